@@ -1,0 +1,1 @@
+"""gsjax: moving scenes from 3D Gaussians, in pure JAX."""

@@ -1,0 +1,97 @@
+"""Pinhole cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# nerfstudio, Blender and OpenGL look along -z with +y up; one sign flip of two axes leads to OpenCV.
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class Camera(eqx.Module):
+    """One or many pinhole cameras of the same image size.
+
+    Attributes:
+        viewmat: world-to-camera transforms, OpenCV axes, metres.
+        K: intrinsics in pixels; the principal point counts pixel centres at +0.5.
+        width: pixels, static.
+        height: pixels, static.
+    """
+
+    viewmat: Float[Array, "*batch 4 4"]
+    K: Float[Array, "*batch 3 3"]
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+
+def viewmat_from_opengl(camera_to_world: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """World-to-camera OpenCV matrices from camera-to-world OpenGL ones (Blender, nerfstudio, push_t)."""
+    return np.linalg.inv(np.asarray(camera_to_world, np.float64) @ OPENGL_TO_OPENCV)
+
+
+def look_at(
+    eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "4 4"]:
+    """The view matrix of a camera at `eye` that looks at `target`; `up` is +z unless told.
+
+    Raises:
+        ValueError: the viewing direction is zero or parallel to `up`.
+    """
+    eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64)
+    forward = target - eye
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError(f"look_at: eye {eye} to target {target} has no direction apart from up {up}")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return viewmat
+
+
+def intrinsics(
+    focal: float, width: int, height: int, center: tuple[float, float] | None = None
+) -> Float[np.ndarray, "3 3"]:
+    """K of a camera with square pixels; the principal point is the middle of the image unless told."""
+    cx, cy = center or (width / 2, height / 2)
+    return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+
+
+def world_to_camera(
+    points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]
+) -> Float[Array, "*n 3"]:
+    """Points in the frame of one camera."""
+    return points @ viewmat[:3, :3].T + viewmat[:3, 3]
+
+
+def project(
+    points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
+) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
+    """Pixel positions and depths of world points in one camera. Depths at or behind 1e-6 m project as if there."""
+    local = world_to_camera(points, viewmat)
+    z = local[..., 2]
+    homogeneous = local @ K.T
+    return homogeneous[..., :2] / jnp.maximum(z, 1e-6)[..., None], z
+
+
+def unproject(
+    pixels: Float[Array, "*n 2"], depths: Float[Array, "*n"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
+) -> Float[Array, "*n 3"]:
+    """World points at z-depth `depths` behind `pixels` of one camera; the inverse of `project`."""
+    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * (pixels[..., 1] - K[1, 2]) / K[1, 1]) / K[0, 0]
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    local = jnp.stack([x, y, jnp.ones_like(x)], axis=-1) * depths[..., None]
+    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 3"]:
+    """Positions of cameras in the world: -R^T t."""
+    return -jnp.einsum("...ji,...j->...i", viewmats[..., :3, :3], viewmats[..., :3, 3])
+
+
+def pixel_grid(width: int, height: int) -> Float[Array, "height width 2"]:
+    """Centres of all pixels, (x, y)."""
+    x, y = jnp.arange(width) + 0.5, jnp.arange(height) + 0.5
+    return jnp.stack(jnp.meshgrid(x, y), axis=-1)

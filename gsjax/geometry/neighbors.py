@@ -1,0 +1,38 @@
+"""Neighbour queries on the host, where point sets are built; nothing here runs inside a jitted step."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+
+def nearest(
+    queries: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"], max_distance: float = np.inf
+) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+    """Index of the nearest point of each query, and its distance in metres; index -1 where none is that near."""
+    if len(points) == 0:
+        return np.full(len(queries), -1), np.full(len(queries), np.inf)
+    distances, indices = cKDTree(points).query(queries, distance_upper_bound=max_distance)
+    return np.where(np.isfinite(distances), indices, -1), distances
+
+
+def neighbor_spacing(points: Float[np.ndarray, "n 3"], k: int = 3) -> Float[np.ndarray, "n"]:
+    """Root mean square distance to the `k` nearest other points, as 3DGS initialises scales; metres."""
+    k = min(k, len(points) - 1)
+    if k < 1:
+        return np.full(len(points), 0.01)
+    distances, _ = cKDTree(points).query(points, k=k + 1)
+    return np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+
+
+def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray, "m"]:
+    """Indices of one point a cubic voxel of edge `voxel` metres: the one nearest to the mean of its voxel."""
+    if len(points) == 0 or voxel <= 0:
+        return np.arange(len(points))
+    cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)
+    _, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+    means = np.stack([np.bincount(inverse, points[:, i]) for i in range(3)], axis=1) / counts[:, None]
+    distance = np.linalg.norm(points - means[inverse], axis=1)
+    order = np.lexsort((distance, inverse))
+    first = np.concatenate([[True], np.diff(inverse[order]) > 0])
+    return np.sort(order[first])

@@ -1,0 +1,45 @@
+"""Quaternions as this package stores them: [w, x, y, z], of any non-zero length.
+
+Rigid motions themselves are `jaxlie.SE3`; what stands here is the little that jaxlie leaves out.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+MIN_SQUARED_NORM = 1e-12
+"""Below this |q|^2 a quaternion names no rotation (RASTERIZER.md, constants)."""
+
+
+def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+    """Unit quaternions. A quaternion too short to name a rotation becomes the identity, with zero gradient."""
+    squared = jnp.sum(quats * quats, axis=-1, keepdims=True)
+    usable = squared >= MIN_SQUARED_NORM
+    identity = jnp.zeros_like(quats).at[..., 0].set(1.0)
+    safe = jnp.where(usable, quats, identity)
+    return safe / jnp.sqrt(jnp.where(usable, squared, 1.0))
+
+
+def quats_to_matrices(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation matrices of (not necessarily unit) quaternions [w, x, y, z]."""
+    w, x, y, z = jnp.moveaxis(normalize_quats(quats), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def multiply_quats(a: Float[Array, "*#batch 4"], b: Float[Array, "*#batch 4"]) -> Float[Array, "*batch 4"]:
+    """Hamilton product: the rotation `b` followed by `a`."""
+    aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
+    bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
