@@ -1,0 +1,40 @@
+"""What every test shares: annotations are checked while tests run, and floats are float32 unless asked."""
+
+import os
+from pathlib import Path
+
+# Several workers may share one GPU: none of them may take most of its memory at the start.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+from jaxtyping import install_import_hook
+
+install_import_hook("gsjax", "beartype.beartype")  # before the first import of gsjax
+
+import hypothesis
+import jax
+import pytest
+
+hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, derandomize=True, database=None)
+hypothesis.settings.load_profile("gsjax")
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def x64():
+    """The test runs with 64-bit types. Ask for it by `@pytest.mark.usefixtures("x64")`."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recordings, which are not part of the repository; without it the test is skipped.
+
+    It is `$GSJAX_DATA`, or `../shared/data` beside the checkout.
+    """
+    named = os.environ.get("GSJAX_DATA")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no recordings at {folder}: point GSJAX_DATA at the folder of tabletop_0, push_t, ...")
+    return folder

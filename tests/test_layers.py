@@ -1,0 +1,122 @@
+"""The layers of the package, read from its imports; docs/architecture.md says why they are as they are."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "gsjax"
+MAX_LINES = 450
+
+STACK = ("geometry", "rasterize", "scene", "losses", "optim", "methods")  # each may import those before it
+BESIDE = {
+    "perception": {"geometry"},
+    "metrics": {"geometry"},
+    "data": {"geometry", "scene"},
+    "io": {"scene"},
+    "viz": {"scene"},
+}
+ALLOWED = {layer: set(STACK[:i]) for i, layer in enumerate(STACK)} | BESIDE
+ALLOWED["cli"] = {*STACK, *BESIDE}
+
+
+def imported_modules(file: Path, root: Path) -> Iterator[tuple[int, str]]:
+    """(line, dotted name) of every import of `file`, also those inside functions, relative ones resolved.
+
+    `from package import name` yields `package.name`: whether that is a module or not, its layer is the same.
+    """
+    package = (root.name, *file.relative_to(root).parent.parts)
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            prefix = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{prefix}.{alias.name}") for alias in node.names)
+
+
+def violations(root: Path) -> list[str]:
+    """One message for each import under the package folder `root` that its layer does not allow."""
+    messages = []
+    for file in sorted(root.rglob("*.py")):
+        where = file.relative_to(root)
+        if len(where.parts) == 1:  # __init__.py and __main__.py of the package show what the layers hold
+            continue
+        layer = where.parts[0]
+        if layer not in ALLOWED:
+            messages.append(f"{root.name}/{where}: {layer!r} is not a layer; the layers are {', '.join(ALLOWED)}")
+            continue
+        for line, module in imported_modules(file, root):
+            top, *rest = module.split(".")
+            if top != root.name or (rest and rest[0] in ALLOWED[layer] | {layer}):
+                continue
+            allowed = ", ".join(sorted(ALLOWED[layer])) or "nothing"
+            messages.append(
+                f"{root.name}/{where}:{line} imports {module}, but {layer} may import only itself and: {allowed}"
+            )
+    return messages
+
+
+def overlong(root: Path) -> list[str]:
+    """One message for each file under `root` with more than `MAX_LINES` lines."""
+    counts = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in sorted(root.rglob("*.py"))}
+    return [
+        f"{root.name}/{file.relative_to(root)} has {count} lines, {MAX_LINES} are allowed: make it a folder"
+        for file, count in counts.items()
+        if count > MAX_LINES
+    ]
+
+
+def test_files_import_only_from_layers_above_their_own():
+    assert not violations(PACKAGE), "\n" + "\n".join(violations(PACKAGE))
+
+
+def test_files_stay_short():
+    assert not overlong(PACKAGE), "\n" + "\n".join(overlong(PACKAGE))
+
+
+@pytest.fixture
+def toy(tmp_path):
+    """Writes one file of a toy package named gsjax, and returns what the checkers say of it."""
+
+    def check(path: str, source: str) -> list[str]:
+        file = tmp_path / "gsjax" / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(source)
+        return violations(tmp_path / "gsjax") + overlong(tmp_path / "gsjax")
+
+    return check
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("rasterize/plan.py", "from gsjax.geometry import cameras\nimport numpy as np"),
+        ("rasterize/plan.py", "from .binning import sort\nfrom ..geometry.cameras import Camera"),
+        ("data/panoptic.py", "def f():\n    import gsjax.scene.gaussians"),
+        ("cli/report.py", "from gsjax.methods import object_tracker\nfrom gsjax.viz import plots"),
+        ("__init__.py", "from gsjax.methods import object_tracker"),
+    ],
+)
+def test_what_is_allowed_passes(toy, path, source):
+    assert toy(path, source) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "says"),
+    [
+        ("rasterize/plan.py", "from gsjax.scene import gaussians", "rasterize/plan.py:1 imports gsjax.scene"),
+        ("rasterize/plan.py", "def f():\n    import gsjax.methods.x", "plan.py:2 imports gsjax.methods.x"),
+        ("geometry/sub/a.py", "from ...scene import b", "geometry/sub/a.py:1 imports gsjax.scene.b"),
+        ("scene/render.py", "from .. import io", "imports gsjax.io"),
+        ("scene/render.py", "import gsjax", "imports gsjax, but scene may import only itself and: geometry"),
+        ("metrics/image.py", "from gsjax import scene", "metrics may import only itself and: geometry"),
+        ("geometry/a.py", "from gsjax.rasterize import plan", "may import only itself and: nothing"),
+        ("utils/a.py", "x = 1", "'utils' is not a layer"),
+        ("scene/long.py", "x = 1\n" * (MAX_LINES + 1), "scene/long.py has 451 lines"),
+    ],
+)
+def test_what_is_not_allowed_is_named(toy, path, source, says):
+    (message,) = toy(path, source)
+    assert says in message
