@@ -1,0 +1,102 @@
+"""Single files: JSON, images, depth and masks, each checked as it is read."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from gsjax.data.errors import DataError
+
+SATURATED_DEPTH = 65535
+"""The largest 16-bit value: what converters clip to and what Kinect writes where it measured nothing."""
+
+# OpenCV decodes the rest of a file that was cut off as grey, so the end marks are looked for here.
+_END_MARKS = {b"\x89PNG": b"IEND", b"\xff\xd8": b"\xff\xd9"}
+_TAIL = 64
+
+
+def read_json(path: Path) -> Any:
+    """The contents of a JSON file.
+
+    Raises:
+        DataError: the file is missing or is not JSON.
+    """
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise DataError(
+            path, "a JSON file", "no such file", "Check the folder; was it copied whole?"
+        ) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
+
+
+def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
+    """An 8-bit colour image, RGB.
+
+    Raises:
+        DataError: the file is missing, cut off, not an image, or not of this size.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR)
+    _check_size(path, image, width, height)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.ndarray, "height width"]:
+    """Depth in metres (float32, 0 = invalid) from a 16-bit image in units of `unit_m` metres.
+
+    0 and 65535 are invalid.
+
+    Raises:
+        DataError: the file is missing, cut off, not a 16-bit single-channel image, or not of this size.
+    """
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    _check_size(path, raw, width, height)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        found = f"{raw.dtype} with {1 if raw.ndim == 2 else raw.shape[2]} channels"
+        raise DataError(path, "depth as one 16-bit channel", found, "Save depth as a 16-bit PNG.")
+    depth = raw.astype(np.float32) * np.float32(unit_m)
+    return np.where(raw == SATURATED_DEPTH, np.float32(0), depth)
+
+
+def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
+    """Integer labels, int32. A mask saved as a grey image of three equal channels is read as one.
+
+    Raises:
+        DataError: the file is missing, cut off, of several differing channels, or not of this size.
+    """
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    _check_size(path, raw, width, height)
+    if raw.ndim == 3:
+        colors = raw[..., :3]
+        if (colors != colors[..., :1]).any():
+            advice = "Save one label a pixel, as a single-channel PNG."
+            raise DataError(path, "one label a pixel", f"{raw.shape[2]} channels that differ", advice)
+        raw = colors[..., 0]
+    return raw.astype(np.int32)
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise DataError(path, "an image", "no such file", "Restore it, or leave out that frame.") from None
+    cut_off = any(
+        content.startswith(head) and end not in content[-_TAIL:] for head, end in _END_MARKS.items()
+    )
+    image = None if cut_off or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if image is None:
+        what = "a file that is cut off" if cut_off else "something else"
+        raise DataError(path, "an image", f"{what} ({len(content)} bytes)", "Fetch the file again.")
+    return image
+
+
+def _check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:
+    if image.shape[:2] != (height, width):
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise DataError(
+            path, f"{width}x{height} pixels", found, "All images, depths and masks share one size."
+        )

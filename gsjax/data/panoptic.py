@@ -1,0 +1,247 @@
+"""The Panoptic layout of Dynamic 3D Gaussians (Luiten et al. 2024), with depth, times and truth added.
+
+train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c], cam_id[t][c];
+                       ours adds time[t] in seconds and depth_unit_m
+test_meta.json         the same for held-out cameras, optional; both are merged
+ims/CAM/FRAME.jpg      named by fn
+seg/CAM/FRAME.png      labels, optional, possibly for some cameras only
+depth/CAM/FRAME.png    uint16 in steps of depth_unit_m, 0 and 65535 = invalid, optional
+truth.npz, meta.json   simulated scenes: T_wo [T,K,4,4] with meta's objects (labels 2.., robot 1), or
+                       T_wp [T,K,4,4] with meta's parts (labels 1..)
+"""
+
+import json
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import read_depth, read_image, read_json, read_mask
+from gsjax.data.sequence import Sequence, Truth
+
+DEFAULT_RATE_HZ = 30.0
+DEFAULT_DEPTH_UNIT_M = 0.001
+META_NAMES = ("train_meta.json", "test_meta.json")
+_ADVICE_META = "Correct the file, or leave that frame or camera out of it."
+
+
+def read_panoptic(path: str | Path) -> Sequence:
+    """The sequence in a folder of this layout; cameras of both metas, in the order in which they stand.
+
+    Without `time` the frames are taken as 1/30 s apart; without `depth_unit_m` depth is in millimetres. Frames
+    of which no image exists are left out, with a DataWarning that counts them.
+
+    Raises:
+        DataError: a meta is missing or disagrees with itself or with the other, an image of a frame is
+            missing while others exist, or the truth does not fit.
+        ValueError: a pose is no rigid motion, or times do not increase.
+    """
+    root = Path(path)
+    meta = _read_metas(root)
+    present = _present_frames(root, meta["fn"])
+    names = [meta["fn"][t] for t in present]
+    frames, width, height = len(meta["fn"]), meta["w"], meta["h"]
+    times = np.asarray(meta.get("time", np.arange(frames) / DEFAULT_RATE_HZ), np.float64)
+    if times.shape != (frames,):
+        raise DataError(
+            root / META_NAMES[0], f"{frames} numbers as time", f"shape {times.shape}", _ADVICE_META
+        )
+    unit = float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
+
+    def locate(kind: str, t: int, c: int) -> str:
+        return str(_FINDERS.get(kind, _image_path)(root, names[t][c]))
+
+    def load_depth(t: int, c: int) -> np.ndarray | None:
+        name = names[t][c]
+        return read_depth(_depth_path(root, name), unit, width, height) if _has(root, "depth", name) else None
+
+    def load_mask(t: int, c: int) -> np.ndarray | None:
+        name = names[t][c]
+        return read_mask(_mask_path(root, name), width, height) if _has(root, "seg", name) else None
+
+    return Sequence(
+        name=root.resolve().name,
+        camera_ids=tuple(meta["cam_id"]),
+        width=width,
+        height=height,
+        times=times[present],
+        frame_ids=tuple(_frame_number(meta["fn"][t][0], t) for t in present),
+        Ks=meta["k"][present],
+        viewmats=meta["w2c"][present],
+        load_image=lambda t, c: read_image(_image_path(root, names[t][c]), width, height),
+        load_depth=load_depth if any(_has(root, "depth", name) for name in names[0]) else None,
+        load_mask=load_mask if any(_has(root, "seg", name) for name in names[0]) else None,
+        truth=_read_truth(root, frames, present),
+        locate=locate,
+    )
+
+
+def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0.0001) -> None:
+    """Saves a sequence in this layout, as one train_meta.json; images as PNG, so nothing is lost.
+
+    Truth is saved too; its labels must be those of a tabletop: the objects 2, 3, ..., a robot 1.
+
+    Args:
+        sequence: what to save; every frame of it is loaded.
+        path: a folder; it is made, and files of the same names in it are replaced.
+        depth_unit_m: metres of one step of depth; 65534 steps are the farthest that can be saved.
+
+    Raises:
+        ValueError: the truth has other labels.
+    """
+    root = Path(path)
+    truth = sequence.truth
+    if truth is not None and list(truth.label_ids) != list(range(2, 2 + len(truth.names))):
+        raise ValueError(f"write_panoptic needs objects labelled 2, 3, ..., got {list(truth.label_ids)}")
+    names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
+    for t, frame in enumerate(names):
+        for c, name in enumerate(frame):
+            _write_image(root / "ims" / name, cv2.cvtColor(sequence.image(t, c), cv2.COLOR_RGB2BGR))
+            depth, mask = sequence.depth(t, c), sequence.mask(t, c)
+            if depth is not None:
+                steps = np.round(depth / depth_unit_m)
+                _write_image(root / "depth" / name, np.where(steps < 65535, steps, 0).astype(np.uint16))
+            if mask is not None:
+                _write_image(root / "seg" / name, mask.astype(np.uint8))
+    meta = {
+        "w": sequence.width,
+        "h": sequence.height,
+        "k": sequence.Ks.tolist(),
+        "w2c": sequence.viewmats.tolist(),
+        "fn": names,
+        "cam_id": [list(sequence.camera_ids)] * sequence.num_frames,
+        "time": sequence.times.tolist(),
+        "depth_unit_m": depth_unit_m,
+    }
+    (root / META_NAMES[0]).write_text(json.dumps(meta))
+    if truth is not None:
+        np.savez_compressed(root / "truth.npz", T_wo=truth.poses)
+        described = {"objects": list(truth.names), "seg": "0 scene, 1 robot, 2+i objects[i]"}
+        (root / "meta.json").write_text(json.dumps(described, indent=1))
+
+
+def _read_metas(root: Path) -> dict[str, Any]:
+    """Both metas as one: k and w2c as arrays [T,C,...], fn [T][C], cam_id [C]."""
+    merged = _read_meta(root / META_NAMES[0])
+    extra_path = root / META_NAMES[1]
+    if not extra_path.exists():
+        return merged
+    extra = _read_meta(extra_path)
+    for key, count in (("w", int), ("h", int), ("fn", len)):
+        if count(extra[key]) != count(merged[key]):
+            expected, found = f"{key} as in {META_NAMES[0]} ({count(merged[key])})", str(count(extra[key]))
+            raise DataError(extra_path, expected, found, "Both metas describe the same frames.")
+    shared = set(merged["cam_id"]) & set(extra["cam_id"])
+    if shared:
+        found = f"cameras {sorted(shared)} in both"
+        raise DataError(extra_path, f"other cameras than in {META_NAMES[0]}", found, "Take them out of one.")
+    merged["fn"] = [a + b for a, b in zip(merged["fn"], extra["fn"], strict=True)]
+    merged["cam_id"] = merged["cam_id"] + extra["cam_id"]
+    for key in ("k", "w2c"):
+        merged[key] = np.concatenate([merged[key], extra[key]], axis=1)
+    return merged
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    meta = read_json(path)
+    missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
+    if missing:
+        raise DataError(path, "the keys w, h, k, w2c, fn, cam_id", f"no {', '.join(missing)}", _ADVICE_META)
+    frames, cameras = len(meta["fn"]), len(meta["cam_id"][0]) if meta["cam_id"] else 0
+    if frames == 0 or cameras == 0:
+        raise DataError(path, "at least one frame and one camera", f"{frames} and {cameras}", _ADVICE_META)
+    for key in ("k", "w2c", "fn", "cam_id"):
+        if len(meta[key]) != frames:
+            raise DataError(path, f"{frames} frames in {key}, as in fn", str(len(meta[key])), _ADVICE_META)
+        for t, values in enumerate(meta[key]):
+            if len(values) != cameras:
+                found = f"{len(values)} in frame {t} ({meta['fn'][t][:1]})"
+                raise DataError(path, f"{cameras} cameras in {key}, as in frame 0", found, _ADVICE_META)
+    for t, ids in enumerate(meta["cam_id"]):
+        if ids != meta["cam_id"][0]:
+            expected = f"cameras {meta['cam_id'][0]} as in frame 0"
+            raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
+    arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
+    return meta | arrays | {"cam_id": [int(i) for i in meta["cam_id"][0]]}
+
+
+def _stack(path: Path, key: str, values: list, side: int) -> np.ndarray:
+    for t, frame in enumerate(values):
+        for c, matrix in enumerate(frame):
+            if np.shape(matrix) != (side, side):
+                found = f"shape {np.shape(matrix)} in frame {t}, camera number {c}"
+                raise DataError(path, f"{key} of shape ({side}, {side})", found, _ADVICE_META)
+    return np.asarray(values, np.float64)
+
+
+def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
+    """Frames whose images exist."""
+    exists = np.array([[_image_path(root, name).exists() for name in frame] for frame in names])
+    some, every = exists.any(1), exists.all(1)
+    if not some.any():
+        found = f"none of {exists.size}, for example no {names[0][0]}"
+        raise DataError(root / "ims", "the images that the meta names", found, "Was the folder copied whole?")
+    if (some & ~every).any():
+        t = int(np.argmax(some & ~every))
+        missing = [name for name, there in zip(names[t], exists[t], strict=True) if not there]
+        expected = f"an image of all {exists.shape[1]} cameras in frame {t}"
+        found = f"none of {len(missing)} of them"
+        raise DataError(_image_path(root, missing[0]), expected, found, "Restore it.")
+    if not every.all():
+        message = f"{root}: {np.sum(~every)} of {len(every)} frames have no image and are left out"
+        warnings.warn(message, DataWarning, stacklevel=3)
+    return [int(t) for t in np.flatnonzero(every)]
+
+
+def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
+    path = root / "truth.npz"
+    if not (path.exists() and (root / "meta.json").exists()):
+        return None
+    described = read_json(root / "meta.json")
+    with np.load(path) as arrays:
+        for key, names_key, first_label, robot in (("T_wo", "objects", 2, 1), ("T_wp", "parts", 1, None)):
+            if key in arrays and names_key in described:
+                names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
+                if poses.shape != (frames, len(names), 4, 4):
+                    expected = (
+                        f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
+                    )
+                    raise DataError(path, expected, f"{poses.shape}", "Make the truth again.")
+                labels = np.arange(first_label, first_label + len(names))
+                return Truth(names=names, label_ids=labels, poses=poses[present], robot=robot)
+    return None
+
+
+def _image_path(root: Path, name: str) -> Path:
+    return root / "ims" / name
+
+
+def _mask_path(root: Path, name: str) -> Path:
+    return (root / "seg" / name).with_suffix(".png")
+
+
+def _depth_path(root: Path, name: str) -> Path:
+    return (root / "depth" / name).with_suffix(".png")
+
+
+_FINDERS = {"image": _image_path, "mask": _mask_path, "depth": _depth_path}
+
+
+def _has(root: Path, kind: str, name: str) -> bool:
+    """Whether the camera of image `name` has a folder of that kind."""
+    return (root / kind / name).parent.is_dir()
+
+
+def _frame_number(name: str, fallback: int) -> int:
+    digits = re.search(r"(\d+)$", Path(name).stem)
+    return int(digits.group()) if digits else fallback
+
+
+def _write_image(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), image):
+        raise DataError(path, "a place to write an image", "no way to write there", "Choose another folder.")

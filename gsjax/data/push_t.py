@@ -1,0 +1,148 @@
+"""The push-T recordings of Embodied Gaussians (Abou-Chakra et al. 2025): three videos, calibrated, no depth.
+
+sample_demos/DEMO/cameras.json          a serial number each: X_WC, camera to world in OpenGL axes
+sample_demos/DEMO/videos/SERIAL.json    K (pixel centres at integers), resolution, timestamps in seconds
+sample_demos/DEMO/videos/SERIAL.mp4     its frame rate is wrong; the timestamps count
+environment/ground.npy                  points of the ground [N,3], world
+environment/ground_plane.json           its plane (n, d), n.x + d = 0
+objects/tblock.json                     the T-block as Gaussians in its own frame
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from gsjax.data.errors import DataError
+from gsjax.data.files import read_json
+from gsjax.data.sequence import PointModel, Sequence
+from gsjax.data.video import Video
+from gsjax.geometry.cameras import viewmat_from_opengl
+from gsjax.geometry.neighbors import neighbor_spacing
+
+MAX_SKEW_S = 0.03
+"""Images farther apart in time than this are no pair: an object at 1 m/s would move by 3 cm."""
+
+GROUND_COLOR = 0.5
+GROUND_THICKNESS_M = 0.001
+BLOCK_LABEL = 1
+
+
+def read_push_t(path: str | Path, demo: int = 0) -> Sequence:
+    """Demonstration `demo` of a push-T folder. Cameras count from 0 in the order of cameras.json.
+
+    The frames are those of the first camera; each other camera gives its image nearest in time. Times are the
+    recording's own, in seconds. `models` holds the ground (static) and the T-block (whose pose is unknown).
+
+    Raises:
+        DataError: a file is missing or bad, a video has another number of frames than timestamps, or no image
+            of a camera lies within MAX_SKEW_S of a frame.
+        ValueError: a pose is no rigid motion, or timestamps do not increase.
+    """
+    root = Path(path)
+    folder = root / "sample_demos" / str(demo)
+    described = read_json(folder / "cameras.json")
+    if not described:
+        raise DataError(folder / "cameras.json", "at least one camera", "none", "Choose another recording.")
+    videos, Ks, poses, stamps = [], [], [], []
+    for serial, entry in described.items():
+        record = folder / "videos" / f"{serial}.json"
+        meta = read_json(record)
+        stamps.append(np.asarray(_get(record, meta, "timestamps"), np.float64))
+        Ks.append(np.asarray(_get(record, meta, "K"), np.float64) + _HALF_PIXEL)
+        poses.append(_get(folder / "cameras.json", entry, "X_WC"))
+        videos.append(Video(record.with_suffix(".mp4"), *_get(record, meta, "resolution"), len(stamps[-1])))
+        if (videos[-1].width, videos[-1].height) != (videos[0].width, videos[0].height):
+            found = f"{videos[-1].width}x{videos[-1].height}"
+            expected = f"{videos[0].width}x{videos[0].height} as in the first camera"
+            raise DataError(record, expected, found, "Bring all videos to one size, and K with them.")
+    pairs = np.stack(
+        [_pair(video.path, stamps[0], own) for video, own in zip(videos, stamps, strict=True)], 1
+    )
+    frames = len(stamps[0])
+    return Sequence(
+        name=f"{root.resolve().name}_{demo}",
+        camera_ids=tuple(range(len(videos))),
+        width=videos[0].width,
+        height=videos[0].height,
+        times=stamps[0],
+        frame_ids=tuple(range(frames)),
+        Ks=np.broadcast_to(np.stack(Ks), (frames, len(videos), 3, 3)),
+        viewmats=np.broadcast_to(viewmat_from_opengl(np.asarray(poses)), (frames, len(videos), 4, 4)),
+        load_image=lambda t, c: videos[c].frame(int(pairs[t, c])),
+        models=_read_models(root),
+        locate=lambda kind, t, c: f"{videos[c].path}, {kind} {pairs[t, c]}",
+    )
+
+
+# RealSense counts pixel centres at integers.
+_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+def _pair(path: Path, reference: Float[np.ndarray, "t"], own: Float[np.ndarray, "s"]) -> Int[np.ndarray, "t"]:
+    """Index of the image nearest in time to each reference time."""
+    if len(own) == 0:
+        raise DataError(path, "timestamps", "none", "Leave out that camera.")
+    nearest = np.abs(own[None] - reference[:, None]).argmin(axis=1)
+    skew = np.abs(own[nearest] - reference)
+    if skew.max() > MAX_SKEW_S:
+        t = int(skew.argmax())
+        expected = f"an image within {MAX_SKEW_S * 1e3:.0f} ms of frame {t} ({reference[t]:.3f} s)"
+        found = f"the nearest {skew[t] * 1e3:.0f} ms away"
+        raise DataError(path, expected, found, "Cut the recording, or leave out that camera.")
+    return nearest
+
+
+def _read_models(root: Path) -> tuple[PointModel, ...]:
+    """Ground and block, as far as their files are there."""
+    ground, plane_path = root / "environment" / "ground.npy", root / "environment" / "ground_plane.json"
+    block = root / "objects" / "tblock.json"
+    plane = (
+        np.asarray(_get(plane_path, read_json(plane_path), "plane"), float) if plane_path.exists() else None
+    )
+    models = []
+    if ground.exists() and plane is not None:
+        models.append(_ground_model(np.load(ground), plane))
+    if block.exists():
+        models.append(_block_model(block, plane))
+    return tuple(models)
+
+
+def _ground_model(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> PointModel:
+    """Grey discs in the plane, as wide as the points are apart."""
+    spacing = neighbor_spacing(points)
+    scales = np.stack([spacing, spacing, np.full_like(spacing, GROUND_THICKNESS_M)], axis=1)
+    count = len(points)
+    turn, _ = Rotation.align_vectors(plane[None, :3], [[0.0, 0.0, 1.0]])
+    return PointModel(
+        name="ground",
+        means=points,
+        quats=np.tile(turn.as_quat(scalar_first=True), (count, 1)),
+        scales=scales,
+        opacities=np.full(count, 0.9),
+        colors=np.full((count, 3), GROUND_COLOR),
+        pose=np.eye(4),
+        plane=plane,
+    )
+
+
+def _block_model(path: Path, plane: Float[np.ndarray, "4"] | None) -> PointModel:
+    """The T-block. The file's X_WB is not its pose in the recordings, so it has none.
+
+    The file's colours are in the order blue, green, red: their mean (0.29, 0.49, 0.87) is a sky blue, while
+    the block in the videos is orange.
+    """
+    gaussians = _get(path, read_json(path), "gaussians")
+    fields = {
+        name: np.asarray(_get(path, gaussians, name), np.float64)
+        for name in ("means", "quats", "scales", "opacities", "colors")
+    }
+    fields["colors"] = fields["colors"][:, ::-1].copy()
+    return PointModel(name="tblock", label=BLOCK_LABEL, plane=plane, **fields)
+
+
+def _get(path: Path, record: dict, key: str):
+    if key not in record:
+        raise DataError(path, f"the key {key!r}", f"only {', '.join(record)}", "Fetch the file again.")
+    return record[key]

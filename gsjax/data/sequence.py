@@ -1,0 +1,314 @@
+"""The one sequence type that every reader gives and every method takes."""
+
+import warnings
+from collections.abc import Callable
+from collections.abc import Sequence as Indices
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
+from gsjax.geometry.cameras import Camera
+
+_POSE_ADVICE = "viewmats are world-to-camera in OpenCV axes; correct or leave out that pose."
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is known of the objects of a sequence, for scoring only.
+
+    Attributes:
+        names: one name an object.
+        label_ids: the mask value of each object, [K].
+        poses: object-to-world transforms, [T,K,4,4] float64.
+        robot: the mask value of the robot, or None where there is none.
+
+    Raises:
+        ValueError: shapes disagree, or a pose is not a rigid motion.
+    """
+
+    names: tuple[str, ...]
+    label_ids: Int[np.ndarray, "objects"]
+    poses: Float[np.ndarray, "frames objects 4 4"]
+    robot: int | None = None
+
+    def __post_init__(self):
+        check_shape("label_ids", self.label_ids, (len(self.names),))
+        check_shape("poses", self.poses, (len(self.poses), len(self.names), 4, 4))
+        advice = "Object poses are object-to-world transforms."
+        check_poses("pose", self.poses, lambda t, k: f"object {self.names[k]} in frame {t}", advice)
+
+
+@dataclass(frozen=True, eq=False)
+class PointModel:
+    """An object or a background whose shape is known beforehand, as Gaussians in its own frame.
+
+    Attributes:
+        name: what it is.
+        means: centres in the model's frame, metres, [N,3].
+        quats: [w,x,y,z] of any length, [N,4].
+        scales: standard deviations, metres, [N,3].
+        opacities: 0 to 1, [N].
+        colors: RGB, 0 to 1, [N,3].
+        label: mask value of the object; 0 is the static background.
+        pose: model-to-world transform [4,4] in the first frame; None: it must be fitted to the first frames.
+        plane: (n, d) with n.x + d = 0 of the plane in the world that it rests on, or None.
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+
+    name: str
+    means: Float[np.ndarray, "n 3"]
+    quats: Float[np.ndarray, "n 4"]
+    scales: Float[np.ndarray, "n 3"]
+    opacities: Float[np.ndarray, "n"]
+    colors: Float[np.ndarray, "n 3"]
+    label: int = 0
+    pose: Float[np.ndarray, "4 4"] | None = None
+    plane: Float[np.ndarray, "4"] | None = None
+
+    def __post_init__(self):
+        count = len(self.means)
+        shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
+        shapes |= {"opacities": (count,), "colors": (count, 3)}
+        if self.pose is not None:
+            shapes["pose"] = (4, 4)
+        if self.plane is not None:
+            shapes["plane"] = (4,)
+        for name, shape in shapes.items():
+            check_shape(f"{self.name}: {name}", getattr(self, name), shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Calibrated cameras that saw a scene over time. Frames are loaded when asked for and never kept.
+
+    `t` and `c` count frames and cameras of this sequence from 0; `frame_ids` and `camera_ids` are the data's
+    own numbers for them. Several cameras of one frame are taken as simultaneous.
+
+    Attributes:
+        name: what to call it.
+        camera_ids: the data's own camera numbers, C of them.
+        width: pixels, of every camera.
+        height: pixels.
+        times: seconds, increasing, [T] float64.
+        frame_ids: the data's own frame numbers, T of them.
+        Ks: intrinsics in pixels, pixel centres at +0.5, [T,C,3,3] float64.
+        viewmats: world to camera, OpenCV axes, metres, [T,C,4,4] float64.
+        load_image: (t, c) -> RGB, [H,W,3] uint8; or floats in 0..1 if `float_images`.
+        load_depth: (t, c) -> metres, [H,W], 0 = invalid; or None for a camera without depth.
+        load_mask: (t, c) -> labels, [H,W] integers; or None for a camera without masks.
+        load_flow: (t, u, c) -> pixels [H,W,2] that each pixel of frame t moves until frame u; NaN = unknown.
+        truth: what is known of the objects, for scoring.
+        models: shapes known beforehand.
+        float_images: `load_image` gives floats. Its pixels that are not finite are reported, turn black, and
+            count as invalid in `depth`.
+        locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
+
+    Raises:
+        ValueError: shapes disagree, a pose is no rigid motion, or times do not increase.
+    """
+
+    name: str
+    camera_ids: tuple[int, ...]
+    width: int
+    height: int
+    times: Float[np.ndarray, "frames"]
+    frame_ids: tuple[int, ...]
+    Ks: Float[np.ndarray, "frames cameras 3 3"]
+    viewmats: Float[np.ndarray, "frames cameras 4 4"]
+    load_image: Callable[[int, int], np.ndarray] = field(repr=False)
+    load_depth: Callable[[int, int], np.ndarray | None] | None = field(default=None, repr=False)
+    load_mask: Callable[[int, int], np.ndarray | None] | None = field(default=None, repr=False)
+    load_flow: Callable[[int, int, int], np.ndarray | None] | None = field(default=None, repr=False)
+    truth: Truth | None = None
+    models: tuple[PointModel, ...] = ()
+    float_images: bool = False
+    locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)
+
+    def __post_init__(self):
+        for name in ("times", "Ks", "viewmats"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
+        frames, cameras = self.num_frames, self.num_cameras
+        if cameras == 0:
+            raise ValueError("a sequence needs at least one camera, got none. Choose other cameras.")
+        if len(set(self.camera_ids)) != cameras:
+            raise ValueError(f"camera_ids must differ from each other, got {self.camera_ids}")
+        check_shape("times", self.times, (frames,))
+        check_times(self.times)
+        check_shape("frame_ids", np.asarray(self.frame_ids), (frames,))
+        check_shape("Ks", self.Ks, (frames, cameras, 3, 3))
+        check_shape("viewmats", self.viewmats, (frames, cameras, 4, 4))
+        check_intrinsics(self.Ks, self._camera_in_frame)
+        check_poses("viewmat", self.viewmats, self._camera_in_frame, _POSE_ADVICE)
+        if self.truth is not None:
+            check_shape("truth.poses", self.truth.poses, (frames, len(self.truth.names), 4, 4))
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(self.times)
+
+    @property
+    def num_cameras(self) -> int:
+        """C."""
+        return len(self.camera_ids)
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether some camera has depth."""
+        return self.load_depth is not None
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether some camera has masks."""
+        return self.load_mask is not None
+
+    @property
+    def has_flow(self) -> bool:
+        """Whether optical flow is known."""
+        return self.load_flow is not None
+
+    def camera(self, t: int, c: int) -> Camera:
+        """Camera `c` as it stood in frame `t`, in JAX's default float type."""
+        dtype = jnp.result_type(float)
+        viewmat, K = jnp.asarray(self.viewmats[t, c], dtype), jnp.asarray(self.Ks[t, c], dtype)
+        return Camera(viewmat=viewmat, K=K, width=self.width, height=self.height)
+
+    def image(self, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
+        """RGB. Warns with DataWarning where float pixels are not finite or the whole image is one colour.
+
+        Raises:
+            DataError: the file is bad, or the loader gave another shape or type.
+        """
+        image, what = self._raw_image(t, c), self._what("image", t, c)
+        if self.float_images:
+            finite = np.isfinite(image).all(-1)
+            if not finite.all():
+                message = f"{what}: {np.sum(~finite)} pixels are not finite; they are black and have no depth"
+                warnings.warn(message, DataWarning, stacklevel=2)
+            clean = np.where(finite[..., None], image, 0)
+            image = np.round(np.clip(clean, 0, 1) * 255).astype(np.uint8)
+        if (image == image[0, 0]).all():
+            warnings.warn(f"{what}: the image is empty, all of one colour", DataWarning, stacklevel=2)
+        return image
+
+    def depth(self, t: int, c: int) -> Float[np.ndarray, "height width"] | None:
+        """Depth along the optical axis, metres, float32, 0 = invalid; None where this camera has none.
+
+        Warns with DataWarning where no pixel is valid.
+
+        Raises:
+            DataError: the file is bad, the loader gave another shape or type, or the unit is wrong.
+        """
+        depth, what = self._load(self.load_depth, "depth", t, c), self._what("depth", t, c)
+        if depth is None:
+            return None
+        _check_array(what, depth, (self.height, self.width), np.floating, "float metres")
+        if self.float_images:
+            depth = np.where(np.isfinite(self._raw_image(t, c)).all(-1), depth, 0)
+        return check_depth(depth, what)
+
+    def mask(self, t: int, c: int) -> Int[np.ndarray, "height width"] | None:
+        """Labels, int32; None where this camera has none.
+
+        Raises:
+            DataError: the file is bad, or the loader gave another shape or type.
+        """
+        mask = self._load(self.load_mask, "mask", t, c)
+        if mask is None:
+            return None
+        _check_array(self._what("mask", t, c), mask, (self.height, self.width), np.integer, "integer labels")
+        return mask.astype(np.int32)
+
+    def flow(self, t: int, c: int) -> Float[np.ndarray, "height width 2"] | None:
+        """Pixels (x, y) that each pixel of frame `t` moves until t + 1; NaN = unknown; None without flow.
+
+        Raises:
+            IndexError: `t` is the last frame.
+            DataError: the loader gave another shape or type.
+        """
+        if self.load_flow is None:
+            return None
+        self._check_index(t + 1, c)
+        flow = self.load_flow(t, t + 1, c)
+        if flow is not None:
+            _check_array(self._what("flow", t, c), flow, (self.height, self.width, 2), np.floating, "floats")
+        return flow
+
+    def select(
+        self, frames: slice | Indices[int] = slice(None), cameras: Indices[int] | None = None
+    ) -> "Sequence":
+        """The sequence of some frames (positions from 0) and some cameras (their camera_ids; None = all).
+
+        Raises:
+            ValueError: a camera or a frame is not there, none is left, or frames do not increase.
+        """
+        chosen = np.arange(self.num_frames)[frames] if isinstance(frames, slice) else np.asarray(frames, int)
+        outside = [int(t) for t in chosen if not 0 <= t < self.num_frames]
+        if outside or len(chosen) == 0:
+            found = f"no frame {outside[0]}" if outside else f"no frame in {frames}"
+            raise ValueError(f"{self.name} has {found}: it has frames 0 to {self.num_frames - 1}.")
+        ids = self.camera_ids if cameras is None else tuple(int(c) for c in cameras)
+        unknown = [c for c in ids if c not in self.camera_ids]
+        if unknown:
+            raise ValueError(f"{self.name} has no camera {unknown[0]}; it has {list(self.camera_ids)}.")
+        ts, cs = [int(t) for t in chosen], [self.camera_ids.index(c) for c in ids]
+        load_flow, locate = self.load_flow, self.locate
+        truth = self.truth and replace(self.truth, poses=self.truth.poses[ts])
+        return replace(
+            self,
+            camera_ids=ids,
+            times=self.times[ts],
+            frame_ids=tuple(self.frame_ids[t] for t in ts),
+            Ks=self.Ks[np.ix_(ts, cs)],
+            viewmats=self.viewmats[np.ix_(ts, cs)],
+            load_image=_reindex(self.load_image, ts, cs),
+            load_depth=_reindex(self.load_depth, ts, cs),
+            load_mask=_reindex(self.load_mask, ts, cs),
+            load_flow=load_flow and (lambda t, u, c: load_flow(ts[t], ts[u], cs[c])),
+            locate=locate and (lambda kind, t, c: locate(kind, ts[t], cs[c])),
+            truth=truth,
+        )
+
+    def _raw_image(self, t: int, c: int) -> np.ndarray:
+        image = self._load(self.load_image, "image", t, c)
+        kind, words = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
+        _check_array(self._what("image", t, c), image, (self.height, self.width, 3), kind, words)
+        return image
+
+    def _load(self, loader: Callable | None, kind: str, t: int, c: int) -> np.ndarray | None:
+        self._check_index(t, c)
+        loaded = None if loader is None else loader(t, c)
+        return None if loaded is None else np.asarray(loaded)
+
+    def _check_index(self, t: int, c: int) -> None:
+        if not (0 <= t < self.num_frames and 0 <= c < self.num_cameras):
+            raise IndexError(
+                f"{self.name} has {self.num_frames} frames and {self.num_cameras} cameras, counted from 0; "
+                f"asked for frame {t}, camera {c}"
+            )
+
+    def _camera_in_frame(self, t: int, c: int) -> str:
+        return f"camera {self.camera_ids[c]} in frame {self.frame_ids[t]}"
+
+    def _what(self, kind: str, t: int, c: int) -> str:
+        if self.locate is not None:
+            return self.locate(kind, t, c)
+        return f"{self.name}, {kind} of {self._camera_in_frame(t, c)}"
+
+
+def _check_array(
+    what: str, array: np.ndarray | None, shape: tuple[int, ...], dtype: type, words: str
+) -> None:
+    if array is None or array.shape != shape or not np.issubdtype(array.dtype, dtype):
+        found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
+        raise DataError(what, f"shape {shape} of {words}", found, "Correct the file or its loader.")
+
+
+def _reindex(loader: Callable | None, frames: list[int], cameras: list[int]) -> Callable | None:
+    return loader and (lambda t, c: loader(frames[t], cameras[c]))

@@ -1,0 +1,95 @@
+"""Checks of cameras, poses, times and depth. Each says where the trouble is, and what to do."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataError, DataWarning
+
+ROTATION_TOLERANCE = 1e-2
+"""Largest entry of |R^T R - I| that passes; calibrations are often written with few digits."""
+
+FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
+"""A median depth outside of this range means a wrong unit rather than a strange scene."""
+
+
+def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Raises ValueError unless `array` has `shape`."""
+    if np.shape(array) != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {np.shape(array)}")
+
+
+def check_poses(
+    name: str, poses: Float[np.ndarray, "frames things 4 4"], where: Callable[[int, int], str], advice: str
+) -> None:
+    """Checks that every matrix is a rigid motion.
+
+    Raises:
+        ValueError: a matrix is not finite, its last row is not 0 0 0 1, or its upper left 3x3 is no rotation;
+            the message says `where(frame, thing)` and ends in `advice`.
+    """
+    rotations = poses[..., :3, :3]
+    finite = np.isfinite(poses).all((-1, -2))
+    safe = np.where(finite[..., None, None], rotations, np.eye(3))
+    skew = np.abs(np.swapaxes(safe, -1, -2) @ safe - np.eye(3)).max((-1, -2))
+    problems = [
+        (~finite, lambda i: "it holds NaN or infinity"),
+        (np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1) > 1e-6, lambda i: f"its last row is {poses[i][3]}"),
+        (skew > ROTATION_TOLERANCE, lambda i: f"R is no rotation: |R^T R - I| reaches {skew[i]:.3g}"),
+        (np.linalg.det(safe) < 0, lambda i: "R is a mirror image, its determinant is negative"),
+    ]
+    for bad, describe in problems:
+        if bad.any():
+            frame, thing = (int(i) for i in np.argwhere(bad)[0])
+            raise ValueError(f"{name} of {where(frame, thing)}: {describe((frame, thing))}. {advice}")
+
+
+def check_intrinsics(Ks: Float[np.ndarray, "frames cameras 3 3"], where: Callable[[int, int], str]) -> None:
+    """Raises ValueError where K is not finite, has a focal length <= 0, or a last row other than 0 0 1."""
+    bad = ~np.isfinite(Ks).all((-1, -2)) | (Ks[..., 0, 0] <= 0) | (Ks[..., 1, 1] <= 0)
+    bad |= np.abs(Ks[..., 2, :] - [0, 0, 1]).max(-1) > 1e-6
+    if bad.any():
+        frame, camera = (int(i) for i in np.argwhere(bad)[0])
+        found = Ks[frame, camera].tolist()
+        raise ValueError(
+            f"K of {where(frame, camera)} is {found}: it must be finite, with positive focal lengths "
+            "and 0 0 1 as its last row. Correct the calibration."
+        )
+
+
+def check_times(times: Float[np.ndarray, "frames"]) -> None:
+    """Raises ValueError unless there is at least one time and all are finite and increase."""
+    if len(times) == 0:
+        raise ValueError("a sequence needs at least one frame, got none. Choose other frames.")
+    bad = ~np.isfinite(times)
+    bad[1:] |= ~(np.diff(times) > 0)
+    if bad.any():
+        frame = int(np.argmax(bad))
+        before = f" after {times[frame - 1]} s" if frame else ""
+        raise ValueError(
+            f"times must be finite and increase, but frame {frame} is at {times[frame]} s{before}. "
+            "Sort the frames and drop those that occur twice."
+        )
+
+
+def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np.ndarray, "height width"]:
+    """The depth with NaN, infinite and negative pixels made 0 (invalid), after a look at its range.
+
+    Warns with DataWarning where no pixel is valid.
+
+    Raises:
+        DataError: the median of the valid pixels is beyond 50 m or below 20 mm: the unit is wrong.
+    """
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    valid = depth[depth > 0]
+    if valid.size == 0:
+        warnings.warn(f"{what}: no pixel has a valid depth", DataWarning, stacklevel=3)
+        return depth
+    median = float(np.median(valid))
+    if not NEAREST_MEDIAN_M <= median <= FARTHEST_MEDIAN_M:
+        expected = f"depth in metres, its median from {NEAREST_MEDIAN_M} to {FARTHEST_MEDIAN_M}"
+        advice = "The unit is likely wrong: set depth_unit_m, the metres of one step of the depth image."
+        raise DataError(what, expected, f"a median of {median:.4g} m", advice)
+    return depth

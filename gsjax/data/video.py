@@ -1,0 +1,67 @@
+"""Frames of a video by number."""
+
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from gsjax.data.errors import DataError
+
+# Decoding on is faster than a seek, which starts at the key frame before.
+_SKIP_AT_MOST = 12
+
+
+class Video:
+    """A video file whose frames are read by number; reading in order is fast. Opened at the first read."""
+
+    def __init__(self, path: Path, width: int, height: int, num_frames: int):
+        """Expects `num_frames` frames of width x height pixels.
+
+        Raises:
+            DataError: the file is missing.
+        """
+        if not path.exists():
+            raise DataError(path, "a video", "no such file", "Check the folder; was it copied whole?")
+        self.path, self.width, self.height, self.num_frames = path, int(width), int(height), num_frames
+        self._capture: cv2.VideoCapture | None = None
+        self._next = 0
+        self._lock = threading.Lock()
+
+    def frame(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        """RGB.
+
+        Raises:
+            DataError: the file is no video, has another size or number of frames, or is cut off.
+        """
+        with self._lock:
+            capture = self._open()
+            if not 0 <= index - self._next <= _SKIP_AT_MOST:
+                capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+                self._next = index
+            while self._next < index and capture.grab():
+                self._next += 1
+            read, image = capture.read()
+            self._next = index + 1
+        if not read:
+            found = f"no frame {index}"
+            raise DataError(
+                self.path, f"{self.num_frames} frames", found, "Fetch the file again; is it cut off?"
+            )
+        if image.shape != (self.height, self.width, 3):
+            found = f"{image.shape[1]}x{image.shape[0]}"
+            raise DataError(self.path, f"{self.width}x{self.height} pixels", found, "Correct the resolution.")
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def _open(self) -> cv2.VideoCapture:
+        if self._capture is None:
+            capture = cv2.VideoCapture(str(self.path))
+            if not capture.isOpened():
+                raise DataError(self.path, "a video", "something that does not open", "Fetch the file again.")
+            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            if count != self.num_frames:
+                expected = f"{self.num_frames} frames, one a timestamp"
+                raise DataError(self.path, expected, f"{count}", "Fetch the video and its JSON file again.")
+            self._capture = capture
+        return self._capture
