@@ -8,7 +8,8 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 from jaxtyping import install_import_hook
 
-install_import_hook("gsjax", "beartype.beartype")  # before the first import of gsjax
+# Before the first import of gsjax. The numeric tower lets an int stand for a float, as type checkers do.
+install_import_hook("gsjax", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 import hypothesis
 import jax

@@ -45,16 +45,15 @@ def violations(root: Path) -> list[str]:
             continue
         layer = where.parts[0]
         if layer not in ALLOWED:
-            messages.append(f"{root.name}/{where}: {layer!r} is not a layer; the layers are {', '.join(ALLOWED)}")
+            messages.append(f"{root.name}/{where}: {layer!r} is not a layer; those are {', '.join(ALLOWED)}")
             continue
         for line, module in imported_modules(file, root):
             top, *rest = module.split(".")
             if top != root.name or (rest and rest[0] in ALLOWED[layer] | {layer}):
                 continue
             allowed = ", ".join(sorted(ALLOWED[layer])) or "nothing"
-            messages.append(
-                f"{root.name}/{where}:{line} imports {module}, but {layer} may import only itself and: {allowed}"
-            )
+            rule = f"{layer} may import only itself and: {allowed}"
+            messages.append(f"{root.name}/{where}:{line} imports {module}, but {rule}")
     return messages
 
 

@@ -1,0 +1,134 @@
+"""Pictures from arrays: label colours, depth, error maps, and the panel that shows them side by side.
+
+All pictures are uint8 RGB `[H,W,3]`; colour inputs are floats in 0 to 1 or uint8.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float, Integer, Num, UInt8
+
+BACKGROUND = (158, 160, 164)  # label 0
+INVALID = (38, 40, 44)  # no depth there
+
+# Okabe and Ito's colours, then darker ones of Tol's muted scheme: any two neighbours differ for colour-blind
+# eyes, and each is dark enough to read as a line on white (so their yellow comes late and is deepened).
+PALETTE = (
+    (0, 114, 178),
+    (230, 159, 0),
+    (0, 158, 115),
+    (213, 94, 0),
+    (204, 121, 167),
+    (86, 180, 233),
+    (51, 34, 136),
+    (190, 174, 20),
+    (136, 34, 85),
+    (153, 153, 51),
+)
+
+
+def label_color(label: int) -> tuple[int, int, int]:
+    """The RGB colour, 0 to 255, of `label` in every picture; 0 is grey, and the palette repeats after 10."""
+    return BACKGROUND if label == 0 else PALETTE[(label - 1) % len(PALETTE)]
+
+
+def colorize_labels(mask: Integer[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A label image as colours; negative labels (unknown) are near black."""
+    labels, inverse = np.unique(mask, return_inverse=True)
+    table = np.array([INVALID if label < 0 else label_color(int(label)) for label in labels], np.uint8)
+    return table.reshape(-1, 3)[inverse.reshape(mask.shape)]
+
+
+def colorize_depth(
+    depth: Float[np.ndarray, "h w"], near: float | None = None, far: float | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Depth in metres as colours, near bright; zero, negative and non-finite depths are near black.
+
+    `near` and `far` default to the 2nd and 98th percentile of the valid depths: give them where pictures are
+    to be compared.
+    """
+    valid = np.isfinite(depth) & (depth > 0)
+    low, high = np.percentile(depth[valid], [2, 98]) if valid.any() else (0.0, 1.0)
+    low, high = (low if near is None else near), (high if far is None else far)
+    closeness = 1 - np.clip((np.where(valid, depth, low) - low) / max(high - low, 1e-9), 0, 1)
+    colors = _apply_colormap("cividis", closeness)
+    colors[~valid] = INVALID
+    return colors
+
+
+def error_heatmap(
+    a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"], limit: float = 0.3
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Mean absolute difference over the channels, black where equal and brightest from `limit` (of 1) on.
+
+    Pixels that are not finite in either image are shown as no error: nothing was compared there.
+    """
+    error = np.abs(_to_float(a) - _to_float(b)).mean(axis=-1)
+    return _apply_colormap("inferno", np.clip(np.nan_to_num(error, nan=0.0) / limit, 0, 1))
+
+
+def to_uint8(image: Num[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A colour image in 0 to 1 (clipped, NaN black) or already uint8, as uint8."""
+    if image.dtype == np.uint8:
+        return image
+    return np.round(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 255).astype(np.uint8)
+
+
+def side_by_side(
+    image: Num[np.ndarray, "h w 3"],
+    render: Num[np.ndarray, "h w 3"],
+    error: UInt8[np.ndarray, "h w 3"] | None = None,
+    labels: Integer[np.ndarray, "h w"] | None = None,
+    captions: Sequence[str] = ("input", "render", "error", "labels"),
+) -> UInt8[np.ndarray, "rows cols 3"]:
+    """One panel: input, render, error and labels, each with a caption; even-sized, as video codecs want.
+
+    Args:
+        image, render: colours.
+        error: a picture already, the `error_heatmap` of the two unless told.
+        labels: rendered labels, laid over the dimmed input; left out where None.
+        captions: one a picture; longer than needed is fine.
+    """
+    image, render = to_uint8(image), to_uint8(render)
+    pictures = [image, render, error_heatmap(image, render) if error is None else error]
+    if labels is not None:
+        pictures.append(overlay_labels(image, labels))
+    columns = 2 if len(pictures) == 4 and image.shape[1] > 1.2 * image.shape[0] else len(pictures)
+    framed = [_captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
+    rows = [np.concatenate(framed[i : i + columns], axis=1) for i in range(0, len(framed), columns)]
+    panel = np.concatenate(rows, axis=0)
+    return np.pad(panel, ((0, panel.shape[0] % 2), (0, panel.shape[1] % 2), (0, 0)))
+
+
+def overlay_labels(
+    image: Num[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"], strength: float = 0.65
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Labels as colours over a grey copy of the image, so that the shapes below still show."""
+    grey = to_uint8(image).mean(axis=-1, keepdims=True) * 0.75
+    inside: Bool[np.ndarray, "h w 1"] = (labels > 0)[..., None]
+    mixed = np.where(inside, strength * colorize_labels(labels) + (1 - strength) * grey, grey)
+    return np.broadcast_to(mixed, (*labels.shape, 3)).astype(np.uint8)
+
+
+def _to_float(image: np.ndarray) -> np.ndarray:
+    return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
+
+
+def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
+    return matplotlib.colormaps[name](values, bytes=True)[..., :3].copy()
+
+
+def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+    """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
+    height, width = picture.shape[:2]
+    scale = max(height / 700, 0.38)
+    (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    pad = round(5 * scale) + 2
+    picture = picture.copy()
+    chip = picture[: text_height + baseline + 2 * pad, : min(text_width + 2 * pad, width)]
+    chip[:] = (0.25 * chip + 0.75 * np.array([22, 24, 28])).astype(np.uint8)
+    origin = (pad, pad + text_height)
+    cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (245, 245, 245), 1, cv2.LINE_AA)
+    return picture

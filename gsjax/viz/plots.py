@@ -1,0 +1,166 @@
+"""Plots of a run, from arrays. Each function returns a matplotlib Figure of its own; `save` writes it.
+
+Only matplotlib's object interface is used: no window, no pyplot, no state shared between plots.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gsjax.viz.colors import label_color
+
+_INK, _FAINT, _GRID = "#22262b", "#6b7280", "#e4e7eb"
+_BLUE, _ORANGE = "#0072b2", "#d55e00"
+
+
+def update_time(
+    update_s: Float[np.ndarray, "frames"], target_hz: float = 30.0, title: str = "Time of one update"
+) -> Figure:
+    """Update times over frames, with their median and 95th percentile, against a target rate.
+
+    Args:
+        update_s: seconds of each update; NaN where there was none.
+        target_hz: the rate drawn as a dashed line.
+    """
+    figure, axes = _new(title, "frame", "ms")
+    ms = np.asarray(update_s, float) * 1e3
+    axes.plot(ms, color=_BLUE, lw=1.1, marker="o", ms=2.2, mew=0)
+    if np.isfinite(ms).any():
+        median, p95 = np.nanpercentile(ms, [50, 95])
+        axes.axhline(median, color=_BLUE, lw=1.4, alpha=0.9)
+        axes.axhline(p95, color=_BLUE, lw=1.0, alpha=0.5)
+        _margin_label(axes, median, f"median {median:.0f} ms", _BLUE)
+        if p95 > 1.25 * median:  # else the two labels would lie on each other
+            _margin_label(axes, p95, f"p95 {p95:.0f} ms", _BLUE)
+        if np.nanmax(ms) > 8 * p95:  # the first update compiles
+            axes.set_yscale("log")
+            axes.minorticks_off()
+    axes.axhline(1e3 / target_hz, color=_ORANGE, lw=1.2, ls=(0, (5, 3)))
+    _margin_label(axes, 1e3 / target_hz, f"{target_hz:.0f} Hz", _ORANGE)
+    if axes.get_yscale() == "linear":
+        axes.set_ylim(bottom=0)
+    return figure
+
+
+def error_over_frames(
+    errors_mm: Mapping[str, Float[np.ndarray, "frames"]],
+    labels: Mapping[str, int] | None = None,
+    limit_mm: float | None = None,
+    title: str = "Centroid error",
+) -> Figure:
+    """One line an object: how far it is from where it truly is, in mm.
+
+    Args:
+        errors_mm: name to error of each frame; NaN where there is no truth.
+        labels: name to label, which gives the line its colour; counted from 1 unless told.
+        limit_mm: a goal, drawn dashed.
+    """
+    figure, axes = _new(title, "frame", "mm")
+    for i, (name, error) in enumerate(errors_mm.items()):
+        axes.plot(error, color=_rgb(labels[name] if labels else i + 1), lw=1.6, label=name)
+    if limit_mm is not None:
+        axes.axhline(limit_mm, color=_FAINT, lw=1.0, ls=(0, (5, 3)))
+        _margin_label(axes, limit_mm, f"{limit_mm:g} mm", _FAINT)
+    axes.set_ylim(bottom=0)
+    _legend(figure, axes)
+    return figure
+
+
+def psnr_over_frames(
+    tracked: Mapping[str, Float[np.ndarray, "frames"]],
+    held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,
+    title: str = "PSNR",
+) -> Figure:
+    """PSNR in dB over frames, one line a camera: solid where it was tracked, dashed where only judged."""
+    figure, axes = _new(title, "frame", "dB")
+    lines = [(n, v, "-", "tracked") for n, v in tracked.items()]
+    lines += [(n, v, (0, (4, 2)), "held out") for n, v in (held_out or {}).items()]
+    for i, (name, values, style, kind) in enumerate(lines):
+        axes.plot(values, color=_rgb(i + 1), lw=1.6, ls=style, label=f"{name} ({kind})")
+    _legend(figure, axes)
+    return figure
+
+
+def trajectories(
+    centroids: Mapping[str, Float[np.ndarray, "frames 3"]],
+    labels: Mapping[str, int] | None = None,
+    truth: Mapping[str, Float[np.ndarray, "frames 3"]] | None = None,
+    view: Literal["top", "3d"] = "top",
+    title: str = "Paths of the objects",
+) -> Figure:
+    """Where the centroids went, in metres: a ring at the start, a dot at the end, the true path thin below.
+
+    `view` "top" looks along the world's z axis; "3d" shows all three.
+    """
+    figure, axes = _new(title, "x (m)", "y (m)", projection="3d" if view == "3d" else None)
+    take = 3 if view == "3d" else 2
+    for i, (name, path) in enumerate(centroids.items()):
+        color = _rgb(labels[name] if labels else i + 1)
+        if truth and name in truth:
+            axes.plot(*np.asarray(truth[name])[:, :take].T, color=_INK, lw=0.9, alpha=0.55)
+        axes.plot(*np.asarray(path)[:, :take].T, color=color, lw=2.0, label=name)
+        finite = np.asarray(path)[np.isfinite(path).all(axis=1), :take]
+        if len(finite):
+            axes.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
+            axes.plot(*finite[-1:].T, color=color, marker="o", ms=6, mew=0)
+    # Three-dimensional axes take "equal" too, but their box then no longer fills the figure.
+    axes.set_aspect("equal", adjustable="datalim" if view == "top" else "box")
+    if view == "3d":
+        axes.set_zlabel("z (m)", color=_FAINT, fontsize=9.5)  # pyright: ignore[reportAttributeAccessIssue]
+    _legend(figure, axes)
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Writes the figure as its suffix says (.svg, .png, .pdf), the same bytes for the same figure.
+
+    Raises:
+        ValueError: a suffix that matplotlib cannot write.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    with matplotlib.rc_context({"svg.hashsalt": "gsjax"}):
+        figure.savefig(path, dpi=160, metadata=metadata)
+    return path
+
+
+def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(7.2, 5.4 if projection else 3.6), facecolor="white", layout="constrained")
+    axes = figure.add_subplot(projection=projection)
+    axes.set_title(title, loc="left", fontsize=11.5, fontweight="bold", color=_INK, pad=10)
+    axes.set_xlabel(xlabel, color=_FAINT, fontsize=9.5)
+    axes.set_ylabel(ylabel, color=_FAINT, fontsize=9.5)
+    axes.tick_params(colors=_FAINT, labelsize=8.5, length=0)
+    axes.grid(color=_GRID, lw=0.8)
+    axes.set_axisbelow(True)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    axes.spines["bottom"].set_color(_GRID)
+    return figure, axes
+
+
+def _margin_label(axes: Axes, y: float, text: str, color: str) -> None:
+    """Names a horizontal line at the right end of it, outside the plot."""
+    place = axes.get_yaxis_transform()
+    axes.text(1.01, y, text, transform=place, color=color, fontsize=8.5, va="center", clip_on=False)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Names the lines below the plot, where no line is hidden."""
+    handles, names = axes.get_legend_handles_labels()
+    columns = 5 if max(map(len, names), default=0) < 14 else 3
+    if names:
+        style = {"frameon": False, "fontsize": 8.5, "labelcolor": _INK}
+        figure.legend(handles, names, loc="outside lower left", ncols=columns, **style)
+
+
+def _rgb(label: int) -> tuple[float, float, float]:
+    red, green, blue = label_color(label)
+    return red / 255, green / 255, blue / 255

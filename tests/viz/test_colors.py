@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from gsjax.viz import colors
+
+
+def test_labels_have_their_colours_and_background_is_grey():
+    mask = np.array([[0, 1], [2, -1]])
+    picture = colors.colorize_labels(mask)
+    assert picture.dtype == np.uint8
+    assert tuple(picture[0, 0]) == colors.BACKGROUND
+    assert tuple(picture[0, 1]) == colors.label_color(1) == colors.PALETTE[0]
+    assert tuple(picture[1, 0]) == colors.label_color(2)
+    assert tuple(picture[1, 1]) == colors.INVALID
+
+
+def test_ten_labels_in_a_row_differ():
+    assert len({colors.label_color(label) for label in range(11)}) == 11
+
+
+def test_palette_stays_apart_for_colour_blind_eyes():
+    """Deuteranopia and protanopia (Vienot et al. 1999, linear RGB) leave the first labels distinct."""
+    rgb = (np.array(colors.PALETTE[:6]) / 255) ** 2.2
+    deutan = np.array([[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]])
+    protan = np.array([[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]])
+    for matrix in (deutan, protan):
+        seen = np.clip(rgb @ matrix.T, 0, 1) ** (1 / 2.2)
+        gaps = np.linalg.norm(seen[:, None] - seen[None], axis=-1)[~np.eye(6, dtype=bool)]
+        assert gaps.min() > 0.08
+
+
+def test_near_is_brighter_than_far_and_invalid_is_dark():
+    depth = np.array([[0.5, 2.0], [0.0, np.nan]], np.float32)
+    picture = colors.colorize_depth(depth)
+    assert picture[0, 0].sum(dtype=int) > picture[0, 1].sum(dtype=int)
+    assert (picture[1] == colors.INVALID).all()
+
+
+@pytest.mark.parametrize("depth", [np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)])
+def test_depth_without_range_is_drawn(depth):
+    assert colors.colorize_depth(depth).shape == (2, 3, 3)
+
+
+def test_error_is_black_where_equal_and_ignores_what_is_not_finite():
+    a = np.zeros((2, 2, 3), np.float32)
+    b = a.copy()
+    b[0, 0], b[1, 1] = 1.0, np.nan
+    picture = colors.error_heatmap(a, b).astype(int).sum(-1)
+    assert picture[0, 0] > 500
+    assert picture[0, 1] == picture[1, 1] < 10
+
+
+def test_uint8_and_float_mean_the_same():
+    image = np.array([[[0, 51, 255]]], np.uint8)
+    np.testing.assert_array_equal(colors.to_uint8(image / 255.0), image)
+    assert colors.error_heatmap(image, (image / 255.0).astype(np.float32)).sum() < 10
+
+
+@pytest.mark.parametrize(
+    ("size", "labelled", "expected"),
+    [((48, 64), True, (96, 128)), ((64, 48), True, (64, 192)), ((33, 41), False, (34, 124))],
+)
+def test_panel_is_even_sized_and_holds_every_picture(size, labelled, expected):
+    image = np.full((*size, 3), 0.5, np.float32)
+    labels = np.ones(size, int) if labelled else None
+    panel = colors.side_by_side(image, image, labels=labels)
+    assert panel.shape == (*expected, 3)
+    assert panel.dtype == np.uint8
+
+
+def test_panel_does_not_write_into_its_inputs():
+    image = np.full((40, 60, 3), 200, np.uint8)
+    colors.side_by_side(image, image)
+    assert (image == 200).all()

@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+from matplotlib import pyplot
+
+from gsjax.viz import plots
+
+TIMES = 0.05 + 0.01 * np.random.default_rng(0).random(30)
+
+
+def texts(figure) -> str:
+    return " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
+
+
+def test_update_time_names_its_lines():
+    said = texts(plots.update_time(TIMES))
+    assert f"median {np.median(TIMES) * 1e3:.0f} ms" in said
+    assert "30 Hz" in said
+
+
+def test_update_time_with_a_slow_first_frame_is_logarithmic():
+    assert plots.update_time(np.r_[30.0, TIMES]).axes[0].get_yscale() == "log"
+    assert plots.update_time(TIMES).axes[0].get_yscale() == "linear"
+
+
+def test_error_has_a_line_an_object_in_the_colour_of_its_label():
+    errors = {"cup": TIMES, "box": TIMES * 2}
+    figure = plots.error_over_frames(errors, labels={"cup": 2, "box": 5}, limit_mm=5)
+    cup, box, _limit = figure.axes[0].get_lines()
+    assert cup.get_label() == "cup"
+    assert cup.get_color() == plots._rgb(2)
+    assert box.get_color() == plots._rgb(5)
+    assert "5 mm" in texts(figure)
+
+
+def test_psnr_tells_tracked_from_held_out():
+    figure = plots.psnr_over_frames({"camera 0": TIMES}, {"camera 2": TIMES})
+    assert [line.get_label() for line in figure.axes[0].get_lines()] == [
+        "camera 0 (tracked)",
+        "camera 2 (held out)",
+    ]
+    assert figure.axes[0].get_lines()[1].get_linestyle() == "--"
+
+
+@pytest.mark.parametrize("view", ["top", "3d"])
+def test_trajectories_survive_gaps_and_absent_objects(view, tmp_path):
+    path = np.cumsum(np.ones((10, 3)) * 0.01, axis=0)
+    path[3] = np.nan
+    paths = {"cup": path, "never seen": np.full((10, 3), np.nan)}
+    figure = plots.trajectories(paths, truth={"cup": path}, view=view)
+    assert plots.save(figure, tmp_path / "plots" / "paths.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png"])
+def test_saving_twice_gives_the_same_bytes_and_leaves_no_state(tmp_path, suffix):
+    first, second = (plots.save(plots.update_time(TIMES), tmp_path / f"{i}{suffix}") for i in range(2))
+    assert first.read_bytes() == second.read_bytes()
+    assert pyplot.get_fignums() == []
+
+
+@pytest.mark.parametrize("plot", [plots.update_time, lambda x: plots.error_over_frames({"a": x})])
+@pytest.mark.parametrize("values", [np.full(3, np.nan), np.zeros(0), np.ones(1)])
+def test_little_or_nothing_to_draw(plot, values, tmp_path):
+    assert plots.save(plot(values), tmp_path / "plot.svg").exists()
