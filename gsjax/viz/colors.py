@@ -123,7 +123,7 @@ def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
 def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
     """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
     height, width = picture.shape[:2]
-    scale = max(height / 700, 0.38)
+    scale = max(height / 650, 0.42)
     (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     pad = round(5 * scale) + 2
     picture = picture.copy()

@@ -112,7 +112,7 @@ def trajectories(
     # Three-dimensional axes take "equal" too, but their box then no longer fills the figure.
     axes.set_aspect("equal", adjustable="datalim" if view == "top" else "box")
     if view == "3d":
-        axes.set_zlabel("z (m)", color=_FAINT, fontsize=9.5)  # pyright: ignore[reportAttributeAccessIssue]
+        axes.set_zlabel("z (m)", color=_FAINT, fontsize=10)  # pyright: ignore[reportAttributeAccessIssue]
     _legend(figure, axes)
     return figure
 
@@ -132,12 +132,12 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 
 def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(7.2, 5.4 if projection else 3.6), facecolor="white", layout="constrained")
+    figure = Figure(figsize=(6.4, 5.0 if projection else 3.4), facecolor="white", layout="constrained")
     axes = figure.add_subplot(projection=projection)
-    axes.set_title(title, loc="left", fontsize=11.5, fontweight="bold", color=_INK, pad=10)
-    axes.set_xlabel(xlabel, color=_FAINT, fontsize=9.5)
-    axes.set_ylabel(ylabel, color=_FAINT, fontsize=9.5)
-    axes.tick_params(colors=_FAINT, labelsize=8.5, length=0)
+    axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=10)
+    axes.set_xlabel(xlabel, color=_FAINT, fontsize=10)
+    axes.set_ylabel(ylabel, color=_FAINT, fontsize=10)
+    axes.tick_params(colors=_FAINT, labelsize=9.5, length=0)
     axes.grid(color=_GRID, lw=0.8)
     axes.set_axisbelow(True)
     for side in ("top", "right", "left"):
@@ -149,7 +149,7 @@ def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) ->
 def _margin_label(axes: Axes, y: float, text: str, color: str) -> None:
     """Names a horizontal line at the right end of it, outside the plot."""
     place = axes.get_yaxis_transform()
-    axes.text(1.01, y, text, transform=place, color=color, fontsize=8.5, va="center", clip_on=False)
+    axes.text(1.01, y, text, transform=place, color=color, fontsize=9, va="center", clip_on=False)
 
 
 def _legend(figure: Figure, axes: Axes) -> None:
@@ -157,7 +157,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     columns = 5 if max(map(len, names), default=0) < 14 else 3
     if names:
-        style = {"frameon": False, "fontsize": 8.5, "labelcolor": _INK}
+        style = {"frameon": False, "columnspacing": 1.3, "handlelength": 1.4, "fontsize": 9.5, "labelcolor": _INK}
         figure.legend(handles, names, loc="outside lower left", ncols=columns, **style)
 
 

@@ -1,0 +1,204 @@
+"""report.html: a run on one page that needs no network, no script and no file beside it."""
+
+import base64
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from gsjax.io.atomic import atomic_write
+
+_MIME = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".svg": "image/svg+xml",
+    ".webp": "image/webp",
+    ".gif": "image/gif",
+    ".mp4": "video/mp4",
+    ".webm": "video/webm",
+}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report.
+
+    Attributes:
+        title: stands above it.
+        columns: heads; the first column names the row.
+        rows: cells of each row: text, numbers, or None where there is nothing to say.
+        units: one a column, "" for none; shown small below the heads.
+        note: a line below the table.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    units: Sequence[str] = ()
+    note: str = ""
+
+    def __post_init__(self):
+        width = len(self.columns)
+        if self.units and len(self.units) != width:
+            raise ValueError(f"Table {self.title!r}: {len(self.units)} units for {width} columns")
+        for i, row in enumerate(self.rows):
+            if len(row) != width:
+                raise ValueError(f"Table {self.title!r}: {len(row)} cells in row {i} for {width} columns")
+
+
+@dataclass(frozen=True)
+class Media:
+    """An image, video or plot to embed, and what it shows."""
+
+    path: str | Path
+    caption: str = ""
+
+
+def write_report(
+    path: str | Path,
+    *,
+    title: str,
+    summary: Mapping[str, Any],
+    subtitle: str = "",
+    tables: Sequence[Table] = (),
+    images: Sequence[Media | str | Path] = (),
+    videos: Sequence[Media | str | Path] = (),
+    plots: Sequence[Media | str | Path] = (),
+    notes: Sequence[str] = (),
+) -> None:
+    """Writes a standalone page.
+
+    Args:
+        path: the .html file, replaced whole.
+        title: the heading.
+        summary: headline figures, name to value or (value, unit); each becomes a card.
+        subtitle: a line below the heading: what ran on what.
+        tables, images, videos, plots: what to show; media are embedded, a plain path has no caption.
+        notes: what was not scored and why. A medium whose file is missing is left out and added here.
+
+    Raises:
+        ValueError: a medium's suffix is none that browsers show.
+    """
+    notes = list(notes)
+    sections = [
+        _cards(summary),
+        _gallery("Videos", videos, _video, notes),
+        _gallery("Plots", plots, _image, notes),
+        "".join(map(_table, tables)),
+        _gallery("Images", images, _image, notes),
+        _notes(notes),
+    ]
+    below = f"<p>{_text(subtitle)}</p>" if subtitle else ""
+    head = f"<header><h1>{_text(title)}</h1>{below}</header>"
+    style = resources.files("gsjax.cli").joinpath("report.css").read_text(encoding="utf-8")
+    page = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>{_text(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n{head}\n"
+        + "\n".join(section for section in sections if section)
+        + "\n<footer>Written by gsjax.</footer>\n</main>\n</body>\n</html>\n"
+    )
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def format_number(value: Any) -> str:
+    """A cell's text: three digits for fractions, thin spaces between thousands, a dash for nothing."""
+    if value is None:
+        return "–"
+    if isinstance(value, (str, bool)):
+        return str(value)
+    if isinstance(value, int) or (hasattr(value, "dtype") and value.dtype.kind in "iu"):
+        return f"{int(value):,}".replace(",", "\u202f")
+    value = float(value)
+    if not math.isfinite(value):
+        return "–"
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.2e}".replace("-", "−")
+    decimals = 0 if value == 0 else max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
+
+
+def _text(value: Any) -> str:
+    return html.escape(str(value))
+
+
+def _cards(summary: Mapping[str, Any]) -> str:
+    cards = []
+    for name, entry in summary.items():
+        value, unit = entry if isinstance(entry, tuple) else (entry, "")
+        unit = f"<small>{_text(unit)}</small>" if unit else ""
+        cards.append(f"<div><dt>{_text(name)}</dt><dd>{_text(format_number(value))}{unit}</dd></div>")
+    return f'<dl class="cards">{"".join(cards)}</dl>' if cards else ""
+
+
+def _table(table: Table) -> str:
+    numeric = [
+        any(not isinstance(row[i], str) and row[i] is not None for row in table.rows)
+        for i in range(len(table.columns))
+    ]
+
+    def cells(values: Sequence[str], tag: str) -> str:
+        kind = [' class="number"' if is_number else "" for is_number in numeric]
+        return "".join(f"<{tag}{k}>{v}</{tag}>" for k, v in zip(kind, values, strict=True))
+
+    units = table.units or [""] * len(table.columns)
+    heads = [
+        _text(name) + (f"<small>{_text(unit)}</small>" if unit else "")
+        for name, unit in zip(table.columns, units, strict=True)
+    ]
+    body = "".join(f"<tr>{cells([_text(format_number(v)) for v in row], 'td')}</tr>" for row in table.rows)
+    note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
+    return (
+        f'<section><h2>{_text(table.title)}</h2><div class="scroll"><table>'
+        f"<thead><tr>{cells(heads, 'th')}</tr></thead><tbody>{body}</tbody></table></div>{note}</section>"
+    )
+
+
+def _gallery(
+    title: str,
+    media: Sequence[Media | str | Path],
+    element: Callable[[str, str], str],
+    notes: list[str],
+) -> str:
+    """The media whose files exist; the others are named in `notes`."""
+    figures = []
+    for item in media:
+        item = item if isinstance(item, Media) else Media(item)
+        file = Path(item.path)
+        if not file.is_file():
+            notes.append(f"{title}: {file.name} was not written.")
+            continue
+        shown = element(_data_uri(file), item.caption or file.stem.replace("_", " "))
+        caption = f"<figcaption>{_text(item.caption)}</figcaption>" if item.caption else ""
+        figures.append(f"<figure>{shown}{caption}</figure>")
+    if not figures:
+        return ""
+    return f'<section><h2>{title}</h2><div class="gallery {title.lower()}">{"".join(figures)}</div></section>'
+
+
+def _image(uri: str, caption: str) -> str:
+    return f'<img src="{uri}" alt="{_text(caption)}">'
+
+
+def _video(uri: str, caption: str) -> str:
+    return f'<video src="{uri}" controls loop muted playsinline aria-label="{_text(caption)}"></video>'
+
+
+def _data_uri(file: Path) -> str:
+    mime = _MIME.get(file.suffix.lower())
+    if mime is None:
+        raise ValueError(f"{file}: expected one of {', '.join(_MIME)}, found {file.suffix!r}")
+    return f"data:{mime};base64,{base64.b64encode(file.read_bytes()).decode()}"
+
+
+def _notes(notes: Sequence[str]) -> str:
+    if not notes:
+        return ""
+    items = "".join(f"<li>{_text(note)}</li>" for note in notes)
+    return f'<section class="notes"><h2>What was not scored, and why</h2><ul>{items}</ul></section>'

@@ -1,0 +1,128 @@
+"""The folder of one run: what lies where, and who may write over it."""
+
+import dataclasses
+import enum
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gsjax.io.atomic import atomic_write, write_json, write_npz
+
+_FILES = ("config.yml", "metrics.json", "trajectory.npz", "scene.ply", "report.html")
+_FOLDERS = ("renders", "plots")
+_PATTERNS = ("video_*.mp4", ".*.partial*")
+
+
+class RunFolder:
+    """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
+
+        RUN/
+          config.yml              the settings, written first
+          metrics.json            every score; what could not be computed is null
+          trajectory.npz          means [T,N,3], labels [N], label_ids [K+1], times [T], update_s [T]
+          scene.ply               the Gaussians of the last frame
+          renders/CAM/FRAME.png   rendered images
+          video_CAM.mp4           input, render, error and labels side by side
+          plots/NAME.svg|png      update time, error over frames, ...
+          report.html             all of it on one page, written last: a run that has it is finished
+
+    Attributes:
+        path: the folder, which exists.
+    """
+
+    def __init__(self, path: str | Path, *, overwrite: bool = False):
+        """Makes the folder, clearing what an unfinished run left there.
+
+        Args:
+            path: a folder that does not exist, is empty, or holds an earlier run.
+            overwrite: clear an earlier run although it is finished. Files that no run writes are kept.
+
+        Raises:
+            FileExistsError: a finished run is there and `overwrite` is off.
+            FileExistsError: something that is not a run is there; nothing of it is touched.
+            NotADirectoryError: `path` is a file.
+        """
+        self.path = Path(path)
+        if self.path.exists() and not self.path.is_dir():
+            raise NotADirectoryError(f"{self.path}: expected a folder, found a file; name another folder")
+        if self.path.is_dir() and any(self.path.iterdir()):
+            self._claim(overwrite)
+        self.path.mkdir(parents=True, exist_ok=True)
+
+    def _claim(self, overwrite: bool) -> None:
+        # config.yml is written first, so a folder without it is none of ours: delete nothing there.
+        if not (self.path / "config.yml").is_file():
+            raise FileExistsError(
+                f"{self.path}: expected a new folder, an empty one or one of a run (with config.yml), "
+                "found other files; name another folder"
+            )
+        if self.finished and not overwrite:
+            raise FileExistsError(
+                f"{self.path}: holds a finished run (report.html); name another folder or ask to overwrite it"
+            )
+        for name in (*_FILES, *_FOLDERS, *_PATTERNS):
+            for entry in self.path.glob(name):
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+    @property
+    def finished(self) -> bool:
+        """Whether a run has written its report here."""
+        return self.report.is_file()
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+    @property
+    def scene(self) -> Path:
+        return self.path / "scene.ply"
+
+    def render(self, camera: int | str, frame: int) -> Path:
+        """Where the rendered image of a camera (its cam_id) at a frame belongs; its folder exists."""
+        path = self.path / "renders" / str(camera) / f"{frame:06d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def video(self, camera: int | str) -> Path:
+        """Where the side-by-side video of a camera belongs."""
+        return self.path / f"video_{camera}.mp4"
+
+    def plot(self, name: str, suffix: str = ".svg") -> Path:
+        """Where the plot `name` belongs; its folder exists."""
+        path = self.path / "plots" / f"{name}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def write_config(self, config: Any) -> None:
+        """Writes config.yml from a dataclass instance, nested ones included.
+
+        Raises:
+            TypeError: `config` is not a dataclass instance.
+        """
+        text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
+        with atomic_write(self.path / "config.yml") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def write_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """Writes metrics.json; numbers that are not finite become null."""
+        write_json(self.path / "metrics.json", metrics)
+
+    def write_trajectory(self, **arrays: Any) -> None:
+        """Writes trajectory.npz."""
+        write_npz(self.path / "trajectory.npz", arrays)
+
+
+def _plain(value: Any) -> Any:
+    """`value` in the types that YAML has words for: paths as text, enums as their values, tuples as lists."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy and JAX arrays and scalars
+        return value.tolist()
+    if isinstance(value, enum.Enum):
+        return _plain(value.value)
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

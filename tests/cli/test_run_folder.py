@@ -1,0 +1,113 @@
+import dataclasses
+import enum
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from gsjax.cli.run_folder import RunFolder
+
+
+class Mode(enum.Enum):
+    FAST = "fast"
+
+
+@dataclasses.dataclass
+class Inner:
+    rate: float = 0.5
+    mode: Mode = Mode.FAST
+
+
+@dataclasses.dataclass
+class Config:
+    out: Path = Path("runs/a")
+    cameras: tuple[int, ...] = (0, 1)
+    count: object = dataclasses.field(default_factory=lambda: np.int64(3))
+    inner: Inner = dataclasses.field(default_factory=Inner)
+    note: str | None = None
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """A finished run with a file of every kind, and one that is not of the run."""
+    run = RunFolder(tmp_path / "run")
+    run.write_config(Config())
+    run.write_metrics({"psnr": 30.0})
+    run.write_trajectory(means=np.zeros((2, 3, 3)))
+    for file in (run.scene, run.render(0, 5), run.video(0), run.plot("psnr"), run.report):
+        file.write_text("x")
+    (run.path / "my notes.txt").write_text("keep")
+    return run
+
+
+def contents(run):
+    return sorted(str(file.relative_to(run.path)) for file in run.path.rglob("*") if file.is_file())
+
+
+def test_layout_is_what_the_docstring_says(finished):
+    assert contents(finished) == [
+        "config.yml",
+        "metrics.json",
+        "my notes.txt",
+        "plots/psnr.svg",
+        "renders/0/000005.png",
+        "report.html",
+        "scene.ply",
+        "trajectory.npz",
+        "video_0.mp4",
+    ]
+    assert finished.finished
+
+
+def test_config_is_plain_yaml(finished):
+    assert yaml.safe_load((finished.path / "config.yml").read_text()) == {
+        "out": "runs/a",
+        "cameras": [0, 1],
+        "count": 3,
+        "inner": {"rate": 0.5, "mode": "fast"},
+        "note": None,
+    }
+
+
+def test_metrics_have_null_for_what_is_not_finite(finished):
+    finished.write_metrics({"psnr": np.float32("nan"), "iou": {"cup": [0.5, float("inf")]}})
+    metrics = json.loads((finished.path / "metrics.json").read_text())
+    assert metrics == {"psnr": None, "iou": {"cup": [0.5, None]}}
+
+
+def test_finished_run_is_not_overwritten(finished):
+    before = contents(finished)
+    with pytest.raises(FileExistsError, match="finished run"):
+        RunFolder(finished.path)
+    assert contents(finished) == before
+
+
+def test_overwriting_clears_the_run_and_nothing_else(finished):
+    run = RunFolder(finished.path, overwrite=True)
+    assert contents(run) == ["my notes.txt"]
+    assert not run.finished
+
+
+def test_unfinished_run_is_replaced(finished):
+    finished.report.unlink()
+    assert contents(RunFolder(finished.path)) == ["my notes.txt"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_folder_of_something_else_is_left_alone(tmp_path, overwrite):
+    (tmp_path / "scene.ply").write_text("precious")
+    with pytest.raises(FileExistsError, match=r"expected .* found other files"):
+        RunFolder(tmp_path, overwrite=overwrite)
+    assert (tmp_path / "scene.ply").read_text() == "precious"
+
+
+def test_file_in_place_of_a_folder(tmp_path):
+    (tmp_path / "run").touch()
+    with pytest.raises(NotADirectoryError, match="expected a folder, found a file"):
+        RunFolder(tmp_path / "run")
+
+
+def test_empty_folder_is_taken(tmp_path):
+    assert RunFolder(tmp_path).path == tmp_path
