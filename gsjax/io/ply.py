@@ -1,0 +1,193 @@
+"""Gaussians as PLY files in the layout of 3DGS (Kerbl et al. 2023), which most viewers and trainers read.
+
+One vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
+then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. Ours adds feature_* and label
+where a scene has them; other readers pass over both.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int, Integer
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from gsjax.geometry.spherical_harmonics import num_sh_bases
+from gsjax.io.atomic import atomic_write
+from gsjax.scene.gaussians import Gaussians, take, valid_rows
+
+_REQUIRED = (
+    *("x", "y", "z"),
+    *(f"f_dc_{i}" for i in range(3)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+_NORMALS = ("nx", "ny", "nz")
+_REST_COUNTS = tuple(3 * (num_sh_bases(degree) - 1) for degree in range(4))
+
+
+class PlyError(ValueError):
+    """A file that is no PLY of Gaussians: names the path, what was expected, what was found, what to do."""
+
+    def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
+        super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
+
+
+@dataclass(frozen=True)
+class PlyReport:
+    """What a PLY file held beside the Gaussians that were returned.
+
+    Attributes:
+        stored: rows in the file.
+        culled: rows left out, for a value that is NaN or infinite or a quaternion of no length.
+        extra: properties that were not read.
+        labels: int32 label of each Gaussian returned, or None where the file has no labels.
+    """
+
+    stored: int
+    culled: int
+    extra: tuple[str, ...]
+    labels: Int[np.ndarray, "N"] | None = None
+
+
+def write_ply(
+    path: str | os.PathLike, gaussians: Gaussians, *, labels: Integer[np.ndarray, "labels"] | None = None
+) -> None:
+    """Write Gaussians (and their `labels`) as a binary little-endian PLY of float32; atomic.
+
+    Raises:
+        ValueError: `labels` are not one integer a Gaussian.
+    """
+    columns = _columns(gaussians)
+    fields = [(name, "<f4") for name in columns]
+    if labels is not None:
+        labels = np.asarray(labels)
+        if labels.shape != (gaussians.num,) or not np.issubdtype(labels.dtype, np.integer):
+            raise ValueError(
+                f"labels: got {labels.dtype} of shape {labels.shape}, want integers [{gaussians.num}]"
+            )
+        columns["label"] = labels
+        fields.append(("label", "<i4"))
+    vertices = np.empty(gaussians.num, dtype=fields)
+    for name, column in columns.items():
+        vertices[name] = column
+    with atomic_write(path) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
+
+
+def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """The float properties of a file, by name, in the order of 3DGS."""
+    means, quats = np.asarray(gaussians.means), np.asarray(gaussians.quats)
+    sh0, log_scales = np.asarray(gaussians.sh0)[:, 0], np.asarray(gaussians.log_scales)
+    columns = dict(zip("xyz", means.T, strict=True))
+    columns |= {name: np.zeros(gaussians.num) for name in _NORMALS}
+    columns |= {f"f_dc_{i}": sh0[:, i] for i in range(3)}
+    if gaussians.shN is not None:
+        # [N, K-1, 3] -> [N, 3, K-1]: the file is channel-major, the trap of this format.
+        rest = np.asarray(gaussians.shN).transpose(0, 2, 1).reshape(gaussians.num, 3 * gaussians.shN.shape[1])
+        columns |= {f"f_rest_{i}": column for i, column in enumerate(rest.T)}
+    columns["opacity"] = np.asarray(gaussians.logit_opacities)
+    columns |= {f"scale_{i}": log_scales[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": quats[:, i] for i in range(4)}
+    if gaussians.features is not None:
+        columns |= {f"feature_{i}": column for i, column in enumerate(np.asarray(gaussians.features).T)}
+    return columns
+
+
+def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
+    """Gaussians of a 3DGS PLY (binary of either byte order, or ascii), as float32.
+
+    Rows that no renderer could draw (a NaN, an infinity, a zero quaternion) are culled and counted.
+
+    Raises:
+        FileNotFoundError: there is no file at `path`.
+        PlyError: the file is no PLY, is cut off, or lacks properties of a Gaussian.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a PLY file of Gaussians, found no file. Check the path")
+    vertices = _read_vertices(path)
+    names = vertices.dtype.names or ()
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise PlyError(
+            path,
+            f"the properties {', '.join(_REQUIRED)}",
+            f"no {', '.join(missing)} among {', '.join(names) or 'none'}",
+            _advice(names),
+        )
+    rest, features = _numbered(names, "f_rest_"), _numbered(names, "feature_")
+    if len(rest) not in _REST_COUNTS:
+        raise PlyError(
+            path,
+            f"{', '.join(map(str, _REST_COUNTS))} properties f_rest_* (degree 0 to 3)",
+            f"{len(rest)}",
+            "Export the scene with spherical harmonics of degree 3 or less",
+        )
+    shN = _stack(vertices, rest).reshape(len(vertices), 3, len(rest) // 3) if rest else None
+    gaussians = Gaussians(
+        means=jnp.asarray(_stack(vertices, ("x", "y", "z"))),
+        quats=jnp.asarray(_stack(vertices, [f"rot_{i}" for i in range(4)])),
+        log_scales=jnp.asarray(_stack(vertices, [f"scale_{i}" for i in range(3)])),
+        logit_opacities=jnp.asarray(_stack(vertices, ["opacity"])[:, 0]),
+        sh0=jnp.asarray(_stack(vertices, [f"f_dc_{i}" for i in range(3)])[:, None, :]),
+        shN=None if shN is None else jnp.asarray(shN.transpose(0, 2, 1)),
+        features=jnp.asarray(_stack(vertices, features)) if features else None,
+    )
+    valid = valid_rows(gaussians)
+    known = {*_REQUIRED, *_NORMALS, *rest, *features, "label"}
+    report = PlyReport(
+        stored=len(vertices),
+        culled=int(np.sum(~valid)),
+        extra=tuple(name for name in names if name not in known),
+        labels=np.asarray(vertices["label"])[valid].astype(np.int32) if "label" in names else None,
+    )
+    return take(gaussians, np.flatnonzero(valid)), report
+
+
+def _read_vertices(path: Path) -> np.ndarray:
+    """The vertex element of a PLY as a structured array."""
+    with open(path, "rb") as stream:
+        start = stream.read(4)
+    if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
+        raise PlyError(path, "a PLY file, which starts with 'ply'", repr(start), "Export it as PLY")
+    try:
+        ply = PlyData.read(str(path))
+    except (PlyParseError, ValueError, UnicodeDecodeError, MemoryError, OverflowError) as error:
+        raise PlyError(
+            path,
+            "a whole PLY file",
+            f"one that cannot be parsed ({error})",
+            "It may be cut off or damaged: copy or export it again",
+        ) from error
+    if "vertex" not in ply:
+        names = ", ".join(element.name for element in ply.elements) or "none"
+        raise PlyError(path, "an element 'vertex'", f"elements {names}", "Export a scene of Gaussians")
+    return ply["vertex"].data
+
+
+def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
+    """Properties prefix0, prefix1, ... as far as they go without a gap."""
+    count = 0
+    while f"{prefix}{count}" in names:
+        count += 1
+    return [f"{prefix}{i}" for i in range(count)]
+
+
+def _stack(vertices: np.ndarray, names) -> np.ndarray:
+    """Columns of a structured array side by side, float32."""
+    return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
+
+
+def _advice(names: tuple[str, ...]) -> str:
+    """What to do about a PLY that lacks properties, by what it seems to be."""
+    if "packed_position" in names:
+        return "This is PlayCanvas's compressed PLY: convert it to an uncompressed one (splat-transform does)"
+    if {"scale_0", "scale_1"} <= set(names) and "scale_2" not in names:
+        return "This seems to be 2D Gaussian splatting, which has no third axis"
+    if {"x", "y", "z"} <= set(names):
+        return "This seems to be a point cloud or a mesh: make Gaussians of it with gaussians_from_points"
+    return "Export the scene in the 3D Gaussian splatting PLY format"

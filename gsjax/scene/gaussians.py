@@ -1,0 +1,211 @@
+"""The scene: Gaussians as one pytree of raw (unconstrained) parameters, and the integers beside them."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Bool, Float, Integer
+
+from gsjax.geometry.rotations import MIN_SQUARED_NORM
+from gsjax.geometry.spherical_harmonics import num_sh_bases, rgb_to_sh0
+
+# Activated values are pulled into this range before their logarithm is taken, so that 0 and 1 stay finite.
+_MIN_SCALE = 1e-12
+_MIN_OPACITY = 1e-6
+_SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
+
+
+class Gaussians(eqx.Module):
+    """N Gaussians. All leaves are floats, so `jax.grad` takes the whole; an absent field is None and free.
+
+    Attributes:
+        means: centres in the world, metres.
+        quats: orientations [w, x, y, z], of any non-zero length.
+        log_scales: logarithms of the standard deviations along the own axes, metres.
+        logit_opacities: logits of the opacities.
+        sh0: constant spherical-harmonics coefficient of each colour channel.
+        shN: the other coefficients, K in 4, 9, 16; None draws one colour from all sides.
+        features: any further values to composite.
+
+    Raises:
+        ValueError: a field is no float array or has another shape, when it is constructed (tree
+            transformations such as `vmap` rebuild it unchecked, with whatever axes they put in front).
+    """
+
+    means: Float[Array, "N 3"]
+    quats: Float[Array, "N 4"]
+    log_scales: Float[Array, "N 3"]
+    logit_opacities: Float[Array, "N"]
+    sh0: Float[Array, "N 1 3"]
+    shN: Float[Array, "N rest 3"] | None = None
+    features: Float[Array, "N D"] | None = None
+
+    def __check_init__(self):
+        count = self.means.shape[0] if np.ndim(self.means) else None
+        wanted = {
+            "means": (count, 3),
+            "quats": (count, 4),
+            "log_scales": (count, 3),
+            "logit_opacities": (count,),
+            "sh0": (count, 1, 3),
+            "shN": (count, None, 3),
+            "features": (count, None),
+        }
+        for name, shape in wanted.items():
+            value = getattr(self, name)
+            if value is not None:
+                _check_array(f"Gaussians.{name}", value, shape)
+        if self.shN is not None and self.shN.shape[1] + 1 not in _SH_SIZES[1:]:
+            raise ValueError(
+                f"Gaussians.shN: got shape {self.shN.shape}, want [N, 3, 3], [N, 8, 3] or [N, 15, 3] "
+                "(degree 1, 2 or 3 without its constant), or None for degree 0"
+            )
+
+    @property
+    def num(self) -> int:
+        """How many Gaussians there are."""
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Float[Array, "N 3"]:
+        """Standard deviations along the own axes, metres."""
+        return jnp.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Float[Array, "N"]:
+        """Opacities, 0 to 1."""
+        return jax.nn.sigmoid(self.logit_opacities)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return 0 if self.shN is None else _SH_SIZES.index(self.shN.shape[-2] + 1)
+
+    @property
+    def sh(self) -> Float[Array, "N K 3"]:
+        """All spherical-harmonics coefficients."""
+        return self.sh0 if self.shN is None else jnp.concatenate([self.sh0, self.shN], axis=-2)
+
+
+class Tags(eqx.Module):
+    """What is known of each Gaussian and is no parameter; kept apart because it has no gradient.
+
+    Attributes:
+        labels: object ids; 0 is background.
+        alive: False for slots that hold no Gaussian at present.
+    """
+
+    labels: Integer[Array, "N"] | None = None
+    alive: Bool[Array, "N"] | None = None
+
+
+def _check_array(name: str, value: ArrayLike, wanted: tuple[int | None, ...]) -> None:
+    """Raise ValueError unless `value` is a float array of shape `wanted`, in which None is any size."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if shape is None or dtype is None:
+        return  # a stand-in that a tree transformation put there (None, a spec, a rate)
+    fits = len(shape) == len(wanted) and all(w is None or s == w for s, w in zip(shape, wanted, strict=True))
+    if not fits:
+        text = ", ".join("any" if size is None else str(size) for size in wanted)
+        raise ValueError(f"{name}: got shape {tuple(shape)}, want [{text}]")
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"{name}: got dtype {dtype}, want floats (integers belong in Tags)")
+
+
+def gaussians_from_activated(
+    means: ArrayLike,
+    quats: ArrayLike,
+    scales: ArrayLike,
+    opacities: ArrayLike,
+    colors: ArrayLike,
+    *,
+    shN: ArrayLike | None = None,
+    features: ArrayLike | None = None,
+    dtype: DTypeLike = jnp.float32,
+) -> Gaussians:
+    """Gaussians from values as one thinks of them: the inverse of the activations.
+
+    Args:
+        means: [N, 3], metres.
+        quats: [N, 4], w x y z.
+        scales: [N, 3], metres; smaller than 1e-12 counts as 1e-12.
+        opacities: [N], 0 to 1, pulled into [1e-6, 1 - 1e-6] so that the logits are finite.
+        colors: [N, 3], RGB 0 to 1, from which sh0 is made.
+        shN: [N, K-1, 3] or None.
+        features: [N, D] or None.
+        dtype: of all fields.
+
+    Raises:
+        ValueError: a shape is not the one wanted; the message names the argument.
+    """
+    count = np.shape(means)[0] if np.ndim(means) else None
+    wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
+    arrays = dict(zip(wanted, (means, quats, scales, opacities, colors), strict=True))
+    arrays = {name: jnp.asarray(value, dtype) for name, value in arrays.items()}
+    for name, columns in wanted.items():
+        _check_array(name, arrays[name], (count,) if columns is None else (count, columns))
+    opacities = jnp.clip(arrays["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
+    return Gaussians(
+        means=arrays["means"],
+        quats=arrays["quats"],
+        log_scales=jnp.log(jnp.maximum(arrays["scales"], _MIN_SCALE)),
+        logit_opacities=jnp.log(opacities) - jnp.log1p(-opacities),
+        sh0=rgb_to_sh0(arrays["colors"])[:, None, :],
+        shN=None if shN is None else jnp.asarray(shN, dtype),
+        features=None if features is None else jnp.asarray(features, dtype),
+    )
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of `parts`, in order. Missing SH degrees are filled with zeros, which draws the same.
+
+    Raises:
+        ValueError: there are no parts, or their features differ in dimension or are there only in some.
+    """
+    if not parts:
+        raise ValueError("concatenate: got no parts, want at least one Gaussians")
+    sizes = {None if part.features is None else part.features.shape[1] for part in parts}
+    if len(sizes) > 1:
+        raise ValueError(f"concatenate: features must have one size in all parts or be None, got {sizes}")
+    degree = max(part.sh_degree for part in parts)
+    padded = [_with_sh_degree(part, degree) for part in parts]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=0), *padded)
+
+
+def _with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians with zeros for coefficients up to `degree` that they lack."""
+    missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
+    if missing == 0:
+        return gaussians
+    padded = jnp.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))
+    return eqx.tree_at(lambda g: g.shN, gaussians, padded[:, 1:], is_leaf=lambda leaf: leaf is None)
+
+
+Tree = TypeVar("Tree", Gaussians, Tags)
+
+
+def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) -> Tree:
+    """The rows `indices` (or, outside a trace, those where a boolean mask is True) of Gaussians or Tags."""
+    indices = jnp.asarray(indices)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[indices], tree)
+
+
+def valid_rows(gaussians: Gaussians) -> Bool[np.ndarray, "N"]:
+    """Where all values are finite and the quaternion names a rotation. On the host."""
+    valid = np.ones(gaussians.num, bool)
+    for leaf in jax.tree.leaves(gaussians):
+        valid &= np.isfinite(np.asarray(leaf)).all(axis=tuple(range(1, leaf.ndim)))
+    # In float64, so that 1e38 does not overflow to inf and a denormal does not vanish.
+    quats = np.where(valid[:, None], np.asarray(gaussians.quats, np.float64), 0.0)
+    return valid & (np.sum(quats**2, axis=1) >= MIN_SQUARED_NORM)
+
+
+def cull_invalid(gaussians: Gaussians) -> tuple[Gaussians, int]:
+    """Without the rows that hold NaN, infinity or a quaternion of |q|^2 < 1e-12, and how many those were."""
+    valid = valid_rows(gaussians)
+    removed = int(np.sum(~valid))
+    return (gaussians if removed == 0 else take(gaussians, np.flatnonzero(valid))), removed

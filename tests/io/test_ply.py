@@ -1,0 +1,183 @@
+"""PLY: what is written is read back, in the channel order of 3DGS; what is no PLY is told so."""
+
+import io
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from gsjax.geometry.spherical_harmonics import num_sh_bases
+from gsjax.io.ply import PlyError, read_ply, write_ply
+from gsjax.scene.gaussians import Gaussians
+
+
+def random_gaussians(count, degree=0, features=0, seed=0):
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    rest = num_sh_bases(degree) - 1
+    return Gaussians(
+        means=draw(count, 3),
+        quats=draw(count, 4),
+        log_scales=draw(count, 3),
+        logit_opacities=draw(count),
+        sh0=draw(count, 1, 3),
+        shN=draw(count, rest, 3) if rest else None,
+        features=draw(count, features) if features else None,
+    )
+
+
+def assert_same(a, b):
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "features"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert (left is None) == (right is None), name
+        if left is not None:
+            np.testing.assert_array_equal(left, right, err_msg=name)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    count=st.integers(0, 20), degree=st.integers(0, 3), features=st.integers(0, 4), seed=st.integers(0, 2**31)
+)
+def test_round_trip_is_exact(tmp_path_factory, count, degree, features, seed):
+    path = tmp_path_factory.mktemp("ply") / "scene.ply"
+    gaussians = random_gaussians(count, degree, features, seed)
+    write_ply(path, gaussians)
+    loaded, report = read_ply(path)
+    assert_same(gaussians, loaded)
+    assert (report.stored, report.culled, report.extra) == (count, 0, ())
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_f_rest_is_channel_major(tmp_path, degree):
+    path = tmp_path / "scene.ply"
+    gaussians = random_gaussians(3, degree)
+    write_ply(path, gaussians)
+    vertices = PlyData.read(str(path))["vertex"].data
+    per_channel = num_sh_bases(degree) - 1
+    for channel in range(3):
+        for basis in range(per_channel):
+            stored = vertices[f"f_rest_{channel * per_channel + basis}"]
+            np.testing.assert_array_equal(stored, gaussians.shN[:, basis, channel])
+
+
+def test_properties_stand_in_the_order_of_3dgs(tmp_path):
+    write_ply(tmp_path / "scene.ply", random_gaussians(1, degree=1))
+    names = PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data.dtype.names
+    rest = [f"f_rest_{i}" for i in range(9)]
+    assert list(names) == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *rest,
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+@pytest.mark.parametrize(("text", "byte_order"), [(True, "="), (False, ">"), (False, "<")])
+def test_reads_ascii_and_both_byte_orders_with_extra_fields(tmp_path, text, byte_order):
+    path = tmp_path / "scene.ply"
+    gaussians = random_gaussians(7, degree=1)
+    write_ply(path, gaussians)
+    vertices = PlyData.read(str(path))["vertex"].data
+    wider = np.empty(7, [*vertices.dtype.descr, ("confidence", "f8"), ("red", "u1")])
+    for name in vertices.dtype.names:
+        wider[name] = vertices[name]
+    wider["confidence"], wider["red"] = 0.5, 7
+    faces = np.empty(0, [("vertex_indices", "i4", (3,))])
+    elements = [PlyElement.describe(wider, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, text=text, byte_order=byte_order).write(str(path))
+    loaded, report = read_ply(path)
+    np.testing.assert_allclose(loaded.shN, gaussians.shN, rtol=1e-6)
+    np.testing.assert_allclose(loaded.quats, gaussians.quats, rtol=1e-6)
+    assert report.extra == ("confidence", "red")
+
+
+def test_rows_that_cannot_be_drawn_are_culled_and_counted(tmp_path):
+    gaussians = random_gaussians(6)
+    gaussians = Gaussians(
+        means=gaussians.means.at[1, 0].set(jnp.nan),
+        quats=gaussians.quats.at[3].set(0.0),
+        log_scales=gaussians.log_scales.at[4, 2].set(jnp.inf),
+        logit_opacities=gaussians.logit_opacities,
+        sh0=gaussians.sh0,
+    )
+    write_ply(tmp_path / "scene.ply", gaussians, labels=np.arange(6))
+    loaded, report = read_ply(tmp_path / "scene.ply")
+    assert (report.stored, report.culled) == (6, 3)
+    np.testing.assert_array_equal(report.labels, [0, 2, 5])
+    np.testing.assert_array_equal(loaded.means, gaussians.means[jnp.array([0, 2, 5])])
+
+
+def test_labels_of_another_length_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"labels: got .* want integers \[3\]"):
+        write_ply(tmp_path / "scene.ply", random_gaussians(3), labels=np.arange(4))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("keep", [0.99, 0.6, 0.1])
+def test_a_file_cut_off_is_named(tmp_path, keep):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(50))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(PlyError, match=r"scene\.ply: expected a whole PLY file.*copy or export it again"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04zip", b"\x80\x04pickle"])
+def test_a_file_that_is_no_ply_is_named(tmp_path, content):
+    path = tmp_path / "scene.ply"
+    path.write_bytes(content)
+    with pytest.raises(PlyError, match="expected a PLY file"):
+        read_ply(path)
+
+
+def test_a_header_that_promises_too_much_is_refused(tmp_path):
+    path = tmp_path / "scene.ply"
+    write_ply(path, random_gaussians(5))
+    path.write_bytes(path.read_bytes().replace(b"element vertex 5", b"element vertex 99999999999999"))
+    with pytest.raises(PlyError, match="cut off or damaged"):
+        read_ply(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.ply"):
+        read_ply(tmp_path / "nothing.ply")
+
+
+@pytest.mark.parametrize(
+    ("names", "advice"),
+    [
+        (["x", "y", "z"], "point cloud or a mesh"),
+        (["packed_position"], "compressed PLY"),
+        (["intensity"], "Gaussian splatting PLY format"),
+        (["x", "y", "z", "scale_0", "scale_1"], "no third axis"),
+    ],
+)
+def test_missing_properties_are_listed_with_advice(tmp_path, names, advice):
+    vertices = np.zeros(2, [(name, "f4") for name in names])
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "scene.ply"))
+    with pytest.raises(PlyError, match=f"rot_3.*{advice}"):
+        read_ply(tmp_path / "scene.ply")
+
+
+def test_no_vertex_element_is_told(tmp_path):
+    stream = io.BytesIO()
+    PlyData([PlyElement.describe(np.zeros(1, [("a", "f4")]), "thing")]).write(stream)
+    (tmp_path / "scene.ply").write_bytes(stream.getvalue())
+    with pytest.raises(PlyError, match=r"element 'vertex'.*thing"):
+        read_ply(tmp_path / "scene.ply")
+
+
+def test_an_unusual_count_of_harmonics_is_refused(tmp_path):
+    write_ply(tmp_path / "scene.ply", random_gaussians(2, degree=1))
+    vertices = PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data
+    fewer = vertices[[name for name in vertices.dtype.names if name != "f_rest_8"]]
+    packed = np.array(fewer.tolist(), dtype=[(name, "f4") for name in fewer.dtype.names])
+    PlyData([PlyElement.describe(packed, "vertex")]).write(str(tmp_path / "scene.ply"))
+    with pytest.raises(PlyError, match=r"0, 9, 24, 45 properties f_rest_\*.*found 8"):
+        read_ply(tmp_path / "scene.ply")
