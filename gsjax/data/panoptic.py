@@ -32,8 +32,8 @@ _ADVICE_META = "Correct the file, or leave that frame or camera out of it."
 def read_panoptic(path: str | Path) -> Sequence:
     """The sequence in a folder of this layout; cameras of both metas, in the order in which they stand.
 
-    Without `time` the frames are taken as 1/30 s apart; without `depth_unit_m` depth is in millimetres. Frames
-    of which no image exists are left out, with a DataWarning that counts them.
+    Without `time` the frames are 1/30 s apart; without `depth_unit_m` depth is in millimetres. Frames of
+    which no image exists are left out, with a DataWarning that counts them.
 
     Raises:
         DataError: a meta is missing or disagrees with itself or with the other, an image of a frame is

@@ -1,0 +1,12 @@
+"""Built-in scenes: a ray-caster of textured, shadowed solids that move rigidly, by seed.
+
+They are no Gaussians, so a reconstruction of them cannot be right by accident; and they need no download.
+"""
+
+from gsjax.data.simulated.primitives import Primitive
+from gsjax.data.simulated.raycaster import Light, Scene
+from gsjax.data.simulated.simulation import simulated_sequence
+from gsjax.data.simulated.tabletop import tabletop
+from gsjax.data.simulated.textures import Texture
+
+__all__ = ["Light", "Primitive", "Scene", "Texture", "simulated_sequence", "tabletop"]

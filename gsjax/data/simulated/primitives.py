@@ -1,0 +1,103 @@
+"""Convex solids and a plane: where rays enter them, and their normals. All rays are columns, [3,N].
+
+Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; rays
+that miss it, or that start inside, give infinity.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.simulated.textures import Texture
+
+_TINY = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """One solid of a body.
+
+    Attributes:
+        shape: "box", "sphere", "cylinder" (about z) or "plane" (z = 0, seen from above).
+        size: metres: three half edges; a radius; a radius and half a length; nothing.
+        texture: its colours, in coordinates of the primitive, so that they turn with it.
+        body: index of the body that it moves with.
+        pose: primitive to body, [4,4].
+    """
+
+    shape: Literal["box", "sphere", "cylinder", "plane"]
+    size: tuple[float, ...]
+    texture: Texture
+    body: int = 0
+    pose: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def half_extents(self) -> Float[np.ndarray, "3"]:
+        """Half the edges of the box around it; infinite for a plane."""
+        match self.shape:
+            case "box":
+                return np.array(self.size)
+            case "sphere":
+                return np.full(3, self.size[0])
+            case "cylinder":
+                return np.array([self.size[0], self.size[0], self.size[1]])
+        return np.array([np.inf, np.inf, 0.0])
+
+
+def intersect(
+    primitive: Primitive, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
+) -> Float[np.ndarray, "n"]:
+    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity."""
+    match primitive.shape:
+        case "box":
+            near, far = _slabs(primitive.size, origin, directions, axes=(0, 1, 2))
+        case "sphere":
+            near, far = _quadric(primitive.size[0], origin, directions)
+        case "cylinder":
+            radius, half = primitive.size
+            near, far = _quadric(radius, origin[:2], directions[:2])
+            low, high = _slabs((0.0, 0.0, half), origin, directions, axes=(2,))
+            near, far = np.maximum(near, low), np.minimum(far, high)
+        case "plane":
+            down = np.where(directions[2] < 0, directions[2], -_TINY)
+            near = far = -origin[2] / down
+    return np.where((near <= far) & (near > 0) & np.isfinite(near), near, np.inf)
+
+
+def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    """Outward unit normals at points of the surface, in the primitive's frame."""
+    match primitive.shape:
+        case "box":
+            axis = np.argmax(np.abs(points) - np.array(primitive.size)[:, None], axis=0)
+            return np.where(np.arange(3)[:, None] == axis, np.sign(points), 0.0)
+        case "sphere":
+            return points / primitive.size[0]
+        case "cylinder":
+            radius, half = primitive.size
+            distance = np.hypot(points[0], points[1])
+            on_cap = np.abs(points[2]) - half > distance - radius
+            side = points * np.array([[1.0], [1.0], [0.0]]) / np.maximum(distance, _TINY)
+            return np.where(on_cap, np.array([[0.0], [0.0], [1.0]]) * np.sign(points), side)
+    return np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), points.shape)
+
+
+def _slabs(half, origin, directions, axes):
+    """The stretch of each ray between pairs of planes at +-half."""
+    near, far = -np.inf, np.inf
+    for i in axes:
+        inverse = 1.0 / np.where(np.abs(directions[i]) < _TINY, _TINY, directions[i])
+        a, b = (-half[i] - origin[i]) * inverse, (half[i] - origin[i]) * inverse
+        near, far = np.maximum(near, np.minimum(a, b)), np.minimum(far, np.maximum(a, b))
+    return near, far
+
+
+def _quadric(radius, origin, directions):
+    """The stretch of each ray within a sphere, or, with two coordinates, within an endless cylinder."""
+    a = np.maximum(np.einsum("ij,ij->j", directions, directions), _TINY)
+    b = origin @ directions
+    discriminant = b * b - a * (origin @ origin - radius * radius)
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    hit = discriminant > 0
+    return np.where(hit, (-b - root) / a, np.inf), np.where(hit, (-b + root) / a, -np.inf)

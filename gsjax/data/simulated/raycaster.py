@@ -1,0 +1,226 @@
+"""Exact images of moving solids: colour, depth along the optical axis, labels and optical flow."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from gsjax.data.simulated.primitives import Primitive, intersect, normals
+from gsjax.data.simulated.textures import GAMMA, albedo
+
+_NEAR_M = 1e-3
+# A surface does not shade itself: shadow rays end this fraction before the point.
+_SHADOW_MARGIN = 1e-6
+# Where in a pixel colour is sampled, and which point of the light each sample sees (in its radius).
+_SUBPIXELS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+_LIGHT_POINTS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A small lamp and the light from all around.
+
+    Attributes:
+        position: metres, world, [3].
+        radius: metres; softens shadows, by as many samples as a pixel has.
+        color: linear RGB of the lamp.
+        ambient: linear RGB from above; surfaces that face down get half.
+    """
+
+    position: tuple[float, float, float]
+    radius: float = 0.0
+    color: tuple[float, float, float] = (0.82, 0.78, 0.70)
+    ambient: tuple[float, float, float] = (0.26, 0.28, 0.32)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Solids on bodies that move rigidly, a light, and cameras.
+
+    Attributes:
+        primitives: the solids; those of one body never move relative to each other.
+        labels: the mask value of each body, [B].
+        poses: body-to-world transforms, [T,B,4,4].
+        light: the lamp.
+        Ks: [T,C,3,3].
+        viewmats: world to camera, OpenCV axes, [T,C,4,4].
+        width: pixels.
+        height: pixels.
+    """
+
+    primitives: tuple[Primitive, ...]
+    labels: Int[np.ndarray, "bodies"]
+    poses: Float[np.ndarray, "frames bodies 4 4"]
+    light: Light
+    Ks: Float[np.ndarray, "frames cameras 3 3"]
+    viewmats: Float[np.ndarray, "frames cameras 4 4"]
+    width: int
+    height: int
+
+    def primitive_poses(self, t: int) -> list[Float[np.ndarray, "4 4"]]:
+        """Primitive-to-world transforms in frame t."""
+        return [self.poses[t, primitive.body] @ primitive.pose for primitive in self.primitives]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What the rays of one camera met.
+
+    Attributes:
+        depth: metres along the optical axis, infinite where nothing was met.
+        primitive: index of the primitive, -1 where nothing was met.
+        origin: the camera, world, [3].
+        directions: world, scaled so that depth is their length, [3,H,W].
+    """
+
+    depth: Float[np.ndarray, "height width"]
+    primitive: Int[np.ndarray, "height width"]
+    origin: Float[np.ndarray, "3"]
+    directions: Float[np.ndarray, "3 height width"]
+
+    def points(self) -> Float[np.ndarray, "3 height width"]:
+        """World points; at the camera where nothing was met."""
+        depth = np.where(np.isfinite(self.depth), self.depth, 0.0)
+        return self.origin[:, None, None] + self.directions * depth
+
+
+def trace(scene: Scene, t: int, c: int, subpixel: tuple[float, float] = (0.5, 0.5)) -> Hits:
+    """What camera c sees in frame t, at the same place within every pixel (0.5: its centre)."""
+    K, viewmat = scene.Ks[t, c], scene.viewmats[t, c]
+    x, y = np.meshgrid(np.arange(scene.width) + subpixel[0], np.arange(scene.height) + subpixel[1])
+    pixels = np.stack([x, y, np.ones_like(x)])
+    directions = np.tensordot(viewmat[:3, :3].T @ np.linalg.inv(K), pixels, axes=1)
+    origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    depth = np.full((scene.height, scene.width), np.inf)
+    index = np.full((scene.height, scene.width), -1)
+    for i, (primitive, pose) in enumerate(zip(scene.primitives, scene.primitive_poses(t), strict=True)):
+        window = _window(primitive, viewmat @ pose, K, scene.width, scene.height)
+        if window is None:
+            continue
+        rays = directions[(slice(None), *window)]
+        local_origin, local_rays = _to_local(pose, origin), pose[:3, :3].T @ rays.reshape(3, -1)
+        found = intersect(primitive, local_origin, local_rays).reshape(rays.shape[1:])
+        nearer = found < depth[window]
+        depth[window] = np.where(nearer, found, depth[window])
+        index[window] = np.where(nearer, i, index[window])
+    return Hits(depth=depth, primitive=index, origin=origin, directions=directions)
+
+
+def render_depth(hits: Hits) -> Float[np.ndarray, "height width"]:
+    """Depth in metres, float32, 0 where nothing was met."""
+    return np.where(np.isfinite(hits.depth), hits.depth, 0.0).astype(np.float32)
+
+
+def render_labels(scene: Scene, hits: Hits) -> Int[np.ndarray, "height width"]:
+    """Mask values, int32, 0 where nothing was met."""
+    return np.append(_primitive_labels(scene), 0)[hits.primitive].astype(np.int32)
+
+
+def render_color(scene: Scene, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
+    """RGB: Lambert's law, shadows, four samples a pixel."""
+    total = np.zeros((3, scene.height, scene.width))
+    side, up = _light_disc(scene.light)
+    for subpixel, (a, b) in zip(_SUBPIXELS, _LIGHT_POINTS, strict=True):
+        lamp = np.array(scene.light.position) + scene.light.radius * (a * side + b * up)
+        total += _radiance(scene, t, trace(scene, t, c, subpixel), lamp)
+    screen = np.clip(total / len(_SUBPIXELS), 0.0, 1.0) ** (1 / GAMMA)
+    return np.round(screen * 255).astype(np.uint8).transpose(1, 2, 0)
+
+
+def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.ndarray, "height width 2"]:
+    """Pixels (x, y) that what is seen in frame t moves until frame u, whether or not it is seen there.
+
+    NaN where nothing was met and where the point is behind the camera in frame u.
+    """
+    motions = np.stack(
+        [scene.poses[u, b] @ np.linalg.inv(scene.poses[t, b]) for b in range(len(scene.labels))]
+    )
+    bodies = np.array([primitive.body for primitive in scene.primitives])[hits.primitive]
+    to_pixels = scene.Ks[u, c] @ scene.viewmats[u, c][:3]
+    per_body = (to_pixels @ motions)[bodies]
+    homogeneous = np.einsum("hwij,jhw->ihw", per_body[..., :3], hits.points()) + per_body[..., 3].transpose(
+        2, 0, 1
+    )
+    y, x = np.mgrid[: scene.height, : scene.width] + 0.5
+    seen = (hits.primitive >= 0) & (homogeneous[2] > _NEAR_M)
+    z = np.where(seen, homogeneous[2], np.nan)
+    return np.stack([homogeneous[0] / z - x, homogeneous[1] / z - y], axis=-1)
+
+
+def _radiance(scene: Scene, t: int, hits: Hits, lamp: np.ndarray) -> Float[np.ndarray, "3 height width"]:
+    """Linear RGB that leaves the surfaces towards the camera."""
+    flat_index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
+    normal, reflectance = np.zeros_like(points), np.zeros_like(points)
+    poses = scene.primitive_poses(t)
+    for i in np.unique(flat_index[flat_index >= 0]):
+        here = np.flatnonzero(flat_index == i)
+        local = _to_local(poses[i], points[:, here])
+        normal[:, here] = poses[i][:3, :3] @ normals(scene.primitives[i], local)
+        reflectance[:, here] = albedo(scene.primitives[i].texture, local)
+    to_lamp = lamp[:, None] - points
+    cosine = np.einsum("ij,ij->j", normal, to_lamp) / np.linalg.norm(to_lamp, axis=0)
+    lit = np.flatnonzero(cosine > 0)
+    direct = np.zeros_like(cosine)
+    direct[lit] = cosine[lit] * ~_shadowed(scene, poses, lamp, points[:, lit])
+    sky = 0.75 + 0.25 * normal[2]
+    light = np.array(scene.light.color)[:, None] * direct + np.array(scene.light.ambient)[:, None] * sky
+    return (reflectance * light).reshape(3, scene.height, scene.width)
+
+
+def _shadowed(scene: Scene, poses: list[np.ndarray], lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether some solid stands between the lamp and each point."""
+    rays = points - lamp[:, None]
+    lengths = np.linalg.norm(rays, axis=0)
+    unit = rays / lengths
+    dark = np.zeros(len(lengths), bool)
+    for primitive, pose in zip(scene.primitives, poses, strict=True):
+        if primitive.shape == "plane":  # nothing is below it
+            continue
+        # Only points in the cone of the solid's bounding sphere can lie in its shadow.
+        center, radius = pose[:3, 3] - lamp, np.linalg.norm(primitive.half_extents)
+        distance = np.linalg.norm(center)
+        cosine = np.sqrt(np.maximum(1 - (radius / distance) ** 2, 0.0)) if distance > radius else -1.0
+        near = ((center / distance) @ unit >= cosine) & (lengths > distance - radius) & ~dark
+        here = np.flatnonzero(near)
+        entry = intersect(primitive, _to_local(pose, lamp), pose[:3, :3].T @ rays[:, here])
+        dark[here] = entry < 1 - _SHADOW_MARGIN
+    return dark
+
+
+def _window(
+    primitive: Primitive, to_camera: np.ndarray, K: np.ndarray, width: int, height: int
+) -> tuple[slice, slice] | None:
+    """Rows and columns that can see a primitive; None if there are none."""
+    half = primitive.half_extents
+    everything = slice(0, height), slice(0, width)
+    if not np.isfinite(half).all():
+        return everything
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij")).reshape(3, -1)
+    corners = to_camera[:3, :3] @ (signs * half[:, None]) + to_camera[:3, 3:]
+    if (corners[2] < _NEAR_M).all():
+        return None
+    if (corners[2] < _NEAR_M).any():
+        return everything
+    pixels = (K @ corners)[:2] / corners[2]
+    (left, top), (right, bottom) = np.floor(pixels.min(1)).astype(int), np.ceil(pixels.max(1)).astype(int)
+    left, right = max(left - 1, 0), min(right + 1, width)
+    top, bottom = max(top - 1, 0), min(bottom + 1, height)
+    return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+
+def _to_local(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """World points (columns, or one) in the frame of `pose`."""
+    origin = pose[:3, 3] if points.ndim == 1 else pose[:3, 3:]
+    return pose[:3, :3].T @ (points - origin)
+
+
+def _light_disc(light: Light) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions that span the lamp's disc, which faces the world's origin."""
+    toward = -np.array(light.position) / np.linalg.norm(light.position)
+    side = np.cross(toward, [0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    return side, np.cross(side, toward)
+
+
+def _primitive_labels(scene: Scene) -> np.ndarray:
+    return np.asarray(scene.labels)[[primitive.body for primitive in scene.primitives]]

@@ -1,0 +1,58 @@
+"""A simulated scene as a sequence."""
+
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.sequence import Sequence, Truth
+from gsjax.data.simulated.raycaster import (
+    Scene,
+    render_color,
+    render_depth,
+    render_flow,
+    render_labels,
+    trace,
+)
+
+CACHED_IMAGES = 16
+"""Rendered images, and traced views, that a simulated sequence keeps."""
+
+
+def simulated_sequence(
+    name: str,
+    scene: Scene,
+    times: Float[np.ndarray, "frames"],
+    objects: dict[str, int],
+    robot: int | None = None,
+) -> Sequence:
+    """The sequence of a scene. Frames are rendered when asked for; the last few are kept.
+
+    Args:
+        name: what to call it.
+        scene: what is seen, by which cameras.
+        times: seconds, increasing.
+        objects: the body of each object whose pose is reported as truth.
+        robot: the mask value of the robot.
+    """
+    color = lru_cache(CACHED_IMAGES)(lambda t, c: render_color(scene, t, c))
+    hits = lru_cache(CACHED_IMAGES)(lambda t, c: trace(scene, t, c))
+    bodies = list(objects.values())
+    truth = Truth(
+        names=tuple(objects), label_ids=scene.labels[bodies], poses=scene.poses[:, bodies], robot=robot
+    )
+    return Sequence(
+        name=name,
+        camera_ids=tuple(range(scene.Ks.shape[1])),
+        width=scene.width,
+        height=scene.height,
+        times=times,
+        frame_ids=tuple(range(len(times))),
+        Ks=scene.Ks,
+        viewmats=scene.viewmats,
+        load_image=lambda t, c: color(t, c).copy(),
+        load_depth=lambda t, c: render_depth(hits(t, c)),
+        load_mask=lambda t, c: render_labels(scene, hits(t, c)),
+        load_flow=lambda t, u, c: render_flow(scene, t, u, c, hits(t, c)),
+        truth=truth,
+    )

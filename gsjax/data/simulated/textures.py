@@ -1,0 +1,79 @@
+"""Procedural colours of points in space. Colours are given as they appear on a screen and mixed as light."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import map_coordinates
+
+GAMMA = 2.2
+_CELLS = 64  # edge of the noise block, which repeats
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Two colours and the pattern in which they change.
+
+    Attributes:
+        kind: "noise" (clouds), "checker", "stripes" (wavering bands along x, as of wood), or "label" (a
+            printed band around z).
+        colors: two RGB colours, 0 to 1.
+        scale: metres of one period: of the coarsest clouds, of a square, of a stripe, of the label's height.
+        seed: moves the pattern.
+        grain: how much fine noise lies over it, 0 to 1.
+    """
+
+    kind: Literal["noise", "checker", "stripes", "label"]
+    colors: tuple[tuple[float, float, float], tuple[float, float, float]]
+    scale: float
+    seed: int = 0
+    grain: float = 0.25
+
+
+def albedo(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    """Diffuse reflectance, linear, at points in the texture's own frame (metres)."""
+    first, second = (np.array(color)[:, None] ** GAMMA for color in texture.colors)
+    # The offset keeps the pattern's borders away from planes of symmetry, where faces of solids lie.
+    offset = np.random.default_rng(texture.seed).uniform(0.1, 0.9, (3, 1)) * texture.scale
+    match texture.kind:
+        case "noise":
+            mix = _smooth(_noise(points + offset, texture.scale))
+        case "checker":
+            cells = np.floor((points + offset) / texture.scale).astype(np.int64)
+            mix = (cells.sum(0) % 2).astype(np.float64)
+        case "stripes":
+            waver = _noise(points + offset, 8 * texture.scale)
+            phase = points[1] / texture.scale + 3.0 * waver
+            mix = 0.5 + 0.5 * np.sin(2 * np.pi * phase)
+        case "label":
+            print_ = _smooth(4 * (_noise(points + offset, 0.7 * texture.scale) - 0.5) + 0.5)
+            mix = np.where(np.abs(points[2]) < 0.5 * texture.scale, print_, 0.0)
+            edge = np.abs(np.abs(points[2]) - 0.5 * texture.scale) < 0.06 * texture.scale
+            mix = np.where(edge, 1.0, mix)
+    fine = 1.0 + texture.grain * (2 * _noise(points + offset, 0.35 * texture.scale + 0.01) - 1)
+    return np.clip((first + (second - first) * mix) * fine, 0.0, 1.0)
+
+
+def _smooth(x):
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3 - 2 * x)
+
+
+def _noise(points, period):
+    """Clouds with detail down to period / 8, around 0.5."""
+    block = _noise_block()
+    coordinates = points * (8.0 / period)
+    return map_coordinates(block, coordinates, order=1, mode="grid-wrap", prefilter=False)
+
+
+@cache
+def _noise_block() -> Float[np.ndarray, "cells cells cells"]:
+    """Periodic noise of spectrum 1/f^1.5 above 4 cycles a block, mean 0.5, mostly within 0 and 1."""
+    white = np.random.default_rng(0).normal(size=(_CELLS,) * 3)
+    axis = np.fft.fftfreq(_CELLS, 1 / _CELLS)
+    frequency = np.sqrt(sum(f**2 for f in np.meshgrid(axis, axis, axis, indexing="ij")))
+    amplitude = np.where(frequency >= 4, np.maximum(frequency, 1) ** -2.2, 0.0)
+    block = np.fft.ifftn(np.fft.fftn(white) * amplitude).real
+    return 0.5 + 0.25 * block / block.std()
