@@ -1,0 +1,146 @@
+"""Videos that browsers play: H.264, yuv420p, through the ffmpeg that imageio-ffmpeg brings along."""
+
+import contextlib
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import IO
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+from jaxtyping import Num, UInt8
+
+
+class VideoWriter:
+    """Write frames to an .mp4: `with VideoWriter(path, fps) as video: video.write(frame)`.
+
+    Frames go to a temporary file, which gets its name when the block ends. It also does when the block ends
+    by an exception or Ctrl-C, so that the frames so far can be watched. All frames have the size of the
+    first; an odd width or height is padded by repeating the last column or row: yuv420p asks for even ones.
+    """
+
+    def __init__(self, path: str | os.PathLike, fps: float, *, quality: int = 18):
+        """
+        Args:
+            path: of the video, ending in .mp4; missing folders are made.
+            fps: frames a second.
+            quality: H.264's constant rate factor; 0 is lossless, 18 looks so, 51 is the worst.
+
+        Raises:
+            ValueError: `fps` is not positive, or the path does not end in .mp4.
+        """
+        self.path = Path(path)
+        if not fps > 0:
+            raise ValueError(f"fps: got {fps}, want a positive number")
+        if self.path.suffix != ".mp4":
+            raise ValueError(f"path: got {self.path}, want a name that ends in .mp4")
+        self._options = ["-r", f"{fps:.6g}", "-crf", str(quality)]
+        self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.partial.mp4")
+        self._shape: tuple[int, ...] | None = None
+        self._process: subprocess.Popen | None = None
+        self._messages: IO[bytes] | None = None
+
+    def write(self, frame: Num[np.ndarray, "..."]) -> None:
+        """Append a frame [H, W, 3]: uint8, or floats 0 to 1 (clipped; NaN is black).
+
+        Raises:
+            ValueError: the frame is no [H, W, 3] picture or not of the size of the first.
+            RuntimeError: ffmpeg failed; the message holds its own.
+        """
+        pixels = _to_bytes(np.asarray(frame))
+        if self._process is None:
+            self._shape = pixels.shape
+            self._start(*pixels.shape[:2])
+        if pixels.shape != self._shape:
+            raise ValueError(f"frame: got shape {pixels.shape}, want {self._shape} like the first frame")
+        height, width = pixels.shape[:2]
+        padded = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        try:
+            self._process.stdin.write(padded.tobytes())
+        except BrokenPipeError as error:
+            raise RuntimeError(f"{self.path}: ffmpeg stopped: {self._said()}") from error
+
+    def close(self) -> None:
+        """Finish the file and give it its name. Without any frame there is no file."""
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        failed = process.wait() != 0
+        message = self._said()
+        self._messages.close()
+        if failed:
+            self._temporary.unlink(missing_ok=True)
+            raise RuntimeError(f"{self.path}: ffmpeg could not write the video: {message}")
+        os.replace(self._temporary, self.path)
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+    def _start(self, height: int, width: int) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        size = f"{width + width % 2}x{height + height % 2}"
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, *self._options[:2], "-i", "-"]
+        target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", *self._options[2:], "-movflags", "+faststart"]
+        # Its messages go to a file: a pipe that nobody reads would fill up and stop it.
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`close` closes it)
+        # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock beside JAX's threads.
+        self._process = subprocess.Popen(
+            [
+                imageio_ffmpeg.get_ffmpeg_exe(),
+                "-y",
+                "-loglevel",
+                "error",
+                *source,
+                *target,
+                str(self._temporary),
+            ],
+            stdin=subprocess.PIPE,
+            stderr=self._messages,
+            **_own_process_group(),
+        )
+
+    def _said(self) -> str:
+        self._messages.seek(0)
+        return self._messages.read().decode(errors="replace").strip() or "no message"
+
+
+def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
+    """All frames of a video, RGB.
+
+    Raises:
+        FileNotFoundError: there is no file at `path`.
+        ValueError: no frame can be read from the file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: expected a video, found no file. Check the path")
+    capture, frames = cv2.VideoCapture(str(path)), []
+    while (grabbed := capture.read())[0]:
+        frames.append(cv2.cvtColor(grabbed[1], cv2.COLOR_BGR2RGB))
+    capture.release()
+    if not frames:
+        raise ValueError(f"{path}: expected a video, found a file of which no frame can be read")
+    return np.stack(frames)
+
+
+def _to_bytes(frame: np.ndarray) -> np.ndarray:
+    if frame.ndim != 3 or frame.shape[2] != 3:
+        raise ValueError(f"frame: got shape {frame.shape}, want [H, W, 3]")
+    if frame.dtype == np.uint8:
+        return frame
+    if not np.issubdtype(frame.dtype, np.floating):
+        raise ValueError(f"frame: got dtype {frame.dtype}, want uint8 or floats 0 to 1")
+    return np.round(255 * np.clip(np.nan_to_num(frame), 0, 1)).astype(np.uint8)
+
+
+def _own_process_group() -> dict[str, int]:
+    """Options that keep the terminal's Ctrl-C away from ffmpeg: it must outlive us to finish the file."""
+    if os.name == "posix":
+        return {"process_group": 0}
+    return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
