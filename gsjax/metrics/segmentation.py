@@ -1,0 +1,83 @@
+"""Overlap of predicted and true label pictures, with pixels pooled over frames and cameras."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Integer
+
+IGNORED_LABEL = -1
+
+
+@dataclass
+class LabelOverlap:
+    """Counts of pixels per label, added up picture by picture.
+
+    Pooling weighs each pixel alike; a mean of per-frame ratios would let a sliver in one frame weigh as much
+    as the whole object in the next.
+
+        IoU = sum |P and T| / sum |P or T|        Dice = 2 sum |P and T| / (sum |P| + sum |T|)
+
+    Attributes:
+        intersections, predicted, true: pixels per label.
+    """
+
+    intersections: dict[int, int] = field(default_factory=dict)
+    predicted: dict[int, int] = field(default_factory=dict)
+    true: dict[int, int] = field(default_factory=dict)
+
+    def add(self, predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray, "..."]) -> None:
+        """Count one picture [H, W]. Pixels whose true label is -1 are left out.
+
+        Raises:
+            ValueError: the two differ in shape.
+        """
+        predicted, true = np.asarray(predicted), np.asarray(true)
+        if predicted.shape != true.shape:
+            raise ValueError(f"predicted: got shape {predicted.shape}, want {true.shape} to match true")
+        scored = true != IGNORED_LABEL
+        predicted, true = predicted[scored], true[scored]
+        _count(self.intersections, predicted[predicted == true])
+        _count(self.predicted, predicted)
+        _count(self.true, true)
+
+    @property
+    def labels(self) -> list[int]:
+        """All labels that occurred, predicted or true, in order."""
+        return sorted(self.predicted.keys() | self.true.keys())
+
+    def iou(self, label: int) -> float:
+        """Intersection over union of one label; NaN where it never occurred."""
+        both = self.intersections.get(label, 0)
+        return _ratio(both, self.predicted.get(label, 0) + self.true.get(label, 0) - both)
+
+    def dice(self, label: int) -> float:
+        """Dice coefficient of one label, 2 IoU / (1 + IoU); NaN where it never occurred."""
+        both = self.intersections.get(label, 0)
+        return _ratio(2 * both, self.predicted.get(label, 0) + self.true.get(label, 0))
+
+    def mean_iou(self, labels: Iterable[int] | None = None) -> float:
+        """Mean IoU over `labels` (all that occurred unless told), those that never occurred left out."""
+        values = [self.iou(label) for label in (self.labels if labels is None else labels)]
+        values = [value for value in values if not np.isnan(value)]
+        return float(np.mean(values)) if values else float("nan")
+
+
+def iou_of_masks(predicted: np.ndarray, true: np.ndarray) -> float:
+    """Intersection over union of two boolean masks of one shape; NaN where both are empty.
+
+    Raises:
+        ValueError: the two differ in shape.
+    """
+    overlap = LabelOverlap()
+    overlap.add(np.asarray(predicted, bool).astype(np.int8), np.asarray(true, bool).astype(np.int8))
+    return overlap.iou(1)
+
+
+def _count(counts: dict[int, int], labels: np.ndarray) -> None:
+    for label, pixels in zip(*np.unique(labels, return_counts=True), strict=True):
+        counts[int(label)] = counts.get(int(label), 0) + int(pixels)
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")

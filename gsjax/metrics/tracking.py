@@ -1,0 +1,167 @@
+"""How far tracked Gaussians are from where the true motion of their object would have carried them.
+
+With x_t the Gaussian's centre at frame t and T_t the object's true pose (object to world), a perfect tracker
+has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. All in float64, on the host.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, Integer
+
+from gsjax.geometry.cameras import project
+
+UNKNOWN_LABEL = -1
+_ORTHONORMALITY = 1e-3
+
+
+class ObjectScore(NamedTuple):
+    """The tracking errors of one object, in millimetres.
+
+    Attributes:
+        centroid_error_mm: mean over time of || mean_i x_t - T_t T_0^-1 mean_i x_0 ||.
+        centroid_errors_mm: the same, a value a frame.
+        point_error_mm: mean over Gaussians and time of || x_t - T_t T_0^-1 x_0 ||.
+        median_point_error_mm: the median of the same.
+        moved_mm: the largest distance over time of the true centroid from its start.
+        turned_deg: the largest true rotation from the start, degrees.
+        num_scored: how many Gaussians have this true label.
+    """
+
+    centroid_error_mm: float
+    centroid_errors_mm: Float[np.ndarray, "T"]
+    point_error_mm: float
+    median_point_error_mm: float
+    moved_mm: float
+    turned_deg: float
+    num_scored: int
+
+
+def true_labels(
+    points: Float[np.ndarray, "N 3"],
+    masks: Sequence[Integer[np.ndarray, "..."]],
+    depths: Sequence[Float[np.ndarray, "..."]],
+    viewmats: Sequence[Float[np.ndarray, "4 4"]],
+    Ks: Sequence[Float[np.ndarray, "3 3"]],
+    *,
+    max_depth_gap: float = 0.015,
+) -> Int[np.ndarray, "N"]:
+    """The true label of each Gaussian, from the masks and depths of the first frame; -1 where unknown.
+
+    A camera sees a centre where it projects into the picture and its z is within `max_depth_gap` metres of
+    the depth there; the label is the mask's value. Where several cameras see it, the one whose depth agrees
+    best decides. What none sees is unknown, and not scored.
+
+    Args:
+        points: centres at frame 0, world, metres.
+        masks, depths: [H, W] of each camera; depth in metres, 0 invalid.
+        viewmats, Ks: world to camera (OpenCV), and intrinsics with pixel centres at +0.5, of each camera.
+
+    Raises:
+        ValueError: there is not one of each for every camera, or a mask and its depth differ in size.
+    """
+    counts = {len(masks), len(depths), len(viewmats), len(Ks)}
+    if len(counts) > 1:
+        raise ValueError(
+            f"true_labels: got {len(masks)} masks, {len(depths)} depths, {len(viewmats)} viewmats and "
+            f"{len(Ks)} Ks, want one of each a camera"
+        )
+    labels = np.full(len(points), UNKNOWN_LABEL, np.int32)
+    best = np.full(len(points), np.inf)
+    for mask, depth, viewmat, K in zip(masks, depths, viewmats, Ks, strict=True):
+        if np.shape(mask) != np.shape(depth):
+            raise ValueError(f"masks: got shape {np.shape(mask)}, want {np.shape(depth)} to match its depth")
+        value, gap = _seen_by(np.asarray(points), np.asarray(mask), np.asarray(depth), viewmat, K)
+        better = (gap <= max_depth_gap) & (gap < best)
+        labels[better], best[better] = value[better], gap[better]
+    return labels
+
+
+def _seen_by(
+    points: np.ndarray, mask: np.ndarray, depth: np.ndarray, viewmat: np.ndarray, K: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mask's value at each point, and the gap to the depth there (infinite outside or without depth)."""
+    height, width = depth.shape
+    pixels, z = map(np.asarray, project(*(jnp.asarray(array, float) for array in (points, viewmat, K))))
+    inside = (z > 0) & np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
+    columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
+    there = depth[rows, columns]
+    valid = inside & np.isfinite(there) & (there > 0)
+    return mask[rows, columns], np.where(valid, np.abs(there - z), np.inf)
+
+
+def relative_motion(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4 4"]:
+    """T_t T_0^-1: what carries a point of the object from frame 0 to frame t, in the world.
+
+    Raises:
+        ValueError: a pose is no rigid motion.
+    """
+    poses = np.asarray(poses, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+        raise ValueError(f"poses: got shape {poses.shape}, want [T, 4, 4]")
+    if not np.isfinite(poses).all():
+        frame = int(np.argmin(np.isfinite(poses).all(axis=(1, 2))))
+        raise ValueError(f"poses: frame {frame} holds NaN or infinity")
+    rotations = poses[:, :3, :3]
+    gap = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    rigid = (gap < _ORTHONORMALITY) & (np.linalg.det(rotations) > 0)
+    if not rigid.all():
+        frame = int(np.argmin(rigid))
+        raise ValueError(f"poses: frame {frame} holds no rotation (R R^T is off by {gap[frame]:.3g})")
+    return poses @ np.linalg.inv(poses[0])
+
+
+def score_object(means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "poses 4 4"]) -> ObjectScore:
+    """Score the Gaussians of one object; without any, the errors are NaN.
+
+    Args:
+        means: centres of the object's Gaussians over time, world, metres.
+        poses: the object's true poses, object to world.
+
+    Raises:
+        ValueError: the frame counts differ, or a pose is no rigid motion.
+    """
+    means, motion = np.asarray(means, np.float64), relative_motion(poses)
+    if len(means) != len(motion):
+        raise ValueError(f"means: got {len(means)} frames, want {len(motion)} like poses")
+    cosine = (np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    turned = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
+    if means.shape[1] == 0:
+        missing = float("nan")
+        return ObjectScore(missing, np.full(len(means), np.nan), missing, missing, missing, turned, 0)
+    expected = np.einsum("tij,nj->tni", motion[:, :3, :3], means[0]) + motion[:, None, :3, 3]
+    errors = 1000.0 * np.linalg.norm(means - expected, axis=-1)
+    centroids = expected.mean(axis=1)
+    centroid_errors = 1000.0 * np.linalg.norm(means.mean(axis=1) - centroids, axis=-1)
+    return ObjectScore(
+        centroid_error_mm=float(centroid_errors.mean()),
+        centroid_errors_mm=centroid_errors,
+        point_error_mm=float(errors.mean()),
+        median_point_error_mm=float(np.median(errors)),
+        moved_mm=1000.0 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max()),
+        turned_deg=turned,
+        num_scored=means.shape[1],
+    )
+
+
+def score_tracks(
+    means: Float[np.ndarray, "T N 3"],
+    labels: Integer[np.ndarray, "labels"],
+    poses: Mapping[int, Float[np.ndarray, "poses 4 4"]],
+) -> dict[int, ObjectScore]:
+    """Score each object whose true poses are known.
+
+    Args:
+        means: centres over time, world, metres.
+        labels: the TRUE label of each Gaussian (see `true_labels`), not the tracker's own.
+        poses: of each label, its true poses over the same frames.
+
+    Raises:
+        ValueError: the shapes do not agree, or a pose is no rigid motion.
+    """
+    means, labels = np.asarray(means), np.asarray(labels)
+    if labels.shape != (means.shape[1],):
+        raise ValueError(f"labels: got shape {labels.shape}, want [{means.shape[1]}] to match means")
+    return {label: score_object(means[:, labels == label], poses[label]) for label in sorted(poses)}

@@ -1,0 +1,43 @@
+"""Overlap of labels, pooled over pictures."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gsjax.metrics.segmentation import LabelOverlap, iou_of_masks
+
+
+def test_counts_are_pooled_over_pictures():
+    overlap = LabelOverlap()
+    overlap.add(np.array([[1, 1, 0, 0]]), np.array([[1, 0, 0, 0]]))  # 1: 1 of 2
+    overlap.add(np.array([[1] * 8]), np.array([[1] * 8]))  # 1: 8 of 8
+    assert overlap.iou(1) == pytest.approx(9 / 10)  # and not the mean of 1/2 and 1
+    assert overlap.iou(0) == pytest.approx(2 / 3)
+    assert overlap.mean_iou() == pytest.approx((9 / 10 + 2 / 3) / 2)
+    assert overlap.mean_iou([1, 99]) == pytest.approx(9 / 10)
+    assert overlap.labels == [0, 1]
+
+
+def test_dice_follows_from_iou():
+    rng = np.random.default_rng(0)
+    overlap = LabelOverlap()
+    overlap.add(rng.integers(0, 4, (30, 30)), rng.integers(0, 4, (30, 30)))
+    for label in range(4):
+        iou = overlap.iou(label)
+        assert overlap.dice(label) == pytest.approx(2 * iou / (1 + iou))
+
+
+def test_unknown_pixels_and_labels_never_seen_score_nothing():
+    overlap = LabelOverlap()
+    overlap.add(np.array([[1, 2]], np.uint8), np.array([[1, -1]]))
+    assert overlap.iou(1) == 1.0
+    assert math.isnan(overlap.iou(2))
+    assert math.isnan(LabelOverlap().mean_iou())
+
+
+def test_masks_and_shapes():
+    assert iou_of_masks(np.array([True, True, False]), np.array([False, True, False])) == 0.5
+    assert math.isnan(iou_of_masks(np.zeros(3, bool), np.zeros(3, bool)))
+    with pytest.raises(ValueError, match=r"predicted: got shape \(2,\), want \(3,\)"):
+        LabelOverlap().add(np.zeros(2, int), np.zeros(3, int))
