@@ -30,7 +30,7 @@ bench: $(VENV)/installed-test ## the benchmark suite
 	$(BIN)/python -m benchmarks
 
 docs: $(VENV)/installed-dev ## build the documentation into site/
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 lint: $(VENV)/installed-dev ## ruff and pyright
 	$(BIN)/ruff check .

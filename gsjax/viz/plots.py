@@ -157,8 +157,9 @@ def _legend(figure: Figure, axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     columns = 5 if max(map(len, names), default=0) < 14 else 3
     if names:
-        style = {"frameon": False, "columnspacing": 1.3, "handlelength": 1.4, "fontsize": 9.5, "labelcolor": _INK}
-        figure.legend(handles, names, loc="outside lower left", ncols=columns, **style)
+        text = {"fontsize": 9.5, "labelcolor": _INK}
+        spacing = {"columnspacing": 1.3, "handlelength": 1.4, "frameon": False}
+        figure.legend(handles, names, loc="outside lower left", ncols=columns, **text, **spacing)
 
 
 def _rgb(label: int) -> tuple[float, float, float]:
