@@ -8,7 +8,7 @@ from jaxtyping import Float
 from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.motion import along_keyframes, coast, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
-from gsjax.data.simulated.raycaster import Light, Scene
+from gsjax.data.simulated.raycaster import Light, Scene, render_labels, trace
 from gsjax.data.simulated.robot import BODIES as ROBOT_BODIES
 from gsjax.data.simulated.robot import robot_poses, robot_primitives
 from gsjax.data.simulated.simulation import simulated_sequence
@@ -18,6 +18,8 @@ from gsjax.geometry.cameras import intrinsics, look_at
 RATE_HZ = 30.0
 NAMES = ("carton", "can", "ball", "block")
 ROBOT_LABEL, FIRST_OBJECT_LABEL = 1, 2
+
+_FIRST_BODY = 1 + ROBOT_BODIES  # of the objects; body 0 is the world
 
 CARTON = (0.045, 0.028, 0.065)
 CAN = (0.034, 0.055)
@@ -92,35 +94,56 @@ def tabletop(
     times = np.arange(frames) / RATE_HZ
     moments = np.zeros(frames) if still else np.arange(frames, dtype=np.float64)
     layout = _draw_layout(seed, leave, hide)
-    objects, grasp, opening = _object_poses(moments, layout, leave, hide)
     viewmats = _viewmats(cameras, times if moving_cameras else np.zeros(frames))
-    Ks = np.broadcast_to(intrinsics(0.95 * width, width, height), (frames, cameras, 3, 3))
-    world = np.broadcast_to(np.eye(4), (frames, 1, 4, 4))
-    scene = Scene(
+    scene = _build_scene(seed, layout, moments, viewmats, width, height, leave, hide)
+    named = dict(zip(NAMES, range(_FIRST_BODY, _FIRST_BODY + len(NAMES)), strict=True))
+    return simulated_sequence(f"tabletop_seed{seed}", scene, times, named, robot=ROBOT_LABEL)
+
+
+def _build_scene(
+    seed: int,
+    layout: _Layout,
+    moments: Float[np.ndarray, "t"],
+    viewmats: Float[np.ndarray, "t c 4 4"],
+    width: int,
+    height: int,
+    leave: bool,
+    hide: bool,
+) -> Scene:
+    objects, grasp, opening = _object_poses(moments, layout, leave, hide)
+    world = np.broadcast_to(np.eye(4), (len(moments), 1, 4, 4))
+    object_labels = [FIRST_OBJECT_LABEL + i for i in range(len(NAMES))]
+    return Scene(
         primitives=(*_surroundings(layout, leave, hide), *robot_primitives(1), *_object_primitives(seed)),
-        labels=np.array(
-            [0] + [ROBOT_LABEL] * ROBOT_BODIES + [FIRST_OBJECT_LABEL + i for i in range(len(NAMES))]
-        ),
+        labels=np.array([0] + [ROBOT_LABEL] * ROBOT_BODIES + object_labels),
         poses=np.concatenate([world, robot_poses(grasp, opening), objects], axis=1),
         light=_LIGHT,
-        Ks=Ks,
+        Ks=np.broadcast_to(intrinsics(0.95 * width, width, height), (*viewmats.shape[:2], 3, 3)),
         viewmats=viewmats,
         width=width,
         height=height,
     )
-    named = dict(zip(NAMES, range(1 + ROBOT_BODIES, 1 + ROBOT_BODIES + len(NAMES)), strict=True))
-    return simulated_sequence(f"tabletop_seed{seed}", scene, times, named, robot=ROBOT_LABEL)
 
 
 def _draw_layout(seed: int, leave: bool, hide: bool) -> _Layout:
-    """Draws until no two objects meet and all stay on the table."""
+    """Draws until no two objects meet, all stay on the table, and the standard cameras see all at first."""
     rng = np.random.default_rng(seed)
     moments = np.arange(61.0)
+    first_views = _viewmats(3, np.zeros(1))
     while True:
         layout = _propose_layout(rng, leave, hide)
         poses, _, _ = _object_poses(moments, layout, leave, hide)
-        if _is_clear(poses[:, :, :3, 3], leave, hide):
+        if not _is_clear(poses[:, :, :3, 3], leave, hide):
+            continue
+        preview = _build_scene(seed, layout, moments[:1], first_views, 80, 60, leave, hide)
+        if all(_sees_all(preview, c) for c in range(3)):
             return layout
+
+
+def _sees_all(preview: Scene, c: int) -> bool:
+    """Whether each object has 12 pixels of 80x60, which are 200 of 320x240."""
+    counts = np.bincount(render_labels(preview, trace(preview, 0, c)).ravel(), minlength=6)
+    return bool((counts[FIRST_OBJECT_LABEL:] >= 12).all())
 
 
 def _propose_layout(rng: np.random.Generator, leave: bool, hide: bool) -> _Layout:
@@ -130,10 +153,10 @@ def _propose_layout(rng: np.random.Generator, leave: bool, hide: bool) -> _Layou
     distances = np.array([rng.uniform(0.22, 0.30), rng.uniform(0.20, 0.29), rng.uniform(0.14, 0.18), 0.0])
     angles = rng.uniform(0, 2 * np.pi, count)
     ends = starts + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    turns = rng.uniform([0.6, 1.2, 0.0, 0.0], [1.5, 2.4, 0.0, 0.0]) * rng.choice([-1.0, 1.0], count)
+    turns = rng.uniform([0.6, 1.2, 0.0, 0.0], [1.5, 1.9, 0.0, 0.0]) * rng.choice([-1.0, 1.0], count)
     layout = _Layout(starts, ends, turns, rng.uniform(-0.5, 0.5, count), rng.uniform(1, 8, count))
     if leave:
-        ends[1] = starts[1] + np.array([-0.15, np.copysign(1.0, starts[1, 1])])
+        ends[1] = starts[1] + np.array([1.0, rng.uniform(-0.3, 0.3)])  # past the cameras
     if hide:
         starts[1] = [_GARAGE_X - _INTO_GARAGE_M, rng.choice([-1.0, 1.0]) * rng.uniform(0.12, 0.20)]
         ends[1] = starts[1] + np.array([_INTO_GARAGE_M, 0.0])
@@ -218,15 +241,15 @@ def _viewmats(cameras: int, times: np.ndarray) -> Float[np.ndarray, "t c 4 4"]:
 
 def _eye(azimuth: float, elevation: float) -> np.ndarray:
     flat = np.array([np.cos(azimuth), np.sin(azimuth)]) * np.cos(elevation)
-    return _TARGET + 0.98 * np.array([*flat, np.sin(elevation)])
+    return _TARGET + 0.90 * np.array([*flat, np.sin(elevation)])
 
 
 def _surroundings(layout: _Layout, leave: bool, hide: bool) -> list[Primitive]:
     """Floor, table, and what hides the can; all on body 0, the world. The table's top is z = 0."""
     floor = Texture("checker", ((0.46, 0.47, 0.49), (0.54, 0.55, 0.56)), 0.35, seed=1)
     wood = Texture("stripes", ((0.60, 0.43, 0.28), (0.72, 0.55, 0.38)), 0.035, seed=2, grain=0.18)
-    half_width = 2.2 if leave else 0.55
-    table = Primitive("box", (0.62, half_width, 0.02), wood, pose=rigid(None, [-0.10, 0.0, -0.02]))
+    length = 1.4 if leave else 0.62  # from the edge behind the robot
+    table = Primitive("box", (length, 0.55, 0.02), wood, pose=rigid(None, [length - 0.72, 0.0, -0.02]))
     solids = [Primitive("plane", (), floor, pose=rigid(None, [0.0, 0.0, -0.65])), table]
     return solids + (_garage(layout.starts[1, 1]) if hide else [])
 
@@ -248,7 +271,7 @@ def _garage(y: float) -> list[Primitive]:
 
 
 def _object_primitives(seed: int) -> list[Primitive]:
-    first = 1 + ROBOT_BODIES
+    first = _FIRST_BODY
     s = 10 * seed
     carton = Texture("label", ((0.86, 0.24, 0.16), (0.97, 0.91, 0.72)), 0.075, seed=s + 4)
     can = Texture("label", ((0.16, 0.42, 0.72), (0.95, 0.96, 0.97)), 0.055, seed=s + 5)

@@ -44,8 +44,8 @@ def albedo(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarr
             cells = np.floor((points + offset) / texture.scale).astype(np.int64)
             mix = (cells.sum(0) % 2).astype(np.float64)
         case "stripes":
-            waver = _noise(points + offset, 8 * texture.scale)
-            phase = points[1] / texture.scale + 3.0 * waver
+            stretched = (points + offset) * np.array([[0.25], [1.0], [1.0]])  # as grain runs along wood
+            phase = points[1] / texture.scale + 1.5 * _noise(stretched, 5 * texture.scale)
             mix = 0.5 + 0.5 * np.sin(2 * np.pi * phase)
         case "label":
             print_ = _smooth(4 * (_noise(points + offset, 0.7 * texture.scale) - 0.5) + 0.5)
