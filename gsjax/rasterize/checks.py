@@ -1,0 +1,117 @@
+"""Shapes of the rasterizer's arguments: checked, named in errors, and brought to one layout."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gsjax.geometry.spherical_harmonics import num_sh_bases
+from gsjax.rasterize.plan import TILE, Plan
+
+
+def is_concrete(tree: Any) -> bool:
+    """Whether every array holds values now, rather than standing for values to come."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _expect(name: str, array, want: tuple, meaning: str) -> None:
+    shape = jnp.shape(array)
+    fits = len(shape) == len(want) and all(w is None or s == w for s, w in zip(shape, want, strict=True))
+    if not fits:
+        wanted = ", ".join("any" if w is None else str(w) for w in want)
+        raise ValueError(f"{name} must have shape ({wanted}), {meaning}; got {tuple(shape)}")
+
+
+def check_inputs(
+    plan: Plan, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, features, roi, means2d_offset
+) -> tuple[tuple, tuple[int, ...]]:
+    """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
+
+    Raises:
+        ValueError: names the argument, the shape it got and the shape it wants.
+    """
+    arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    arrays |= {"viewmats": viewmats, "Ks": Ks}
+    for name, array in arrays.items():
+        if not hasattr(array, "dtype"):
+            raise ValueError(f"{name} must be an array; got {type(array).__name__}")
+        if not jnp.issubdtype(array.dtype, jnp.floating):
+            raise ValueError(f"{name} must hold floats; got {array.dtype}")
+    if means.ndim < 2 or means.shape[-1] != 3:
+        raise ValueError(f"means must have shape (..., N, 3); got {tuple(means.shape)}")
+    *lead, n, _ = means.shape
+    lead = tuple(lead)
+    lead_words = f"leading axes {lead} and N = {n} as in means"
+    _expect("quats", quats, (*lead, n, 4), lead_words)
+    _expect("scales", scales, (*lead, n, 3), lead_words)
+    _expect("opacities", opacities, (*lead, n), lead_words)
+    if viewmats.ndim != len(lead) + 3:
+        raise ValueError(
+            f"viewmats must have shape ({', '.join(map(str, (*lead, 'C', 4, 4)))}); got {tuple(viewmats.shape)}. "
+            "One camera is viewmats[None]"
+        )
+    num_cameras = viewmats.shape[-3]
+    _expect("viewmats", viewmats, (*lead, num_cameras, 4, 4), "leading axes as in means")
+    _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one matrix for each of viewmats")
+    colors = _check_colors(colors, plan, lead, num_cameras, n)
+
+    scenes = math.prod(lead)
+    dtype = jnp.result_type(means, quats, scales, opacities, colors, viewmats, Ks)
+
+    def flat(array, inner):
+        return jnp.asarray(array, dtype).reshape(scenes, *inner)
+
+    channels = colors.shape[-1]
+    if backgrounds is not None:
+        _expect("backgrounds", backgrounds, (*lead, num_cameras, channels), "one row a camera, as wide as colors")
+        backgrounds = flat(backgrounds, (num_cameras, channels))
+    if features is not None:
+        _expect("features", features, (*lead, n, None), lead_words)
+        features = flat(features, features.shape[-2:])
+    if means2d_offset is not None:
+        _expect("means2d_offset", means2d_offset, (*lead, num_cameras, n, 2), "a pixel offset a camera and Gaussian")
+        means2d_offset = flat(means2d_offset, (num_cameras, n, 2))
+    tile_mask = None
+    if roi is not None:
+        _expect("roi", roi, (*lead, num_cameras, plan.height, plan.width), "a pixel mask a camera")
+        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, num_cameras, plan.height, plan.width))
+
+    views = (
+        flat(means, (n, 3)),
+        flat(quats, (n, 4)),
+        flat(scales, (n, 3)),
+        flat(opacities, (n,)),
+        flat(colors, colors.shape[len(lead) :]),
+        features,
+        flat(viewmats, (num_cameras, 4, 4)),
+        flat(Ks, (num_cameras, 3, 3)),
+        means2d_offset,
+        backgrounds,
+        tile_mask,
+    )
+    return views, (*lead, num_cameras)
+
+
+def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n: int):
+    """Colours as [*lead, 1 or C, N, ...]."""
+    inner = 1 if plan.sh_degree is None else 2
+    per_camera = colors.ndim == len(lead) + 2 + inner
+    bases = () if plan.sh_degree is None else (None,)
+    cameras = (num_cameras,) if per_camera else ()
+    meaning = "values [N, D]" if plan.sh_degree is None else "SH coefficients [N, K, D] since sh_degree is given"
+    _expect("colors", colors, (*lead, *cameras, n, *bases, None), meaning)
+    if plan.sh_degree is not None and colors.shape[-2] < num_sh_bases(plan.sh_degree):
+        raise ValueError(
+            f"colors holds {colors.shape[-2]} SH coefficients; sh_degree={plan.sh_degree} "
+            f"reads {num_sh_bases(plan.sh_degree)}"
+        )
+    return colors if per_camera else jnp.expand_dims(colors, len(lead))
+
+
+def _tiles_with_a_pixel(roi):
+    scenes, cameras, height, width = roi.shape
+    padded = jnp.pad(roi, ((0, 0), (0, 0), (0, -height % TILE), (0, -width % TILE)))
+    tiles = padded.reshape(scenes, cameras, padded.shape[2] // TILE, TILE, padded.shape[3] // TILE, TILE)
+    return tiles.any(axis=(3, 5)).reshape(scenes, cameras, -1)
+

@@ -1,0 +1,128 @@
+"""A Plan: the static half of a rasterization. Image size, options, capacities; never a value of a scene.
+
+The idea is jax-md's neighbour list: shapes are fixed ahead with some headroom, the device reports what it
+needed, and the host re-plans when that was too little. Capacities climb one geometric ladder, so that a
+scene that grows compiles a few variants in all, and re-planning on a known rung compiles nothing.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+
+TILE = 16
+"""Edge of a tile in pixels. Smaller tiles touch fewer pixel pairs, larger ones need fewer tile lists."""
+
+_LADDER_START, _LADDER_RATIO = 4096, math.sqrt(2.0)
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+DERIVATIVES = ("reverse", "forward")
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Options and capacities of one kind of call. Frozen, hashable, and a pytree without leaves.
+
+    Attributes:
+        width, height: image size in pixels.
+        capacity: Gaussian-tile pairs that one camera may have.
+        near_plane, far_plane: depths between which Gaussians are drawn, metres.
+        eps2d: variance added to projected Gaussians, square pixels.
+        sh_degree: None when colours are values, else the degree their coefficients are read to.
+        render_mode: RGB, D (accumulated depth), ED (expected depth), RGB+D, RGB+ED.
+        rasterize_mode: classic, or antialiased (opacity scaled by what the dilation spread out).
+        derivative: "reverse" for the hand-written VJP, "forward" for jvp, linearize and Gauss-Newton.
+        alpha_max: where a single contribution saturates.
+        tiles_per_batch: tiles composited together; a matter of speed alone.
+    """
+
+    width: int
+    height: int
+    capacity: int
+    near_plane: float = 0.01
+    far_plane: float = 1e10
+    eps2d: float = 0.3
+    sh_degree: int | None = None
+    render_mode: str = "RGB"
+    rasterize_mode: str = "classic"
+    derivative: str = "reverse"
+    alpha_max: float = 0.99
+    tiles_per_batch: int = 32
+
+    def __post_init__(self):
+        for name, allowed in (
+            ("render_mode", RENDER_MODES),
+            ("rasterize_mode", RASTERIZE_MODES),
+            ("derivative", DERIVATIVES),
+            ("sh_degree", (None, 0, 1, 2, 3)),
+        ):
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {value!r}")
+        for name in ("width", "height", "tiles_per_batch"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
+        if not self.near_plane < self.far_plane:
+            raise ValueError(f"near_plane {self.near_plane} must be below far_plane {self.far_plane}")
+        if not 0 < self.alpha_max < 1:
+            raise ValueError(f"alpha_max must lie between 0 and 1; got {self.alpha_max}")
+        if self.eps2d < 0:
+            raise ValueError(f"eps2d must not be negative; got {self.eps2d}")
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // TILE)
+
+    @property
+    def tiles_y(self) -> int:
+        return -(-self.height // TILE)
+
+    @property
+    def num_tiles(self) -> int:
+        return self.tiles_x * self.tiles_y
+
+    def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
+        """The same plan on the lowest rung that holds `needed` pairs, and never below this one."""
+        return dataclasses.replace(self, capacity=max(self.capacity, rung(needed * headroom)))
+
+
+def rung(pairs: float) -> int:
+    """The smallest capacity of the ladder that holds `pairs`."""
+    steps = max(0, math.ceil(math.log(max(pairs, 1) / _LADDER_START) / math.log(_LADDER_RATIO) - 1e-9))
+    return math.ceil(_LADDER_START * _LADDER_RATIO**steps / 16) * 16
+
+
+class _Unset:
+    """Stands for "not given", so that a plan's own option can be told from an explicit one."""
+
+    def __repr__(self):
+        return "UNSET"
+
+
+UNSET: Any = _Unset()
+
+OPTION_NAMES = tuple(
+    f.name for f in dataclasses.fields(Plan) if f.name not in ("width", "height", "capacity")
+)
+
+
+def resolve(plan: Plan | None, width: int, height: int, options: dict[str, Any]) -> Plan:
+    """The plan a call runs under; without one, a plan of the given options whose capacity is still 0.
+
+    Raises:
+        ValueError: an explicit option contradicts the plan.
+    """
+    given = {name: value for name, value in options.items() if value is not UNSET}
+    if plan is None:
+        return Plan(width=width, height=height, capacity=0, **given)
+    for name, value in {"width": width, "height": height, **given}.items():
+        if getattr(plan, name) != value:
+            raise ValueError(
+                f"{name}={value!r} contradicts the plan, which was made with {name}={getattr(plan, name)!r}; "
+                "leave the option out, or make another plan with gsjax.plan(...)"
+            )
+    return plan

@@ -1,0 +1,308 @@
+"""The public rasterizer: Gaussians and cameras in, images out. A pure function of arrays.
+
+Same meaning as gsplat's function of this name (https://docs.gsplat.studio), in JAX: jit, grad, jvp, vmap.
+"""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.geometry.cameras import camera_centers
+from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.rasterize.binning import bin_gaussians, count_pairs
+from gsjax.rasterize.checks import check_inputs, is_concrete
+from gsjax.rasterize.compositing import Lists, Splats, composite
+from gsjax.rasterize.plan import OPTION_NAMES, TILE, UNSET, Plan, resolve
+from gsjax.rasterize.projection import Projected, project_gaussians
+
+
+class Meta(NamedTuple):
+    """What a rasterization has to say besides its images."""
+
+    means2d: Float[Array, "*batch n 2"]  # pixels
+    radii: Int[Array, "*batch n 2"]  # half-widths in pixels, (x, y); 0 where not visible
+    depths: Float[Array, "*batch n"]  # z in the camera's frame
+    features: Float[Array, "*batch height width channels"] | None
+    pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
+    culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area), not for where they are
+    overflow: Bool[Array, "*batch"]  # the plan was too small: nothing was drawn
+    needed: Int[Array, "*batch"]  # pairs that the plan's capacity has to hold
+
+
+class _Views(NamedTuple):
+    """All inputs flattened to B scenes of C cameras."""
+
+    means: Float[Array, "b n 3"]
+    quats: Float[Array, "b n 4"]
+    scales: Float[Array, "b n 3"]
+    opacities: Float[Array, "b n"]
+    colors: Float[Array, "b #c n ..."]
+    features: Float[Array, "b n f"] | None
+    viewmats: Float[Array, "b c 4 4"]
+    Ks: Float[Array, "b c 3 3"]
+    means2d_offset: Float[Array, "b c n 2"] | None
+    backgrounds: Float[Array, "b c channels"] | None
+    tile_mask: Bool[Array, "b c tiles"] | None
+
+
+def rasterization(
+    means: Float[Array, "*batch n 3"],
+    quats: Float[Array, "*batch n 4"],
+    scales: Float[Array, "*batch n 3"],
+    opacities: Float[Array, "*batch n"],
+    colors: Float[Array, "*batch n channels"] | Float[Array, "*batch n bases channels"],
+    viewmats: Float[Array, "*batch c 4 4"],
+    Ks: Float[Array, "*batch c 3 3"],
+    width: int,
+    height: int,
+    *,
+    plan: Plan | None = None,
+    near_plane: float = UNSET,
+    far_plane: float = UNSET,
+    eps2d: float = UNSET,
+    sh_degree: int | None = UNSET,
+    backgrounds: Float[Array, "*batch c channels"] | None = None,
+    render_mode: str = UNSET,
+    rasterize_mode: str = UNSET,
+    features: Float[Array, "*batch n f"] | None = None,
+    roi: Bool[Array, "*batch c height width"] | None = None,
+    means2d_offset: Float[Array, "*batch c n 2"] | None = None,
+    derivative: str = UNSET,
+    alpha_max: float = UNSET,
+    tiles_per_batch: int = UNSET,
+) -> tuple[Float[Array, "*batch c height width d"], Float[Array, "*batch c height width 1"], Meta]:
+    """Draw 3D Gaussians (Kerbl et al. 2023) into one or many cameras.
+
+    Differentiable in everything continuous: means, quats, scales, opacities, colors, features, viewmats, Ks,
+    backgrounds, means2d_offset. What cannot be drawn (NaN, a zero quaternion, no area) is culled, counted in
+    `meta.culled`, and receives gradients of exactly zero.
+
+    Args:
+        means: centres, metres.
+        quats: rotations wxyz, need not be normalised.
+        scales: standard deviations along the own axes, metres.
+        opacities: 0 to 1 (values outside are clipped).
+        colors: values of any dimension D, or SH coefficients [N, K, D] when `sh_degree` is given. An axis of
+            cameras before N, [..., C, N, D], makes them differ from camera to camera.
+        viewmats: world to camera, OpenCV axes.
+        Ks: intrinsics, pixels; pixel centres at +0.5.
+        width, height: image size, static.
+        plan: capacities and options, from `gsjax.plan`. Without one the call plans by itself, which needs
+            concrete values: under jit or vmap, plan outside and pass it in.
+        near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
+        eps2d: variance added on the image, square pixels (default 0.3).
+        sh_degree: degree to which coefficients are read, 0 to 3 (default None: colors are values).
+        backgrounds: value behind everything, one row a camera, of the colours' dimension; black unless given.
+        render_mode: RGB (default), D (sum of w z), ED (D over alpha), RGB+D or RGB+ED: depth comes last.
+        rasterize_mode: classic (default) or antialiased.
+        features: more values [N, F], composited in the same pass into `meta.features`, without background.
+        roi: pixels that are wanted. Tiles without one are not drawn and show the background.
+        means2d_offset: added to the projected means; pass zeros to read their gradient.
+        derivative: "reverse" (default, a fast VJP) or "forward" (jvp, linearize, Gauss-Newton).
+        alpha_max: where one contribution saturates (default 0.99).
+        tiles_per_batch: tiles composited together (default 32); of speed alone.
+
+    Returns:
+        (render_colors, render_alphas, meta).
+
+    Raises:
+        ValueError: a shape or an option is wrong, an option contradicts the plan, or there is no plan and
+            values are traced.
+    """
+    plan = resolve(plan, width, height, _options(locals()))
+    views, batch = check_inputs(
+        plan, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, features, roi, means2d_offset
+    )
+    if plan.capacity == 0:
+        plan = _planned(views, plan, headroom=1.0)
+    return _rasterize(_Views(*views), plan, batch)
+
+
+def plan(
+    means: Float[Array, "*batch n 3"],
+    quats: Float[Array, "*batch n 4"],
+    scales: Float[Array, "*batch n 3"],
+    opacities: Float[Array, "*batch n"],
+    viewmats: Float[Array, "*batch c 4 4"],
+    Ks: Float[Array, "*batch c 3 3"],
+    width: int,
+    height: int,
+    *,
+    headroom: float = 1.25,
+    near_plane: float = UNSET,
+    far_plane: float = UNSET,
+    eps2d: float = UNSET,
+    sh_degree: int | None = UNSET,
+    render_mode: str = UNSET,
+    rasterize_mode: str = UNSET,
+    derivative: str = UNSET,
+    alpha_max: float = UNSET,
+    tiles_per_batch: int = UNSET,
+) -> Plan:
+    """A plan whose capacity holds what these Gaussians need in the neediest of these cameras, times `headroom`.
+
+    Arguments as for `rasterization`. Values must be concrete: call it outside jit.
+
+    Raises:
+        ValueError: a shape or an option is wrong, or values are traced.
+    """
+    bare = resolve(None, width, height, _options(locals()))
+    colors = jnp.zeros((*means.shape[:-1], 1), means.dtype)
+    if bare.sh_degree is not None:
+        colors = jnp.zeros((*means.shape[:-1], (bare.sh_degree + 1) ** 2, 1), means.dtype)
+    views, _ = check_inputs(bare, means, quats, scales, opacities, colors, viewmats, Ks, None, None, None, None)
+    return _planned(views, bare, headroom)
+
+
+def _options(arguments: dict[str, Any]) -> dict[str, Any]:
+    return {name: arguments[name] for name in OPTION_NAMES if name in arguments}
+
+
+def _planned(views, bare: Plan, headroom: float) -> Plan:
+    values = jax.lax.stop_gradient(views)
+    if not is_concrete(values):
+        raise ValueError(
+            "rasterization without a plan looks at values, and these are traced (jit, vmap or scan). Call "
+            "plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, with "
+            "typical values, and pass plan=plan inside; meta.overflow tells if it ever becomes too small"
+        )
+    needed = int(_needed(_Views(*values), bare))
+    if needed == jnp.iinfo(jnp.int32).max:
+        raise ValueError(
+            f"these Gaussians touch more than 2^30 tiles of a {bare.width}x{bare.height} image; "
+            "prune the ones that fill the frame, or draw fewer at a time"
+        )
+    return bare.grown(needed, headroom)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _needed(views: _Views, plan: Plan) -> Int[Array, ""]:
+    projected = _project_all(views, plan)
+    return jax.vmap(jax.vmap(partial(count_pairs, plan=plan)))(projected).max(initial=0)
+
+
+def _project_all(views: _Views, plan: Plan) -> Projected:
+    """Every scene in each of its cameras: fields [B, C, N, ...]."""
+
+    def one_camera(means, quats, scales, opacities, usable, viewmat, K, offset):
+        return project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
+
+    # What a Gaussian is painted with decides too whether it can be drawn.
+    painted = [views.colors.reshape(*views.colors.shape[:3], -1)]
+    if views.features is not None:
+        painted.append(views.features[:, None])
+    usable = jnp.stack([jnp.isfinite(a).all(-1).all(1) for a in painted]).all(0)
+
+    offset_axis = None if views.means2d_offset is None else 0
+    cameras = jax.vmap(one_camera, in_axes=(None,) * 5 + (0, 0, offset_axis))
+    scenes = jax.vmap(cameras, in_axes=(0,) * 7 + (offset_axis,))
+    gaussians = (views.means, views.quats, views.scales, views.opacities, usable)
+    return scenes(*gaussians, views.viewmats, views.Ks, views.means2d_offset)
+
+
+def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c n channels"]:
+    """The values each camera composites: colours, depth, features, as the plan asks."""
+    drawable = projected.visible[..., None]
+    columns = []
+    if "RGB" in plan.render_mode:
+        colors = views.colors
+        if plan.sh_degree is not None:
+            seen = projected.visible[..., None]
+            means = jnp.where(seen, views.means[:, None], 0.0)
+            viewmats = jnp.where(jnp.isfinite(views.viewmats), views.viewmats, 0.0)
+            directions = jnp.where(seen, means - camera_centers(viewmats)[:, :, None], 0.0)
+            colors = jnp.where(seen[..., None], colors, 0.0)
+            colors = jnp.maximum(evaluate_sh(plan.sh_degree, colors, directions), 0.0)
+        columns.append(jnp.where(drawable, colors, 0.0))
+    if "D" in plan.render_mode:
+        columns.append(projected.depths[..., None])
+    if views.features is not None:
+        columns.append(jnp.where(drawable, views.features[:, None], 0.0))
+    return jnp.concatenate(columns, axis=-1)
+
+
+class _Counts(NamedTuple):
+    pairs: Int[Array, "views"]
+    overflow: Bool[Array, "views"]
+    needed: Int[Array, "views"]
+
+
+@partial(jax.jit, static_argnames=("plan", "batch"))
+def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
+    shape = views.viewmats.shape[:2]
+    projected = _project_all(views, plan)
+    values = _paint(views, projected, plan)
+
+    def merge(a):
+        return a.reshape(math.prod(shape), *a.shape[2:])
+
+    mask = None if views.tile_mask is None else merge(views.tile_mask)
+    tiles, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, plan)
+    image = _untile(tiles, shape, plan)
+    alphas = 1 - _untile(transmittance[:, None], shape, plan)
+    return _finish(image, alphas, views, projected, counts, plan, batch)
+
+
+def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, plan: Plan):
+    """Bin and composite all views at once, every view's tiles after the last one's."""
+    num_views, n, channels = values.shape
+    if n == 0:
+        zeros = jnp.zeros(num_views, jnp.int32)
+        tiles = jnp.zeros((num_views * plan.num_tiles, channels, TILE * TILE), values.dtype)
+        return tiles, jnp.ones_like(tiles, shape=(tiles.shape[0], TILE * TILE)), _Counts(zeros, zeros > 0, zeros)
+
+    bin_view = partial(bin_gaussians, plan=plan)
+    binned = jax.vmap(bin_view, in_axes=(0, None if mask is None else 0))(projected, mask)
+    view = jnp.arange(num_views, dtype=jnp.int32)[:, None]
+    lists = Lists(
+        ids=(binned.ids + view * n).ravel(),
+        starts=(binned.starts + view * plan.capacity).ravel(),
+        counts=binned.counts.ravel(),
+    )
+    rows = (projected.means2d, projected.conics, projected.opacities, values)
+    splats = Splats(*(a.reshape(num_views * n, *a.shape[2:]) for a in rows))
+    tiles, transmittance = composite(splats, lists, plan)
+    return tiles, transmittance, _Counts(binned.pairs, binned.overflow, binned.needed)
+
+
+def _untile(tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, int], plan: Plan):
+    """[B, C, H, W, channels] of what was composited tile by tile."""
+    channels = tiles.shape[1]
+    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, TILE, TILE)
+    image = image.transpose(0, 1, 2, 5, 3, 6, 4)
+    image = image.reshape(*shape, plan.tiles_y * TILE, plan.tiles_x * TILE, channels)
+    return image[:, :, : plan.height, : plan.width]
+
+
+def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts, plan: Plan, batch):
+    """Backgrounds, expected depth, and the caller's own batch axes."""
+    shape = image.shape[:2]
+    depth_channels = int("D" in plan.render_mode)
+    num_colors = views.colors.shape[-1] if "RGB" in plan.render_mode else 0
+    colors = image[..., :num_colors]
+    if views.backgrounds is not None and num_colors:
+        colors = colors + (1 - alphas) * views.backgrounds[:, :, None, None, :]
+    depth = image[..., num_colors : num_colors + depth_channels]
+    if "ED" in plan.render_mode:
+        depth = depth / jnp.maximum(alphas, 1e-10)
+    features = None if views.features is None else image[..., num_colors + depth_channels :]
+
+    def outer(a):
+        return a.reshape(*batch, *a.shape[2:])
+
+    counts = jax.tree.map(lambda a: outer(a.reshape(*shape)), counts)
+    meta = Meta(
+        means2d=outer(projected.means2d),
+        radii=outer(jnp.ceil(projected.extents).astype(jnp.int32)),
+        depths=outer(projected.depths),
+        features=None if features is None else outer(features),
+        pairs=counts.pairs,
+        culled=outer(projected.culled),
+        overflow=counts.overflow,
+        needed=counts.needed,
+    )
+    return outer(jnp.concatenate([colors, depth], axis=-1)), outer(alphas), meta

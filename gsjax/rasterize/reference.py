@@ -1,0 +1,131 @@
+"""The rasterizer written as slowly and plainly as can be: every Gaussian at every pixel, in float64.
+
+It shares no code with the fast path. Its gradients are plain autodiff. It also marks the pixels whose value
+hangs on a comparison that rounding may turn the other way (the 1/255 and 0.99 thresholds, the early stop,
+the order of nearly equal depths); there, two correct renderings may differ by up to 1/255.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gsjax.geometry.spherical_harmonics import evaluate_sh
+
+_DOUBT = 1e-5  # relative distance to a threshold at which float32 may decide otherwise
+_TIE = 5e-7  # the same for two depths: a few units in the last place of float32
+_VISIBLE = 1e-3  # behind less transmittance than this a flip changes a pixel by less than 4e-6
+
+
+class Reference(NamedTuple):
+    colors: Float[Array, "height width d"]
+    alphas: Float[Array, "height width 1"]
+    features: Float[Array, "height width f"] | None
+    doubtful: Bool[Array, "height width"]
+
+
+def _rotation(q):
+    w, x, y, z = q / jnp.linalg.norm(q)
+    return jnp.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def _splat(mean, quat, scale, opacity, viewmat, K, width, height, eps2d, antialiased):
+    """Image mean, conic, depth and opacity of one Gaussian, by the textbook."""
+    rotation = _rotation(quat)
+    covariance = rotation @ jnp.diag(scale**2) @ rotation.T
+    x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
+    fx, fy, cx, cy, skew = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
+    tan_x, tan_y = width / (2 * fx), height / (2 * fy)
+    tx = z * jnp.clip(x / z, -(cx / fx + 0.3 * tan_x), (width - cx) / fx + 0.3 * tan_x)
+    ty = z * jnp.clip(y / z, -(cy / fy + 0.3 * tan_y), (height - cy) / fy + 0.3 * tan_y)
+    jacobian = jnp.array([[fx / z, skew / z, -(fx * tx + skew * ty) / z**2], [0.0, fy / z, -fy * ty / z**2]])
+    to_image = jacobian @ viewmat[:3, :3]
+    exact = to_image @ covariance @ to_image.T
+    blurred = exact + eps2d * jnp.eye(2)
+    det, det_blurred = jnp.linalg.det(exact), jnp.linalg.det(blurred)
+    if antialiased:
+        opacity = opacity * jnp.sqrt(jnp.maximum(det / det_blurred, 0.005**2))
+    mean2d = jnp.array([(fx * x + skew * y) / z + cx, fy * y / z + cy])
+    return mean2d, jnp.linalg.inv(blurred), z, opacity
+
+
+def rasterization_reference(
+    means: Float[Array, "n 3"],
+    quats: Float[Array, "n 4"],
+    scales: Float[Array, "n 3"],
+    opacities: Float[Array, "n"],
+    colors: Float[Array, "n *sh d"],
+    viewmat: Float[Array, "4 4"],
+    K: Float[Array, "3 3"],
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    background: Float[Array, "d"] | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    features: Float[Array, "n f"] | None = None,
+    alpha_max: float = 0.99,
+) -> Reference:
+    """One scene in one camera, exactly; arguments as for `gsjax.rasterization`. All rows must be drawable."""
+    antialiased = rasterize_mode == "antialiased"
+    means2d, conics, depths, opacities = jax.vmap(
+        lambda *g: _splat(*g, viewmat, K, width, height, eps2d, antialiased)
+    )(means, quats, scales, opacities)
+    if sh_degree is not None:
+        center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        colors = jnp.maximum(evaluate_sh(sh_degree, colors, means - center), 0.0)
+    order = jnp.argsort(depths, stable=True)
+    means2d, conics, depths, opacities, colors = (a[order] for a in (means2d, conics, depths, opacities, colors))
+    in_range = (depths > near_plane) & (depths < far_plane)
+    painted = [colors, depths[:, None]] + ([] if features is None else [features[order]])
+    painted = jnp.where(in_range[:, None], jnp.concatenate(painted, axis=-1), 0.0)
+    gaps = jnp.abs(jnp.diff(depths)) <= _TIE * jnp.abs(depths[1:])
+
+    def one_pixel(pixel):
+        d = pixel - means2d
+        power = -0.5 * jnp.einsum("ni,nij,nj->n", d, conics, d)
+        raw = opacities * jnp.exp(power)
+        alpha = jnp.minimum(raw, alpha_max)
+        drawn = in_range & (alpha >= 1 / 255)
+        alpha = jnp.where(drawn, alpha, 0.0)
+        after = jnp.cumprod(1 - alpha)
+        before = jnp.concatenate([jnp.ones(1), after[:-1]])
+        live = after > 1e-4
+        weights = jnp.where(live, alpha * before, 0.0)
+        left = jnp.where(live, 1 - alpha, 1.0).prod()
+
+        def near(value, threshold, where):
+            return jnp.any(where & (jnp.abs(value / threshold - 1) < _DOUBT))
+
+        seen = in_range & (before > _VISIBLE)
+        doubtful = near(raw, 1 / 255, seen) | near(raw, alpha_max, seen) | near(after, 1e-4, drawn)
+        doubtful |= jnp.any(gaps & drawn[1:] & drawn[:-1] & seen[:-1])
+        return weights @ painted, 1 - left, doubtful
+
+    x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
+    rows = jax.lax.map(jax.checkpoint(jax.vmap(one_pixel)), jnp.stack([x, y], axis=-1))
+    values, alphas, doubtful = rows
+    num_colors = colors.shape[-1]
+    image, depth = values[..., :num_colors], values[..., num_colors : num_colors + 1]
+    if background is not None:
+        image = image + (1 - alphas)[..., None] * background
+    if "ED" in render_mode:
+        depth = depth / jnp.maximum(alphas, 1e-10)[..., None]
+    parts = ([image] if "RGB" in render_mode else []) + ([depth] if "D" in render_mode else [])
+    return Reference(
+        colors=jnp.concatenate(parts, axis=-1),
+        alphas=alphas[..., None],
+        features=None if features is None else values[..., num_colors + 1 :],
+        doubtful=doubtful,
+    )
