@@ -1,0 +1,163 @@
+"""Planes in a depth picture, one after the other by RANSAC (Fischler and Bolles 1981).
+
+A hypothesis is one pixel and the normal there, and a vote needs the normal to agree too: an infinite plane
+slices whatever stands across it, and by distance alone those slices would count as plane.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+_SAMPLES = 6000  # pixels that vote on hypotheses; enough to rank planes of a few per cent
+_HYPOTHESES = 400
+_MIN_COSINE = np.cos(np.radians(25))  # between a pixel's normal, which is noisy, and its plane's
+_EDGE = 4  # pixels: so near to an edge a normal mixes two surfaces and cannot vote
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The plane normal . x = offset in the camera's frame, and the pixels that lie on it.
+
+    Attributes:
+        normal: unit, towards the camera.
+        offset: metres; at most 0, as the camera is at the origin on the side of the normal.
+        pixels: those of the plane.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    pixels: Bool[np.ndarray, "H W"]
+
+    def fraction_behind(
+        self,
+        points: Float[np.ndarray, "H W 3"],
+        valid: Bool[np.ndarray, "H W"],
+        tolerance: Float[np.ndarray, "H W"],
+    ) -> float:
+        """The part of the valid points that lies clearly (three tolerances) beyond the plane."""
+        return float(np.mean((points @ self.normal - self.offset < -3 * tolerance)[valid]))
+
+    def fraction_rising(
+        self,
+        points: Float[np.ndarray, "H W 3"],
+        valid: Bool[np.ndarray, "H W"],
+        tolerance: Float[np.ndarray, "H W"],
+    ) -> float:
+        """The part of the pixels' rim at which the picture goes up from the plane: high on the ground that
+        things stand on or in, low on the top of a thing."""
+        rim = ndimage.binary_dilation(self.pixels, iterations=3) & ~self.pixels & valid
+        rising = points @ self.normal - self.offset > tolerance
+        return float(np.mean(rising[rim])) if rim.any() else 0.0
+
+
+def surface_normals(points: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """Unit normals towards the camera, from differences of blurred points; zero where there is no surface."""
+    blurred = ndimage.uniform_filter(points, (5, 5, 1), mode="nearest")
+    across, down = np.gradient(blurred, axis=1), np.gradient(blurred, axis=0)
+    normals = np.cross(down, across)
+    normals *= -np.sign(np.sum(normals * points, axis=-1, keepdims=True))
+    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(lengths > 1e-12, normals / np.maximum(lengths, 1e-12), 0.0)
+
+
+def find_planes(
+    points: Float[np.ndarray, "H W 3"],
+    normals: Float[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"],
+    tolerance: Float[np.ndarray, "H W"],
+    *,
+    min_pixels: int,
+    max_planes: int,
+    rng: np.random.Generator,
+) -> list[Plane]:
+    """Planes from the largest on, each among the pixels that the ones before left over.
+
+    Args:
+        points: in the camera's frame, metres.
+        normals: of their surfaces (`surface_normals`).
+        valid: where there is depth.
+        tolerance: how far from a plane a pixel may lie, metres.
+        min_pixels: of a plane; the search ends at the first that has fewer.
+        max_planes: the most planes that are looked for.
+        rng: draws the hypotheses.
+    """
+    planes, free = [], valid.copy()
+    while len(planes) < max_planes and free.sum() >= max(min_pixels, 3):
+        normal, offset = _best_hypothesis(points[free], normals[free], tolerance[free], rng)
+        for _ in range(3):  # fitted to all its pixels, it takes in some more
+            near = free & (np.abs(points @ normal - offset) <= tolerance)
+            agreeing = near & (normals @ normal > _MIN_COSINE)
+            if agreeing.sum() < 3:
+                return planes
+            normal, offset = _fit(points[agreeing])
+        if agreeing.sum() < min_pixels:
+            break
+        core = ndimage.binary_opening(agreeing)
+        planes.append(Plane(normal, offset, near & ndimage.binary_dilation(core, iterations=_EDGE)))
+        free &= ~(planes[-1].pixels | agreeing)
+    return planes
+
+
+def find_levels(
+    points: Float[np.ndarray, "H W 3"],
+    normals: Float[np.ndarray, "H W 3"],
+    free: Bool[np.ndarray, "H W"],
+    tolerance: Float[np.ndarray, "H W"],
+    up: Float[np.ndarray, "3"],
+    *,
+    min_pixels: int,
+    max_levels: int = 20,
+) -> list[Plane]:
+    """Connected flat patches whose normal is `up`, by the peaks of a histogram of heights.
+
+    Knowing the direction makes much smaller planes certain than RANSAC could find.
+
+    Args:
+        points, normals, tolerance: as in `find_planes`.
+        free: the pixels to look at.
+        up: unit.
+        min_pixels: of a patch.
+        max_levels: the most heights that are looked at.
+    """
+    heights, free, patches = points @ up, free.copy(), []
+    agreeing = free & (normals @ up > _MIN_COSINE)
+    for _ in range(max_levels):
+        if agreeing.sum() < max(min_pixels, 1):
+            break
+        width = float(np.median(tolerance[agreeing]))
+        bins = np.floor((heights[agreeing] - heights[agreeing].min()) / width).astype(int)
+        peak = bins == np.argmax(np.bincount(bins))
+        offset = float(np.median(heights[agreeing][peak]))
+        near = free & (np.abs(heights - offset) <= tolerance)
+        core = ndimage.binary_opening(near & agreeing)
+        labels, count = ndimage.label(near & ndimage.binary_dilation(core, iterations=_EDGE))
+        found = [labels == label for label in range(1, count + 1)]
+        patches += [Plane(up, offset, patch) for patch in found if patch.sum() >= min_pixels]
+        taken = near | (agreeing & (np.abs(heights - offset) <= width))
+        free, agreeing = free & ~taken, agreeing & ~taken
+    return patches
+
+
+def _best_hypothesis(
+    points: np.ndarray, normals: np.ndarray, tolerance: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, float]:
+    """The tangent plane of the pixel for which most others vote."""
+    chosen = rng.choice(len(points), min(_SAMPLES, len(points)), replace=False)
+    points, normals, tolerance = points[chosen], normals[chosen], tolerance[chosen]
+    tried = slice(0, _HYPOTHESES)  # `chosen` is in random order already
+    offsets = np.sum(points[tried] * normals[tried], axis=1)
+    near = np.abs(normals[tried] @ points.T - offsets[:, None]) <= tolerance
+    votes = np.sum(near & (normals[tried] @ normals.T > _MIN_COSINE), axis=1)
+    best = int(np.argmax(votes))
+    return normals[best], float(offsets[best])
+
+
+def _fit(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """The least-squares plane of points, its normal towards the camera."""
+    center = points.mean(axis=0)
+    _, vectors = np.linalg.eigh((points - center).T @ (points - center))
+    normal = vectors[:, 0]
+    offset = float(normal @ center)
+    return (-normal, -offset) if offset > 0 else (normal, offset)
