@@ -58,7 +58,7 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
     if raw.dtype != np.uint16 or raw.ndim != 2:
         found = f"{raw.dtype} with {1 if raw.ndim == 2 else raw.shape[2]} channels"
         raise DataError(path, "depth as one 16-bit channel", found, "Save depth as a 16-bit PNG.")
-    depth = raw.astype(np.float32) * np.float32(unit_m)
+    depth = (raw * unit_m).astype(np.float32)
     return np.where(raw == SATURATED_DEPTH, np.float32(0), depth)
 
 

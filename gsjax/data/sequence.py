@@ -13,6 +13,8 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import Camera
 
+# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+
 _POSE_ADVICE = "viewmats are world-to-camera in OpenCV axes; correct or leave out that pose."
 
 
@@ -31,8 +33,8 @@ class Truth:
     """
 
     names: tuple[str, ...]
-    label_ids: Int[np.ndarray, "objects"]
-    poses: Float[np.ndarray, "frames objects 4 4"]
+    label_ids: Int[np.ndarray, "..."]
+    poses: Float[np.ndarray, "..."]
     robot: int | None = None
 
     def __post_init__(self):
@@ -62,14 +64,14 @@ class PointModel:
     """
 
     name: str
-    means: Float[np.ndarray, "n 3"]
-    quats: Float[np.ndarray, "n 4"]
-    scales: Float[np.ndarray, "n 3"]
-    opacities: Float[np.ndarray, "n"]
-    colors: Float[np.ndarray, "n 3"]
+    means: Float[np.ndarray, "..."]
+    quats: Float[np.ndarray, "..."]
+    scales: Float[np.ndarray, "..."]
+    opacities: Float[np.ndarray, "..."]
+    colors: Float[np.ndarray, "..."]
     label: int = 0
-    pose: Float[np.ndarray, "4 4"] | None = None
-    plane: Float[np.ndarray, "4"] | None = None
+    pose: Float[np.ndarray, "..."] | None = None
+    plane: Float[np.ndarray, "..."] | None = None
 
     def __post_init__(self):
         count = len(self.means)
@@ -117,10 +119,10 @@ class Sequence:
     camera_ids: tuple[int, ...]
     width: int
     height: int
-    times: Float[np.ndarray, "frames"]
+    times: Float[np.ndarray, "..."]
     frame_ids: tuple[int, ...]
-    Ks: Float[np.ndarray, "frames cameras 3 3"]
-    viewmats: Float[np.ndarray, "frames cameras 4 4"]
+    Ks: Float[np.ndarray, "..."]
+    viewmats: Float[np.ndarray, "..."]
     load_image: Callable[[int, int], np.ndarray] = field(repr=False)
     load_depth: Callable[[int, int], np.ndarray | None] | None = field(default=None, repr=False)
     load_mask: Callable[[int, int], np.ndarray | None] | None = field(default=None, repr=False)

@@ -1,12 +1,14 @@
 """Rigid transforms and smooth motions along keyframes; every function takes many frames at once."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 
 def rigid(
-    rotation: Rotation | None = None, translation: Float[np.ndarray, "*frames 3"] = (0.0, 0.0, 0.0)
+    rotation: Rotation | None, translation: Float[np.ndarray, "*frames 3"] | Sequence[float]
 ) -> Float[np.ndarray, "*frames 4 4"]:
     """Transforms that rotate, then translate; of one rotation or of many."""
     translation = np.asarray(translation, np.float64)
@@ -24,14 +26,14 @@ def minimum_jerk(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def along_keyframes(
-    frames: Float[np.ndarray, "t"], keys: Float[np.ndarray, "k"], values: Float[np.ndarray, "k d"]
+    frames: Float[np.ndarray, "t"], keys: Sequence[float], values: Sequence[Sequence[float]]
 ) -> Float[np.ndarray, "t d"]:
     """Values that pass through `values` at the frames `keys`, at rest at each of them."""
-    keys, values = np.asarray(keys, np.float64), np.asarray(values, np.float64)
-    result = np.broadcast_to(values[0], (len(frames), values.shape[1])).copy()
+    points = np.asarray(values, np.float64)
+    result = np.broadcast_to(points[0], (len(frames), points.shape[1])).copy()
     for i in range(len(keys) - 1):
         share = minimum_jerk((frames - keys[i]) / (keys[i + 1] - keys[i]))
-        result += share[:, None] * (values[i + 1] - values[i])
+        result += share[:, None] * (points[i + 1] - points[i])
     return result
 
 
@@ -44,7 +46,7 @@ def coast(frames: Float[np.ndarray, "t"], start: float, duration: float) -> Floa
     return x * (2 - x)
 
 
-def turn(axis: Float[np.ndarray, "3"], angles: Float[np.ndarray, "*n"]) -> Rotation:
+def turn(axis: Float[np.ndarray, "3"] | Sequence[float], angles: Float[np.ndarray, "*n"] | float) -> Rotation:
     """Rotations about one unit axis, by radians."""
     return Rotation.from_rotvec(np.asarray(angles)[..., None] * np.asarray(axis, np.float64))
 

@@ -96,7 +96,7 @@ def tabletop(
     layout = _draw_layout(seed, leave, hide)
     viewmats = _viewmats(cameras, times if moving_cameras else np.zeros(frames))
     scene = _build_scene(seed, layout, moments, viewmats, width, height, leave, hide)
-    named = dict(zip(NAMES, range(_FIRST_BODY, _FIRST_BODY + len(NAMES)), strict=True))
+    named = {name: _FIRST_BODY + i for i, name in enumerate(NAMES)}
     return simulated_sequence(f"tabletop_seed{seed}", scene, times, named, robot=ROBOT_LABEL)
 
 
