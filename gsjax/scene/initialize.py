@@ -184,7 +184,8 @@ def lift_labels(
     columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
     there = depth[rows, columns]
     seen = inside & _valid_depth(there) & (np.abs(there - z) <= max_depth_gap)
-    labels = np.where(seen, mask[rows, columns], UNKNOWN_LABEL).astype(np.int32)
+    # Widened before: -1 among the bytes of a mask file would become 255.
+    labels = np.where(seen, mask[rows, columns].astype(np.int32), UNKNOWN_LABEL)
     _warn_of_lost_labels(mask, labels, expected_labels)
     return labels
 

@@ -166,17 +166,21 @@ def test_labels_are_lifted_only_where_the_depth_agrees():
             [0.0, 0.0, -1.0],  # behind the camera
         ]
     )
-    labels = lift_labels(points, mask, depth, np.eye(4), K)
-    np.testing.assert_array_equal(labels, [1, 1, -1, -1, 0, -1, -1])
+    for dtype in (np.int32, np.uint8, np.int64):
+        labels = lift_labels(points, mask.astype(dtype), depth, np.eye(4), K)
+        np.testing.assert_array_equal(labels, [1, 1, -1, -1, 0, -1, -1])
+        assert labels.dtype == np.int32
 
 
 def test_labels_do_not_bleed_across_an_occlusion_edge():
     depth, mask = box_before_wall()
     points, _ = points_from_rgbd(np.zeros((HEIGHT, WIDTH, 3)), depth, np.eye(4), K)
     np.testing.assert_array_equal(lift_labels(points, mask, depth, np.eye(4), K), mask.ravel())
-    wall = points[points[:, 2] > 1.5]
-    shifted = wall + np.array([0.013, 0.017, 0.0])  # as another camera would have sampled the same wall
-    assert not (lift_labels(shifted, mask, depth, np.eye(4), K) == 1).any()
+    # The same surfaces as another camera would have sampled them: the wall takes nothing from the box.
+    shifted = points + np.array([0.013, 0.017, 0.0])
+    labels = lift_labels(shifted, mask, depth, np.eye(4), K)
+    assert not (labels[points[:, 2] > 1.5] == 1).any()
+    assert (labels == 1).any()
 
 
 def test_invalid_depth_lifts_nothing():
