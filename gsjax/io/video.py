@@ -5,7 +5,6 @@ import os
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import IO
 
 import cv2
 import imageio_ffmpeg
@@ -36,11 +35,10 @@ class VideoWriter:
             raise ValueError(f"fps: got {fps}, want a positive number")
         if self.path.suffix != ".mp4":
             raise ValueError(f"path: got {self.path}, want a name that ends in .mp4")
-        self._options = ["-r", f"{fps:.6g}", "-crf", str(quality)]
+        self._rate, self._quality = f"{fps:.6g}", str(quality)
         self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
-        self._process: subprocess.Popen | None = None
-        self._messages: IO[bytes] | None = None
+        self._encoder: _Encoder | None = None
 
     def write(self, frame: Num[np.ndarray, "..."]) -> None:
         """Append a frame [H, W, 3]: uint8, or floats 0 to 1 (clipped; NaN is black).
@@ -50,32 +48,28 @@ class VideoWriter:
             RuntimeError: ffmpeg failed; the message holds its own.
         """
         pixels = _to_bytes(np.asarray(frame))
-        if self._process is None:
-            self._shape = pixels.shape
-            self._start(*pixels.shape[:2])
+        height, width = pixels.shape[:2]
+        if self._encoder is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            even = f"{width + width % 2}x{height + height % 2}"
+            self._shape, self._encoder = pixels.shape, self._start(even)
         if pixels.shape != self._shape:
             raise ValueError(f"frame: got shape {pixels.shape}, want {self._shape} like the first frame")
-        height, width = pixels.shape[:2]
-        padded = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        try:
-            self._process.stdin.write(padded.tobytes())
-        except BrokenPipeError as error:
-            raise RuntimeError(f"{self.path}: ffmpeg stopped: {self._said()}") from error
+        self._encoder.write(np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").tobytes())
 
     def close(self) -> None:
         """Finish the file and give it its name. Without any frame there is no file."""
-        if self._process is None:
+        if self._encoder is None:
             return
-        process, self._process = self._process, None
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
-        failed = process.wait() != 0
-        message = self._said()
-        self._messages.close()
-        if failed:
+        encoder, self._encoder = self._encoder, None
+        try:
+            encoder.finish()
+            os.replace(self._temporary, self.path)
+        finally:
             self._temporary.unlink(missing_ok=True)
-            raise RuntimeError(f"{self.path}: ffmpeg could not write the video: {message}")
-        os.replace(self._temporary, self.path)
+
+    def _start(self, size: str) -> "_Encoder":
+        return _Encoder(self._temporary, size=size, rate=self._rate, quality=self._quality)
 
     def __enter__(self) -> "VideoWriter":
         return self
@@ -83,28 +77,42 @@ class VideoWriter:
     def __exit__(self, *exception) -> None:
         self.close()
 
-    def _start(self, height: int, width: int) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        size = f"{width + width % 2}x{height + height % 2}"
-        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, *self._options[:2], "-i", "-"]
-        target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", *self._options[2:], "-movflags", "+faststart"]
+
+class _Encoder:
+    """An ffmpeg process that eats raw RGB frames and writes an .mp4."""
+
+    def __init__(self, path: Path, *, size: str, rate: str, quality: str):
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
+        target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", quality, "-movflags", "+faststart"]
         # Its messages go to a file: a pipe that nobody reads would fill up and stop it.
-        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`close` closes it)
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
         # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock beside JAX's threads.
         self._process = subprocess.Popen(
-            [
-                imageio_ffmpeg.get_ffmpeg_exe(),
-                "-y",
-                "-loglevel",
-                "error",
-                *source,
-                *target,
-                str(self._temporary),
-            ],
+            [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target, str(path)],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             **_own_process_group(),
         )
+
+    def write(self, data: bytes) -> None:
+        """Feed it; RuntimeError with its own words if it has stopped."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(data)
+        except BrokenPipeError as error:
+            self._process.wait()
+            raise RuntimeError(f"ffmpeg stopped: {self._said()}") from error
+
+    def finish(self) -> None:
+        """End the file and the process; RuntimeError with its own words if it failed."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        failed = self._process.wait() != 0
+        message = self._said()
+        self._messages.close()
+        if failed:
+            raise RuntimeError(f"ffmpeg could not write the video: {message}")
 
     def _said(self) -> str:
         self._messages.seek(0)

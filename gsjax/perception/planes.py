@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from skimage.measure import label
 
 _SAMPLES = 6000  # pixels that vote on hypotheses; enough to rank planes of a few per cent
 _HYPOTHESES = 400
@@ -132,8 +133,8 @@ def find_levels(
         offset = float(np.median(heights[agreeing][peak]))
         near = free & (np.abs(heights - offset) <= tolerance)
         core = ndimage.binary_opening(near & agreeing)
-        labels, count = ndimage.label(near & ndimage.binary_dilation(core, iterations=_EDGE))
-        found = [labels == label for label in range(1, count + 1)]
+        labels = label(near & ndimage.binary_dilation(core, iterations=_EDGE), connectivity=1)
+        found = [labels == name for name in range(1, labels.max() + 1)]
         patches += [Plane(up, offset, patch) for patch in found if patch.sum() >= min_pixels]
         taken = near | (agreeing & (np.abs(heights - offset) <= width))
         free, agreeing = free & ~taken, agreeing & ~taken

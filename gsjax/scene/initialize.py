@@ -106,7 +106,7 @@ def gaussians_from_points(
     *,
     voxel: float = 0.0,
     opacity: float = 0.9,
-    scale_factor: float = 0.6,
+    scale_factor: float = 0.55,
     clip_quantile: float = 0.95,
     normals: Float[np.ndarray, "normals 3"] | str | None = None,
     flatness: float = 0.2,

@@ -1,5 +1,6 @@
 """Videos: what is written plays, also after an exception or Ctrl-C."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -117,3 +118,14 @@ def test_bad_arguments_and_files_are_named(tmp_path):
         read_video_frames(tmp_path / "text.mp4")
     with pytest.raises(FileNotFoundError, match=r"none\.mp4"):
         read_video_frames(tmp_path / "none.mp4")
+
+
+def test_what_ffmpeg_says_is_passed_on_and_no_litter_stays(tmp_path):
+    video = VideoWriter(tmp_path / "a.mp4", fps=10)
+    with pytest.raises(RuntimeError, match="ffmpeg"):  # noqa: PT012  (it may fail at any write, or at the end)
+        for _ in range(3):
+            video.write(np.zeros((2, 20000, 3)))  # wider than H.264 can be
+        video.close()
+    with contextlib.suppress(RuntimeError):
+        video.close()
+    assert not list(tmp_path.iterdir())
