@@ -95,8 +95,8 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
     """
     root = Path(path)
     truth = sequence.truth
-    if truth is not None and list(truth.label_ids) != list(range(2, 2 + len(truth.names))):
-        raise ValueError(f"write_panoptic needs objects labelled 2, 3, ..., got {list(truth.label_ids)}")
+    if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
+        raise ValueError(f"write_panoptic needs objects labelled 2, 3, ..., got {truth.label_ids.tolist()}")
     names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
     for t, frame in enumerate(names):
         for c, name in enumerate(frame):

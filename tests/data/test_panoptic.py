@@ -1,5 +1,6 @@
 import json
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -322,3 +323,18 @@ def test_real_recording_with_held_out_cameras(shared_data):
     assert held_out.mask(0, 0) is None
     assert held_out.image(29, 3).shape == (360, 640, 3)
     assert set(np.unique(sequence.mask(0, 0))) == {0, 255}
+
+
+def test_writing_needs_the_labels_of_a_tabletop(tmp_path):
+    scene = tabletop(frames=1, width=16, height=12, cameras=1)
+    truth = replace(scene.truth, label_ids=np.array([1, 2, 3, 4]))
+    with pytest.raises(ValueError, match=r"labelled 2, 3, ..., got \[1, 2, 3, 4\]"):
+        write_panoptic(replace(scene, truth=truth), tmp_path)
+
+
+def test_frames_without_a_number_are_counted(folder):
+    for t in range(FRAMES):
+        for c in (0, 1):
+            (folder.root / f"ims/{c}/{t:06d}.jpg").rename(folder.root / f"ims/{c}/frame_{'abc'[t]}.jpg")
+    folder.meta["fn"] = [[f"{c}/frame_{letter}.jpg" for c in (0, 1)] for letter in "abc"]
+    assert folder.read().frame_ids == (0, 1, 2)

@@ -7,6 +7,7 @@ import pytest
 
 from gsjax.data import DataError, read_push_t
 from gsjax.data.push_t import MAX_SKEW_S
+from gsjax.data.video import Video
 
 WIDTH, HEIGHT = 64, 48
 K = [[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 1.0]]
@@ -114,6 +115,26 @@ def test_a_file_that_is_no_video(folder):
     (folder.demo / "videos/a.mp4").write_text("no video")
     with pytest.raises(DataError, match=r"a.mp4: expected a video, found something that does not open"):
         read_push_t(folder.root).image(0, 0)
+
+
+def test_a_video_of_another_size_or_shorter_than_it_says(folder):
+    path = folder.demo / "videos/a.mp4"
+    with pytest.raises(DataError, match=r"a.mp4: expected 32x24 pixels, found 64x48"):
+        Video(path, 32, 24, 20).frame(0)
+    video = Video(path, WIDTH, HEIGHT, 20)
+    with pytest.raises(DataError, match=r"a.mp4: expected 20 frames, found no frame 25"):
+        video.frame(25)
+    assert level(video.frame(3)) == 3  # it reads on after an error
+
+
+def test_recordings_without_cameras_or_timestamps(folder):
+    folder.write_record("b", [])
+    with pytest.raises(DataError, match=r"b.mp4: expected timestamps, found none"):
+        read_push_t(folder.root)
+    folder.cameras = {}
+    folder.write_cameras()
+    with pytest.raises(DataError, match=r"cameras.json: expected at least one camera"):
+        read_push_t(folder.root)
 
 
 def test_timestamps_that_go_back(folder):
