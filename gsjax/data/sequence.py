@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import Camera
+from gsjax.scene.frame import Frame
 
 # Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
 
@@ -226,6 +227,24 @@ class Sequence:
             return None
         _check_array(self._what("mask", t, c), mask, (self.height, self.width), np.integer, "integer labels")
         return mask.astype(np.int32)
+
+    def frame(self, t: int) -> Frame:
+        """All cameras of frame `t` as arrays on the device; cameras without depth have depth 0 everywhere.
+
+        Raises:
+            DataError: as `image` and `depth`.
+        """
+        cameras = range(self.num_cameras)
+        dtype = jnp.result_type(float)
+        images = np.stack([self.image(t, c) for c in cameras])
+        depths = None
+        if self.has_depth:
+            nothing = np.zeros((self.height, self.width), np.float32)
+            loaded = [self.depth(t, c) for c in cameras]
+            depths = jnp.asarray(np.stack([nothing if d is None else d for d in loaded]), dtype)
+        viewmats, Ks = jnp.asarray(self.viewmats[t], dtype), jnp.asarray(self.Ks[t], dtype)
+        camera = Camera(viewmat=viewmats, K=Ks, width=self.width, height=self.height)
+        return Frame(jnp.asarray(images, dtype) / 255, depths, camera)
 
     def flow(self, t: int, c: int) -> Float[np.ndarray, "height width 2"] | None:
         """Pixels (x, y) that each pixel of frame `t` moves until t + 1; NaN = unknown; None without flow.

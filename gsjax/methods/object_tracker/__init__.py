@@ -1,0 +1,28 @@
+"""The object-aware tracker (papers/000): objects followed at the rate of a camera, from one view's first mask.
+
+Read the files as the data flows: config, scene, (shapes,) fit, matching, motion, refine, tracker, tracking.
+"""
+
+from gsjax.methods.object_tracker.config import MatchConfig, RefineConfig, StartConfig, TrackerConfig
+from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker, render_labels
+from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
+
+__all__ = [
+    "MatchConfig",
+    "Pose",
+    "RefineConfig",
+    "StartConfig",
+    "Tracked",
+    "TrackedScene",
+    "TrackerBatch",
+    "TrackerConfig",
+    "TrackerState",
+    "first_pose",
+    "object_tracker",
+    "place",
+    "render_labels",
+    "start_scene",
+    "track",
+]

@@ -1,0 +1,72 @@
+"""Every number of the object-aware tracker, with its unit and what it trades."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """How the first frame becomes Gaussians."""
+
+    object_pixels: float = 1.5
+    """Width of the voxels that keep one point of an object each, in pixels of the camera that saw it."""
+    background_pixels: float = 4.0
+    """The same for the background, which is only looked at."""
+    label_distance: float = 0.02
+    """A point unseen by the mask's camera takes the label of its nearest labelled point up to here, metres."""
+    depth_gap: float = 0.015
+    """How far a point's depth may be from the depth image and still be what the image shows, metres."""
+    iterations: int = 150
+    """Photometric optimisation steps on the first frame."""
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """Template matching: where has each object gone?"""
+
+    patch: int = 64
+    """Edge of the template, pixels of the (possibly reduced) image."""
+    radius: int = 24
+    """How far the template is searched to each side, pixels of the reduced image."""
+    min_score: float = 0.5
+    """A correlation below this moves nothing."""
+    margin: int = 2
+    """Pixels by which the object's mask is grown: an outline against its surroundings is texture too."""
+    max_residual: float = 0.03
+    """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Photometric refinement of the group displacements D_k and the individual ones delta_i."""
+
+    iterations: int = 20
+    """Adam iterations a frame."""
+    translation_rate: float = 1.5e-3
+    """Learning rate of D_k's translation, metres."""
+    rotation_rate: float = 2e-2
+    """Learning rate of D_k's rotation, radians."""
+    delta_rate: float = 1e-4
+    """Learning rate of delta_i, metres; 0 keeps groups rigid."""
+    delta_weight: float = 20.0
+    """Weight of the mean |delta_i|^2 of a group, in units of delta_scale^2."""
+    delta_scale: float = 0.004
+    """A displacement of its own that is large for a Gaussian, metres."""
+    depth_weight: float = 2.0
+    """Weight of the depth difference in metres beside the colour difference (0 to 1)."""
+    depth_limit: float = 0.05
+    """Depth differences beyond this are of something else, metres."""
+    color_limit: float = 0.3
+    """Colour differences beyond this are of something else, 0 to 1."""
+    se3: bool = True
+    """D_k rotates as well; False is the paper's translation."""
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """The object-aware tracker (papers/000), stage by stage."""
+
+    start: StartConfig = field(default_factory=StartConfig)
+    match: MatchConfig = field(default_factory=MatchConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    headroom: float = 1.5
+    """Room in the rasterizer's plan for what the motion will add."""

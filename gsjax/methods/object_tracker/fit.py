@@ -1,0 +1,66 @@
+"""Photometric optimisation of the first frame's Gaussians, before anything moves."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from gsjax.losses.photometric import photometric_loss, truncated_l1
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.optim.step import gradient_step, per_field_adam
+from gsjax.scene.frame import Frame
+from gsjax.scene.render import plan_render, render
+
+# Means hardly move: depth has measured them. What is learned is how to blend into the pictures.
+RATES = {"means": 1e-4, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
+_DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
+
+
+def fit_loss(gaussians, batch, *, step, key):
+    """L1 and D-SSIM on the images, and a truncated depth difference where depth is known."""
+    frame, plan = batch
+    rendered = render(gaussians, frame.cameras, plan)
+    loss = photometric_loss(rendered.colors, frame.images)
+    if frame.depths is not None:
+        known = (frame.depths > 0).astype(loss.dtype) * jax.lax.stop_gradient(rendered.alphas > 0.5)
+        loss += _DEPTH_WEIGHT * truncated_l1(rendered.depths, frame.depths, known, _DEPTH_LIMIT)
+    mse = jnp.square(rendered.colors - frame.images).mean()
+    return loss, {
+        "psnr": -10 * jnp.log10(mse),
+        "overflow": rendered.meta.overflow,
+        "needed": rendered.meta.needed,
+    }
+
+
+def fit_scene(
+    scene: TrackedScene, frame: Frame, iterations: int, headroom: float = 1.5
+) -> tuple[TrackedScene, dict]:
+    """The scene after `iterations` steps of Adam on the first frame; re-plans where splats outgrow the plan.
+
+    Returns:
+        The scene, and the info of the last step.
+    """
+    step = gradient_step(fit_loss, per_field_adam(RATES))
+    gaussians, done, info = scene.gaussians, 0, {}
+    state = step.init(gaussians)
+    plan = plan_render(gaussians, frame.cameras, headroom=headroom)
+    while done < iterations:
+        count = min(50, iterations - done)
+        new, new_state, infos = _run(step, gaussians, state, (frame, plan), count)
+        if infos["overflow"].any():
+            plan = plan.grown(int(infos["needed"].max()), headroom)
+            continue
+        gaussians, state, done = new, new_state, done + count
+        info = jax.tree.map(lambda a: a[-1], infos)
+    return eqx.tree_at(lambda s: s.gaussians, scene, gaussians), info
+
+
+@partial(jax.jit, static_argnames=("step", "count"))
+def _run(step, params, state, batch, count):
+    def body(carry, i):
+        params, state, info = step.update(*carry, batch, step=i, key=None)
+        return (params, state), info
+
+    (params, state), infos = jax.lax.scan(body, (params, state), jnp.arange(count))
+    return params, state, infos

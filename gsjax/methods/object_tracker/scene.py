@@ -1,0 +1,117 @@
+"""The first frame: a dense labelled cloud of Gaussians from RGB-D cameras and one mask (papers/000, section II-A)."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.geometry.neighbors import voxel_thin
+from gsjax.methods.object_tracker.config import StartConfig
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians, concatenate, take
+from gsjax.scene.initialize import gaussians_from_points, inherit_labels, lift_labels, points_from_rgbd
+
+
+class TrackedScene(eqx.Module):
+    """Gaussians with labels, the moving ones first.
+
+    Attributes:
+        gaussians: the scene at the first frame.
+        labels: group of each Gaussian: 0 is the background, 1..K the objects in the order of `label_ids`.
+        label_ids: the mask value that each group came from, background first (static).
+        num_moving: how many Gaussians, from the front, belong to objects (static).
+    """
+
+    gaussians: Gaussians
+    labels: Int[Array, "n"]
+    label_ids: tuple[int, ...] = eqx.field(static=True)
+    num_moving: int = eqx.field(static=True)
+
+    @property
+    def num_objects(self) -> int:
+        return len(self.label_ids) - 1
+
+
+class Cloud(NamedTuple):
+    """Points, on the host."""
+
+    points: Float[np.ndarray, "n 3"]
+    colors: Float[np.ndarray, "n 3"]
+    labels: Int[np.ndarray, "n"]
+    footprints: Float[np.ndarray, "n"]  # width of a pixel at the point, as its camera saw it, metres
+
+
+def labelled_cloud(
+    frame: Frame, mask: Int[np.ndarray, "height width"], mask_camera: int, config: StartConfig
+) -> Cloud:
+    """All cameras' points; labels come from one camera's mask, and from it to near neighbours unseen there.
+
+    Raises:
+        ValueError: the frame has no depth or no valid depth, or the mask has another size.
+    """
+    if frame.depths is None:
+        raise ValueError(
+            "the first frame needs depth to become Gaussians; without depth cameras give shapes (models)"
+        )
+    images, depths = np.asarray(frame.images), np.asarray(frame.depths)
+    viewmats, Ks = np.asarray(frame.cameras.viewmat, np.float64), np.asarray(frame.cameras.K, np.float64)
+    if mask.shape != depths.shape[1:]:
+        raise ValueError(f"mask has shape {mask.shape}; the images have {depths.shape[1:]} (height, width)")
+    clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]
+    footprints = [depth[depth > 0] / K[0, 0] for depth, K in zip(depths, Ks, strict=True)]
+    points = np.concatenate([points for points, _ in clouds])
+    colors = np.concatenate([colors for _, colors in clouds])
+    if len(points) == 0:
+        raise ValueError("the first frame has no valid depth in any camera: depth images are all zero")
+    view = (depths[mask_camera], viewmats[mask_camera], Ks[mask_camera])
+    labels = lift_labels(points, mask, *view, max_depth_gap=config.depth_gap)
+    labels = inherit_labels(points, labels, max_distance=config.label_distance)
+    return Cloud(points, colors, labels, np.concatenate(footprints))
+
+
+def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
+    """Rows of the chosen points that are left when each voxel, `pixels` pixels wide, keeps one; octave by octave."""
+    rows = np.flatnonzero(chosen)
+    octave = np.floor(np.log2(pixels * cloud.footprints[rows]))
+    kept = [
+        members[voxel_thin(cloud.points[members], 2.0**level)]
+        for level in np.unique(octave)
+        for members in [rows[octave == level]]
+    ]
+    return np.concatenate(kept)
+
+
+def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
+    """Thin the cloud, objects finely and the background coarsely, and make each point a disc on its surface."""
+    parts, labels, label_ids = [], [], [0]
+    for value in [*sorted(set(np.unique(cloud.labels)) - {0}), 0]:
+        chosen = cloud.labels == value
+        if not chosen.any():
+            continue
+        kept = _thin(cloud, chosen, config.object_pixels if value else config.background_pixels)
+        part = gaussians_from_points(cloud.points[kept], cloud.colors[kept], normals="pca")
+        if value:
+            label_ids.append(int(value))
+        parts.append(part)
+        labels.append(np.full(part.num, len(label_ids) - 1 if value else 0))
+    return assemble(parts, labels, tuple(label_ids))
+
+
+def assemble(parts: list[Gaussians], labels: list[np.ndarray], label_ids: tuple[int, ...]) -> TrackedScene:
+    """A scene from Gaussians and their groups, sorted so that what can move comes first.
+
+    Raises:
+        ValueError: all of it is background.
+    """
+    gaussians, group = concatenate(parts), np.concatenate(labels)
+    order = np.argsort(group == 0, kind="stable")
+    if len(label_ids) == 1:
+        raise ValueError("no object to track: the mask labels nothing, or nothing that has depth")
+    return TrackedScene(
+        gaussians=take(gaussians, order),
+        labels=jnp.asarray(group[order], jnp.int32),
+        label_ids=label_ids,
+        num_moving=int((group != 0).sum()),
+    )

@@ -1,0 +1,134 @@
+"""The host's side of tracking: compile once, feed frames, re-plan when a plan has become too small."""
+
+import time
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gsjax.methods.object_tracker.config import TrackerConfig
+from gsjax.methods.object_tracker.fit import fit_scene
+from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.scene import TrackedScene, labelled_cloud, scene_from_cloud
+from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render
+
+
+class Tracked(NamedTuple):
+    """The scene after one frame.
+
+    Attributes:
+        pose: where the moving Gaussians are now.
+        state: what the tracker carries to the next frame.
+        info: losses and matches by name; see `object_tracker`.
+        seconds: from images in memory to the new state, re-planning included; compilation apart.
+        compile_seconds: what compiling took before that; 0 but for the first frame and after re-plans.
+        plan: the plan it ran under.
+    """
+
+    pose: Pose
+    state: TrackerState
+    info: dict[str, Any]
+    seconds: float
+    compile_seconds: float
+    plan: Plan
+
+    def gaussians(self, scene: TrackedScene) -> Gaussians:
+        """The whole scene as it stands now."""
+        return place(scene, self.pose)
+
+
+def start_scene(
+    frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackerConfig = TrackerConfig()
+) -> TrackedScene:
+    """A labelled, photometrically optimised scene from the first RGB-D frame and one camera's mask.
+
+    Args:
+        frame: what the cameras see at first, with depth.
+        mask: labels [H, W] of one camera's image; 0 is background.
+        mask_camera: which camera of the frame the mask belongs to, counted from 0.
+
+    Raises:
+        ValueError: there is no depth, or the mask does not fit the images.
+    """
+    scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
+    return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
+
+
+@partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
+def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
+    return object_tracker(config, num_objects, reduction).update(pose, state, batch, step=step, key=None)
+
+
+def track(
+    scene: TrackedScene,
+    frames: Iterable[Frame],
+    config: TrackerConfig = TrackerConfig(),
+    *,
+    pose: Pose | None = None,
+    state: TrackerState | None = None,
+) -> Iterator[Tracked]:
+    """Follow the objects of `scene` through `frames` (those after the first one), one `Tracked` a frame.
+
+    Nothing is compiled between frames, unless a plan overflows: then the frame is done again under the next
+    rung, from the state before it, so nothing is lost.
+
+    Args:
+        scene: from `start_scene` or `scene_from_shapes`.
+        frames: in order of time; all of one size and number of cameras.
+        config: see `TrackerConfig`.
+        pose, state: where to go on from; the first frame unless given.
+    """
+    pose = first_pose(scene) if pose is None else pose
+    step = object_tracker(config, scene.num_objects)
+    state = step.init(pose) if state is None else state
+    plan: Plan | None = None
+    compiled: dict[Plan, Any] = {}
+    for index, frame in enumerate(frames):
+        if plan is None:
+            plan = plan_render(place(scene, pose), frame.cameras, headroom=config.headroom)
+            reduction = _reduction(scene, frame, config)
+        jax.block_until_ready(frame)
+        seconds = compile_seconds = 0.0
+        while True:
+            batch = TrackerBatch(scene, frame, plan)
+            arguments = (pose, state, batch, index)
+            if plan not in compiled:
+                begun = time.perf_counter()
+                static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
+                compiled[plan] = _update.lower(*arguments, **static).compile(host_options())
+                compile_seconds += time.perf_counter() - begun
+            begun = time.perf_counter()
+            result = jax.block_until_ready(compiled[plan](*arguments))
+            seconds += time.perf_counter() - begun
+            info = result[2]
+            if not bool(info["overflow"]):
+                break
+            plan = plan.grown(int(info["needed"]), config.headroom)
+        pose, state, info = result
+        yield Tracked(pose, state, info, seconds, compile_seconds, plan)
+
+
+def _reduction(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> int:
+    """By how much images shrink for matching, so that the largest object but one fits its template.
+
+    The largest is commonly a robot, which is far larger than what it handles.
+    """
+    groups = np.asarray(scene.labels[: scene.num_moving])
+    means = np.asarray(scene.gaussians.means[: scene.num_moving], np.float64)
+    sizes = []
+    for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
+        local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3)
+        sizes.append([np.ptp(pixels[groups == k], axis=0).max() for k in np.unique(groups)])
+    if not sizes or not sizes[0]:
+        return 1
+    largest = np.sort(np.max(sizes, axis=0))
+    size = largest[-2] if len(largest) > 1 else largest[-1]
+    return max(1, int(np.ceil(size / config.match.patch)))

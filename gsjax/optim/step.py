@@ -1,0 +1,78 @@
+"""The step protocol: every method advances by a pair of pure functions, as in optax and blackjax.
+
+    state = step.init(params)
+    params, state, info = step.update(params, state, batch, step=i, key=key)
+
+`params` holds what trains, `batch` what is given (observations, frozen scene, plan), `state` what a method
+carries along. `info` has the losses by name.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, PyTree
+
+
+class Init(Protocol):
+    def __call__(self, params: PyTree) -> PyTree: ...
+
+
+class Update(Protocol):
+    def __call__(
+        self, params: PyTree, state: PyTree, batch: PyTree, *, step: Any, key: Any
+    ) -> tuple[PyTree, PyTree, dict[str, Any]]: ...
+
+
+class Step(NamedTuple):
+    """A pair of pure functions; see the module."""
+
+    init: Init
+    update: Update
+
+
+def gradient_step(
+    loss: Callable[..., tuple[Array, dict[str, Any]]], optimizer: optax.GradientTransformation
+) -> Step:
+    """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
+
+    A step whose loss or gradient is not finite, or whose aux says `overflow`, returns params and state
+    unchanged; `info["skipped"]` says so. `info` is aux with `loss` added.
+    """
+
+    def update(params, state, batch, *, step, key):
+        (value, aux), gradients = jax.value_and_grad(loss, has_aux=True)(params, batch, step=step, key=key)
+        updates, new_state = optimizer.update(gradients, state, params)
+        new_params = optax.apply_updates(params, updates)
+        sound = all_finite((value, gradients)) & ~jnp.asarray(aux.get("overflow", False)).any()
+        params, state = keep_if(sound, (new_params, new_state), (params, state))
+        return params, state, {**aux, "loss": value, "skipped": ~sound}
+
+    return Step(optimizer.init, update)
+
+
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether every number of a pytree is finite."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+
+
+def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    """`new` where the condition holds, else `old`, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def per_field_adam(rates: dict[str, Any], default: float = 0.0) -> optax.GradientTransformation:
+    """Adam (eps 1e-15, as 3DGS uses it) with one learning rate a field of a module; fields without one stand still."""
+
+    def label(params):
+        def of(path, _):
+            name = getattr(path[0], "name", str(path[0]))
+            return name if name in rates else "rest"
+
+        return jax.tree_util.tree_map_with_path(of, params)
+
+    transforms = {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()}
+    transforms["rest"] = optax.adam(default) if default else optax.set_to_zero()
+    return optax.multi_transform(transforms, label)
