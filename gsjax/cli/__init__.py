@@ -1,0 +1,52 @@
+"""`gsjax COMMAND ...`: what can be done from a command line.
+
+Commands are imported when they are called, so that `gsjax --help` answers at once.
+"""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from rich.console import Console
+from rich.table import Table
+
+COMMANDS = {
+    "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
+    "info": ("gsjax.cli.info", "say what is understood of a recording"),
+}
+"""Each command's module, which has `Options`, a dataclass, and `run(options)`, which returns the exit code."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command that `arguments` (those of the process unless given) ask for; returns the exit code.
+
+    0: done. 2: the user's mistake, said in a sentence. 130: Ctrl-C.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    if command in ("-h", "--help"):
+        _print_help()
+        return 0
+    if command == "--version":
+        print("gsjax", import_module("gsjax").__version__)
+        return 0
+    if command not in COMMANDS:
+        known = ", ".join(COMMANDS)
+        Console(stderr=True).print(f"[bold red]error:[/] no command {command!r}; there are: {known}")
+        return 2
+    from gsjax.cli.messages import run_politely
+
+    return run_politely(command, rest, COMMANDS[command])
+
+
+def _print_help() -> None:
+    console = Console(highlight=False)
+    console.print("[bold]gsjax[/]: moving scenes from 3D Gaussians, in pure JAX\n")
+    table = Table.grid(padding=(0, 3, 0, 2))
+    for name, (_, does) in COMMANDS.items():
+        table.add_row(f"[bold cyan]gsjax {name}[/]", does)
+    console.print(table)
+    console.print(
+        "\nEach has its own options: [bold]gsjax track --help[/]. A first run, which needs no data:\n"
+    )
+    console.print("  gsjax track simulated:tabletop --out runs/demo --frames 0:30")

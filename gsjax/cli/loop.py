@@ -1,0 +1,110 @@
+"""The host loop: frames in, poses out, and everything timed."""
+
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsjax.cli.recording import Prefetched
+from gsjax.data import Sequence
+from gsjax.methods.object_tracker import Pose, TrackedScene, TrackerConfig, first_pose, track
+
+LOADED_AHEAD = 2
+"""Frames that are read while an update runs."""
+
+
+@dataclass
+class Tracking:
+    """What tracking gave so far: the first frame, and one entry more for each update.
+
+    Attributes:
+        scene: at the first frame.
+        poses: of the moving Gaussians in each frame, on the host.
+        update_s: seconds of each update; 0 for the first frame, which is initialisation.
+        compile_s: seconds spent compiling, all together.
+        loading_s: seconds that the loop waited for images.
+        loop_s: seconds of the whole loop.
+        plans: how many plans there were; more than one means that it had to plan again.
+        visible: [K] of each update, which objects some camera saw.
+        stopped: what ended the loop early, or None.
+    """
+
+    scene: TrackedScene
+    poses: list[Pose]
+    update_s: list[float] = field(default_factory=lambda: [0.0])
+    compile_s: float = 0.0
+    loading_s: float = 0.0
+    loop_s: float = 0.0
+    plans: int = 0
+    visible: list[np.ndarray] = field(default_factory=list)
+    stopped: BaseException | None = None
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that have a pose."""
+        return len(self.poses)
+
+    @property
+    def hz(self) -> float | None:
+        """Updates a second, loading and compiling apart; None before the first."""
+        total = sum(self.update_s)
+        return (self.num_frames - 1) / total if total else None
+
+    def means(self) -> Float[np.ndarray, "T N 3"]:
+        """The centres of all Gaussians over time, metres."""
+        still = np.asarray(self.scene.gaussians.means)[self.scene.num_moving :]
+        return np.stack([np.concatenate([pose.means, still]) for pose in self.poses])
+
+    def quats(self) -> Float[np.ndarray, "T M 4"]:
+        """The orientations of the moving Gaussians, which stand first, over time."""
+        return np.stack([pose.quats for pose in self.poses])
+
+
+def follow(
+    scene: TrackedScene, tracked: Sequence, config: TrackerConfig, console: Console, total: int | None = None
+) -> Tracking:
+    """Track all frames after the first. Ctrl-C or an error ends the loop; what was tracked until then stays.
+
+    Args:
+        scene: at the first frame.
+        tracked: the tracked cameras; only images and depth are loaded.
+        config: the tracker's.
+        console: for the progress bar.
+    """
+    tracking = Tracking(scene, [jax.device_get(first_pose(scene))])
+    frames = Prefetched(tracked.frame, range(1, tracked.num_frames), LOADED_AHEAD)
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    begun, plans = perf_counter(), set()
+    with Progress(*columns, console=console, expand=True) as progress:
+        task = progress.add_task("tracking", total=tracked.num_frames, completed=1, rate="compiling")
+        try:
+            for update in track(scene, frames, config):
+                tracking.poses.append(jax.device_get(update.pose))
+                tracking.update_s.append(update.seconds)
+                tracking.compile_s += update.compile_seconds
+                tracking.visible.append(np.asarray(update.info["visible"]))
+                plans.add(update.plan)
+                progress.update(task, advance=1, rate=_rate(tracking, update.info))
+        except (KeyboardInterrupt, Exception) as stopped:
+            tracking.stopped = stopped
+            progress.update(task, rate="stopped")
+    tracking.loop_s = perf_counter() - begun
+    tracking.loading_s, tracking.plans = frames.waited, len(plans)
+    return tracking
+
+
+def _rate(tracking: Tracking, info: dict) -> str:
+    """The rate of the last ten updates, and how good the picture is."""
+    recent = tracking.update_s[1:][-10:]
+    text = f"{len(recent) / sum(recent):.2f} Hz"
+    return f"{text}  {float(info['psnr']):.1f} dB" if "psnr" in info else text

@@ -1,0 +1,119 @@
+"""What goes wrong is said in a sentence: errors of the user's making, and warnings, each kind once."""
+
+import re
+import sys
+import warnings
+from collections import Counter
+from importlib import import_module
+
+from rich.console import Console
+from rich.text import Text
+
+from gsjax.data.errors import DataWarning
+
+# ValueError covers DataError and PlyError, and whatever an argument is checked for.
+USER_ERRORS = (ValueError, OSError)
+
+
+def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
+    """Parse the options of a command and run it. A user's mistake becomes a sentence and exit code 2.
+
+    Args:
+        command: its name.
+        arguments: what stands behind the name.
+        entry: its module, and what it does.
+    """
+    import tyro
+
+    module, does = entry
+    debug = False
+    try:
+        chosen = import_module(module)
+        options = tyro.cli(
+            chosen.Options,
+            prog=f"gsjax {command}",
+            description=f"{does[0].upper()}{does[1:]}.",
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+        debug = options.debug
+        return chosen.run(options)
+    except KeyboardInterrupt:
+        say_error("stopped by Ctrl-C before there was anything to keep", word="stopped")
+        return 130
+    except USER_ERRORS as error:
+        if debug:
+            raise
+        say_error(describe(error))
+        return 2
+
+
+def describe(error: BaseException) -> str:
+    """An exception as one paragraph, without Python's own words where there are better ones."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def say_error(text: str, word: str = "error") -> None:
+    """Print one paragraph on stderr. It is wrapped for people only, so that programs can search it."""
+    console = Console(stderr=True, highlight=False)
+    line = Text.assemble((f"{word}: ", "bold red"), text.removeprefix(f"{word} "))
+    console.print(line, soft_wrap=not console.is_terminal)
+
+
+class Notes:
+    """Collects what a run has to say for itself, and shows each kind of warning once.
+
+        with Notes(console) as notes: ...
+
+    While the block runs, warnings of gsjax are printed plainly to the console. Two that differ in numbers
+    only (one for each frame, say) are of one kind.
+    """
+
+    def __init__(self, console: Console):
+        self._console = console
+        self._first: dict[str, str] = {}
+        self._counts: Counter[str] = Counter()
+        self._added: list[str] = []
+
+    def add(self, text: str) -> None:
+        """Note something for the report without printing it."""
+        self._added.append(text)
+
+    def warn(self, text: str) -> None:
+        """Print a warning, unless one of its kind was printed before, and note it."""
+        kind = re.sub(r"\d+(\.\d+)?", "#", text)
+        self._counts[kind] += 1
+        if kind not in self._first:
+            self._first[kind] = text
+            line = Text.assemble(("warning: ", "bold yellow"), text)
+            self._console.print(line, soft_wrap=not self._console.is_terminal)
+
+    @property
+    def all(self) -> list[str]:
+        """The notes, then the warnings; of many of one kind the first, with their number."""
+        more = {kind: count - 1 for kind, count in self._counts.items()}
+        tail = {k: f" (and {n} more like it)" if n else "" for k, n in more.items()}
+        return [*self._added, *(f"Warning: {text}{tail[kind]}" for kind, text in self._first.items())]
+
+    def __enter__(self) -> "Notes":
+        self._caught = warnings.catch_warnings()
+        self._caught.__enter__()
+        warnings.simplefilter("always", DataWarning)
+        warnings.filterwarnings("always", category=UserWarning, module=r"gsjax(\.|$)")
+        show = warnings.showwarning
+
+        def showwarning(message, category, filename, lineno, file=None, line=None):
+            if issubclass(category, DataWarning) or (
+                issubclass(category, UserWarning) and "gsjax" in filename
+            ):
+                self.warn(" ".join(str(message).split()))
+            elif sys.warnoptions:  # who asked Python for warnings gets the others too
+                show(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = showwarning
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._caught.__exit__(*exception)

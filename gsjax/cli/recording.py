@@ -1,0 +1,224 @@
+"""Which part of a recording is tracked, which is only judged, and what its masks call things."""
+
+from collections.abc import Callable
+from collections.abc import Sequence as Indices
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Int
+
+from gsjax.cli.messages import Notes
+from gsjax.data import Sequence, open_sequence
+from gsjax.data.open import SIMULATED_PREFIX
+
+FIRST_LABEL_NAMES = {0: "background"}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The chosen frames of a recording.
+
+    Attributes:
+        tracked: as its tracked cameras saw them; the others are not even opened while tracking.
+        judged: the same frames with the cameras that are only judged behind the tracked ones.
+        frames_in_data: how many frames there were to choose from.
+    """
+
+    tracked: Sequence
+    judged: Sequence
+    frames_in_data: int
+
+    @property
+    def held_out(self) -> tuple[int, ...]:
+        """Ids of the cameras that are only judged."""
+        return self.judged.camera_ids[self.tracked.num_cameras :]
+
+
+def open_recording(
+    dataset: str, cameras: Indices[int] | None, eval_cameras: Indices[int], frames: str
+) -> Recording:
+    """Open a dataset and choose frames and cameras; without a choice all cameras that are not held out.
+
+    Raises:
+        ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen.
+        DataError: the dataset cannot be read.
+    """
+    sequence = open_sequence(dataset)
+    known = list(sequence.camera_ids)
+    chosen = [c for c in known if c not in eval_cameras] if cameras is None else list(cameras)
+    for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):
+        unknown = [c for c in ids if c not in known]
+        if unknown:
+            raise ValueError(f"{option}: {sequence.name} has no camera {unknown[0]}; it has {known}.")
+        twice = [c for c in ids if ids.count(c) > 1]
+        if twice:
+            raise ValueError(f"{option}: camera {twice[0]} is named twice.")
+    both = [c for c in chosen if c in eval_cameras]
+    if both:
+        raise ValueError(f"--eval-cameras: camera {both[0]} is tracked too; a judge must not be. Drop one.")
+    if not chosen:
+        raise ValueError(f"--cameras: no camera is left to track; {sequence.name} has {known}.")
+    total = sequence.num_frames
+    sequence = sequence.select(frames=parse_frames(frames))
+    if dataset.startswith(SIMULATED_PREFIX):
+        sequence = _remember(sequence)
+    return Recording(
+        tracked=sequence.select(cameras=chosen),
+        judged=sequence.select(cameras=[*chosen, *eval_cameras]),
+        frames_in_data=total,
+    )
+
+
+def parse_frames(text: str) -> slice:
+    """Frames as Python slices them: "0:60", "0:60:2", ":30", ":"; "7" is the eighth alone.
+
+    Raises:
+        ValueError: it is none of these, or does not go forward.
+    """
+    try:
+        parts = [int(part) if part.strip() else None for part in text.split(":")]
+    except ValueError:
+        parts = []
+    if not 1 <= len(parts) <= 3 or (len(parts) == 1 and parts[0] is None):
+        raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, found {text!r}.")
+    if len(parts) == 1:
+        return slice(parts[0], None if parts[0] == -1 else parts[0] + 1)
+    if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
+        raise ValueError(f"--frames: frames are tracked forwards; found the step {parts[2]}.")
+    return slice(*parts)
+
+
+def _remember(sequence: Sequence) -> Sequence:
+    """The same sequence with what was loaded kept in memory: a simulated picture is slow to draw twice."""
+
+    def kept(loader: Callable | None) -> Callable | None:
+        seen: dict[tuple[int, int], Any] = {}
+
+        def load(t: int, c: int) -> Any:
+            if (t, c) not in seen:
+                seen[t, c] = loader(t, c)
+            return seen[t, c]
+
+        return loader and load
+
+    return replace(sequence, load_image=kept(sequence.load_image), load_depth=kept(sequence.load_depth))
+
+
+class FirstMask(NamedTuple):
+    """Labels of one camera's first image, which is all that a tracker is told about objects.
+
+    Attributes:
+        labels: [H, W]; 0 is background. None where objects come as shapes.
+        camera: id of the camera, or None.
+        source: one of "files", "segment" and "shapes".
+    """
+
+    labels: Int[np.ndarray, "height width"] | None
+    camera: int | None
+    source: str
+
+
+def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
+    """The mask of the first frame: a file's, or made by the weight-free segmenter.
+
+    Args:
+        tracked: what is tracked.
+        camera: id of the mask's camera; None takes the first that has masks.
+        source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter.
+
+    Raises:
+        ValueError: the camera is not tracked, or has no mask.
+    """
+    if camera is not None and camera not in tracked.camera_ids:
+        raise ValueError(
+            f"--mask-camera: camera {camera} is not tracked; the tracked ones are {list(tracked.camera_ids)}."
+        )
+    if source in ("auto", "files") and tracked.has_masks:
+        for c, name in enumerate(tracked.camera_ids):
+            labels = tracked.mask(0, c) if camera in (None, name) else None
+            if labels is not None:
+                return FirstMask(labels, name, "files")
+        if camera is not None and source == "auto":
+            raise ValueError(
+                f"--mask-camera: camera {camera} has no masks. Name another, or --masks segment."
+            )
+    if source == "files":
+        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks segment.")
+    if source == "auto" and not tracked.has_depth and tracked.models:
+        return FirstMask(None, None, "shapes")
+    from gsjax.perception.segmenters import PlaneOrRegionSegmenter
+
+    name = tracked.camera_ids[0] if camera is None else camera
+    c = tracked.camera_ids.index(name)
+    labels = PlaneOrRegionSegmenter()(tracked.image(0, c), tracked.depth(0, c), tracked.Ks[0, c])
+    return FirstMask(labels.astype(np.int32), name, "segment")
+
+
+def label_names(recording: Recording, source: str) -> dict[int, str]:
+    """The name of each mask value that has one. The segmenter's own values have none."""
+    names = dict(FIRST_LABEL_NAMES)
+    if source == "segment":
+        return names
+    names |= {model.label: model.name for model in recording.tracked.models if model.label}
+    truth = recording.tracked.truth
+    if truth is not None:
+        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
+        names |= {} if truth.robot is None else {truth.robot: "robot"}
+    return names
+
+
+def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
+    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian."""
+    if mask.labels is None:
+        return
+    names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())
+    if mask.source == "files":
+        for value in sorted(set(names) - there - {0}):
+            notes.warn(
+                f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
+                "it is not tracked"
+            )
+    for value in sorted(there - set(scene_ids) - {0}):
+        pixels = int((mask.labels == value).sum())
+        notes.warn(
+            f"label {value} has {pixels} pixels in the first mask but none with depth: it is not tracked"
+        )
+
+
+Loaded = TypeVar("Loaded")
+
+
+class Prefetched(Generic[Loaded]):
+    """Iterate over `load(0), load(1), ...`, each loaded by a thread while the one before is in use.
+
+    Attributes:
+        waited: seconds that the iteration had to wait for a load so far.
+    """
+
+    def __init__(self, load: Callable[[int], Loaded], indices: Indices[int], ahead: int = 2):
+        self._load, self._indices, self._ahead = load, indices, ahead
+        self.waited = 0.0
+
+    def __iter__(self):
+        executor = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+        pending: list[Future] = []
+        try:
+            rest = iter(self._indices)
+            for index in rest:
+                pending.append(executor.submit(self._load, index))
+                if len(pending) > self._ahead:
+                    yield self._take(pending)
+            while pending:
+                yield self._take(pending)
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
+
+    def _take(self, pending: list[Future]) -> Loaded:
+        begun = perf_counter()
+        try:
+            return pending.pop(0).result()
+        finally:
+            self.waited += perf_counter() - begun

@@ -1,0 +1,203 @@
+"""Scores of a run, added up view by view so that memory stays flat, and the metrics that come of them."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsjax.cli.loop import Tracking
+from gsjax.cli.recording import FirstMask, Recording, label_names
+from gsjax.cli.views import View
+from gsjax.metrics.image import depth_error, psnr, ssim
+from gsjax.metrics.segmentation import LabelOverlap
+from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
+
+SMALLEST_FOR_SSIM = 11
+
+
+@dataclass
+class CameraScores:
+    """Scores of one camera, one entry a frame; NaN where there was nothing to compare."""
+
+    held_out: bool
+    values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+    def mean(self, name: str) -> float | None:
+        """The mean over frames of those that are finite; None without any."""
+        values = np.asarray(self.values.get(name, []), np.float64)
+        values = values[np.isfinite(values)]
+        return float(values.mean()) if len(values) else None
+
+
+class Scores:
+    """Pictures, depth and labels against what the cameras saw.
+
+    Args:
+        values: the mask value that each group of the scene stands for, [K+1]; None scores no labels.
+        robot: the robot's mask value, or None.
+    """
+
+    def __init__(self, values: np.ndarray | None, robot: int | None):
+        self._values, self._robot = values, robot
+        self.cameras: dict[int, CameraScores] = {}
+        self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
+        self.num_frames = 0
+
+    def add(self, view: View) -> None:
+        """Score one view."""
+        self.num_frames = max(self.num_frames, view.t + 1)
+        camera = self.cameras.setdefault(view.camera, CameraScores(view.held_out))
+        scored = {"psnr": psnr(view.render, view.image), "coverage": float(view.covered.mean())}
+        scored["psnr_covered"] = psnr(view.render, view.image, view.covered)
+        if min(view.image.shape[:2]) >= SMALLEST_FOR_SSIM:
+            scored["ssim"] = ssim(view.render, view.image)
+        if view.depth is not None:
+            error = depth_error(view.render_depth, view.depth)
+            scored |= {"depth_error_mm": error.mean_abs_mm, "depth_within_1cm": error.within_1cm}
+        if view.mask is not None and self._robot is not None:
+            inside = view.mask == self._robot
+            scored["psnr_robot"] = psnr(view.render, view.image, inside)
+            if "ssim" in scored:
+                scored["ssim_robot"] = ssim(view.render, view.image, inside)
+            if view.depth is not None:
+                error = depth_error(view.render_depth, view.depth, inside)
+                scored["depth_error_robot_mm"] = error.mean_abs_mm
+        for name, value in scored.items():
+            camera.values[name].append(value)
+        if view.mask is not None and self._values is not None:
+            self.overlaps[view.held_out].add(self._values[view.groups], view.mask)
+
+
+CAMERA_SCORES = (
+    *("psnr", "ssim", "coverage", "psnr_covered", "depth_error_mm", "depth_within_1cm"),
+    *("psnr_robot", "ssim_robot", "depth_error_robot_mm"),
+)
+
+
+def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> np.ndarray | None:
+    """The mask value in the data's files that each group stands for, [K+1]; None if there are no files.
+
+    Groups of the segmenter stand for the value that most of their pixels have in the file's first mask.
+    """
+    values = np.asarray(tracking.scene.label_ids)
+    if mask.source != "segment":
+        return values
+    c = recording.tracked.camera_ids.index(mask.camera)
+    files = recording.tracked.mask(0, c)
+    if files is None or mask.labels is None:
+        return None
+    matched = [0]
+    for value in values[1:]:
+        found, counts = np.unique(files[mask.labels == value], return_counts=True)
+        matched.append(int(found[np.argmax(counts)]) if len(found) else 0)
+    return np.asarray(matched)
+
+
+def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectScore]:
+    """How each object of the truth was followed, by its mask value; empty without truth, depth or masks."""
+    sequence = recording.tracked
+    truth = sequence.truth
+    if truth is None or not (sequence.has_masks and sequence.has_depth):
+        return {}
+    seen = [(sequence.mask(0, c), sequence.depth(0, c), c) for c in range(sequence.num_cameras)]
+    seen = [(mask, depth, c) for mask, depth, c in seen if mask is not None and depth is not None]
+    if not seen:
+        return {}
+    masks, depths, cameras = zip(*seen, strict=True)
+    means = tracking.means()
+    labels = true_labels(
+        means[0],
+        masks,
+        depths,
+        [sequence.viewmats[0, c] for c in cameras],
+        [sequence.Ks[0, c] for c in cameras],
+    )
+    poses = truth.poses[: tracking.num_frames]
+    return score_tracks(means, labels, {int(k): poses[:, i] for i, k in enumerate(truth.label_ids)})
+
+
+def metrics(
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    scores: Scores,
+    motion: dict[int, ObjectScore],
+    values: np.ndarray | None,
+) -> dict[str, Any]:
+    """The scores of metrics.json; what was not scored is None. docs/tracker.md says what each one means."""
+    names = object_names(tracking, recording, mask, values)
+    objects = {
+        name: {
+            "label": label,
+            "gaussians": _count_gaussians(tracking, values, label),
+            "mask_pixels": _pixels(mask, tracking, values, label),
+            **_motion_metrics(motion.get(label)),
+        }
+        for label, name in names.items()
+    }
+    cameras = {
+        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
+        for camera, found in scores.cameras.items()
+    }
+    return {
+        "objects": objects,
+        "iou": _iou(scores, names, held_out=False),
+        "iou_held_out": _iou(scores, names, held_out=True),
+        "cameras": cameras,
+        "tracked": _mean_of(cameras, tracked=True),
+        "held_out": _mean_of(cameras, tracked=False),
+        "over_frames": {
+            "psnr": {str(camera): found.values["psnr"] for camera, found in scores.cameras.items()},
+            "centroid_error_mm": {
+                names[label]: score.centroid_errors_mm for label, score in motion.items() if label in names
+            },
+        },
+    }
+
+
+def object_names(
+    tracking: Tracking, recording: Recording, mask: FirstMask, values: np.ndarray | None
+) -> dict[int, str]:
+    """The name of each object that is tracked or in the truth, by mask value, background left out."""
+    known = label_names(recording, "files")
+    ids = tracking.scene.label_ids if values is None else values.tolist()
+    labels = sorted({*ids, *(known if values is not None else {})} - {0})
+    return {
+        label: known.get(label, f"object {label}") if values is not None else f"object {label}"
+        for label in labels
+    }
+
+
+def _motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
+    fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
+    scored = {name: getattr(score, name, None) for name in fields}
+    return scored | {"gaussians_scored": 0 if score is None else score.num_scored}
+
+
+def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
+    overlap = scores.overlaps[held_out]
+    return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
+
+
+def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]:
+    """Each score's mean over the cameras of one kind."""
+    chosen = [found for found in cameras.values() if found["tracked"] == tracked]
+    means = {}
+    for name in CAMERA_SCORES:
+        there = [found[name] for found in chosen if found[name] is not None]
+        means[name] = float(np.mean(there)) if there else None
+    return means
+
+
+def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) -> int:
+    ids = np.asarray(tracking.scene.label_ids) if values is None else values
+    return int(np.isin(np.asarray(tracking.scene.labels), np.flatnonzero(ids == label)).sum())
+
+
+def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    if mask.labels is None:
+        return None
+    ids = np.asarray(tracking.scene.label_ids)
+    own = ids[values == label] if values is not None else [label]
+    return int(np.isin(mask.labels, [label] if mask.source == "files" else own).sum())

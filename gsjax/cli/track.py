@@ -1,0 +1,242 @@
+"""`gsjax track`: from a recording to a run folder."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from gsjax.cli.loop import Tracking, follow
+from gsjax.cli.messages import Notes, describe, say_error
+from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
+from gsjax.cli.recording import FirstMask, Recording, first_mask, open_recording, warn_of_missing
+from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
+from gsjax.cli.summary import machine, print_summary, write_run_report
+from gsjax.cli.views import views
+from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax track` is told."""
+
+    dataset: tyro.conf.Positional[str]
+    """Folder of a recording, or a built-in scene such as simulated:tabletop."""
+    out: Path
+    """Folder for the run. It must be new, empty, or hold an unfinished run."""
+    cameras: tuple[int, ...] | None = None
+    """Ids of the cameras to track with. All that are not held out, unless given."""
+    mask_camera: int | None = None
+    """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
+    eval_cameras: tuple[int, ...] = ()
+    """Ids of cameras that are held out: only judged, after tracking."""
+    frames: str = ":"
+    """Which frames, as Python slices: 0:60, 0:60:2, :30."""
+    masks: Literal["auto", "files", "segment"] = "auto"
+    """Where the first mask comes from: the recording's files, or a segmenter that needs no weights. "auto"
+    takes files if there are any, then shapes that the recording brings, then the segmenter."""
+    overwrite: bool = False
+    """Replace a finished run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    """The tracker's own settings."""
+
+
+def run(options: Options) -> int:
+    """Track a recording and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything tracked before that is on disk.
+    """
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
+        folder = RunFolder(options.out, overwrite=options.overwrite)
+        folder.write_config(dataclasses.replace(options, cameras=recording.tracked.camera_ids))
+        mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        seconds = {"preparing": perf_counter() - begun}
+        scene, seconds["start"] = _start(recording, mask, options.tracker, console, notes)
+        tracking = follow(scene, recording.tracked, options.tracker, console)
+        seconds |= _seconds(tracking)
+        write_tracking(folder, tracking, recording.tracked.times)
+        _say_if_stopped(tracking, recording, notes)
+        found, report = _judge(folder, tracking, recording, mask, seconds, notes, console)
+        seconds["total"] = perf_counter() - begun
+        found |= {"seconds": seconds, "notes": notes.all}
+        folder.write_metrics(found)
+        write_run_report(folder, found, **report)
+    print_summary(folder, found)
+    if tracking.stopped is None or isinstance(tracking.stopped, KeyboardInterrupt):
+        return 0 if tracking.stopped is None else 130
+    raise tracking.stopped
+
+
+def _start(
+    recording: Recording, mask: FirstMask, config: TrackerConfig, console: Console, notes: Notes
+) -> tuple[TrackedScene, float]:
+    """The scene at the first frame, and the seconds that it took."""
+    frame = recording.tracked.frame(0)
+    begun = perf_counter()
+    with console.status("fitting the scene to the first frame"):
+        if mask.labels is not None:
+            scene = start_scene(frame, mask.labels, recording.tracked.camera_ids.index(mask.camera), config)
+        else:
+            from gsjax.methods.object_tracker import scene_from_shapes
+
+            scene = scene_from_shapes(recording.tracked.models, frame, config)
+    warn_of_missing(recording, mask, scene.label_ids, notes)
+    seconds = perf_counter() - begun
+    console.print(
+        f"[bold]scene[/]     {scene.gaussians.num:,} Gaussians, {scene.num_moving:,} of them in "
+        f"{scene.num_objects} objects, in {seconds:.1f} s; {_origin(mask)}"
+    )
+    return scene, seconds
+
+
+def _origin(mask: FirstMask) -> str:
+    """Where objects come from, in words."""
+    if mask.source == "shapes":
+        return "objects are the shapes that the recording brings"
+    made = "the file" if mask.source == "files" else "the weight-free segmenter"
+    return f"labels from {made} in camera {mask.camera}"
+
+
+def _judge(
+    folder: RunFolder,
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    seconds: dict[str, float],
+    notes: Notes,
+    console: Console,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Render and score what was tracked. Ctrl-C ends it; what was scored until then counts.
+
+    Returns:
+        What metrics.json holds but for seconds and notes, and what the report shows beside it.
+    """
+    begun = perf_counter()
+    values = group_values(tracking, mask, recording)
+    colors = np.asarray(tracking.scene.label_ids) if values is None else values
+    truth = recording.tracked.truth
+    scores = Scores(values, None if truth is None else truth.robot)
+    try:
+        with Film(folder, recording, tracking.num_frames, colors) as film, console.status("") as status:
+            for frame in views(tracking, recording):
+                status.update(f"rendering and scoring frame {frame[0].t + 1} of {tracking.num_frames}")
+                for view in frame:
+                    scores.add(view)
+                    film.add(view)
+    except KeyboardInterrupt:
+        notes.warn(f"scoring was stopped by Ctrl-C after {scores.num_frames} of {tracking.num_frames} frames")
+    motion = score_motion(tracking, recording)
+    names = object_names(tracking, recording, mask, values)
+    seconds["evaluation"] = perf_counter() - begun
+    found = _what_ran(tracking, recording, mask, scores)
+    found |= metrics(tracking, recording, mask, scores, motion, values)
+    _note_what_is_missing(found, tracking, recording, mask, values, notes)
+    report = {
+        "plots": write_plots(folder, tracking, recording, scores, motion, names, colors),
+        "first_mask": write_first_mask(folder, recording, mask),
+    }
+    return found, report
+
+
+def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores) -> dict[str, Any]:
+    """The part of metrics.json that says what ran, and how fast."""
+    ids, updates = recording.tracked.frame_ids, np.asarray(tracking.update_s[1:]) * 1e3
+    stopped = tracking.stopped
+    return {
+        "dataset": recording.tracked.name,
+        "complete": stopped is None and scores.num_frames == tracking.num_frames,
+        "stopped": None if stopped is None else _reason(stopped),
+        "frames": {
+            "tracked": tracking.num_frames,
+            "asked": recording.tracked.num_frames,
+            "in_data": recording.frames_in_data,
+            "scored": scores.num_frames,
+            "first_id": ids[0],
+            "last_id": ids[tracking.num_frames - 1],
+        },
+        "image": {"width": recording.tracked.width, "height": recording.tracked.height},
+        "tracked_cameras": list(recording.tracked.camera_ids),
+        "held_out_cameras": list(recording.held_out),
+        "mask": {"source": mask.source, "camera": mask.camera},
+        "gaussians": {"all": tracking.scene.gaussians.num, "moving": tracking.scene.num_moving},
+        "update_hz": tracking.hz,
+        "update_ms": {
+            "mean": float(updates.mean()) if len(updates) else None,
+            "median": float(np.median(updates)) if len(updates) else None,
+            "p95": float(np.percentile(updates, 95)) if len(updates) else None,
+        },
+        "plans": tracking.plans,
+        "machine": machine(),
+    }
+
+
+def _seconds(tracking: Tracking) -> dict[str, float]:
+    """Where the time of the loop went."""
+    parts = {
+        "compile": tracking.compile_s,
+        "updates": sum(tracking.update_s),
+        "loading": tracking.loading_s,
+    }
+    return parts | {"loop_rest": tracking.loop_s - sum(parts.values()), "loop_wall": tracking.loop_s}
+
+
+def _reason(stopped: BaseException) -> str:
+    return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
+
+
+def _say_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> None:
+    if tracking.stopped is None:
+        return
+    after = f"after {tracking.num_frames} of {recording.tracked.num_frames} frames"
+    notes.add(f"This run is not complete: it was stopped {after} by {_reason(tracking.stopped)}.")
+    if isinstance(tracking.stopped, KeyboardInterrupt):
+        say_error(f"by Ctrl-C {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
+
+
+def _note_what_is_missing(
+    found: dict[str, Any],
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    values: np.ndarray | None,
+    notes: Notes,
+) -> None:
+    """Say what was not scored, and why."""
+    sequence = recording.judged
+    if mask.source == "segment":
+        notes.add("Objects were found by the weight-free segmenter; they are named by size.")
+    if sequence.truth is None:
+        notes.add("Motion was not scored: the recording has no true poses.")
+    elif not (recording.tracked.has_masks and recording.tracked.has_depth):
+        notes.add("Motion was not scored: which Gaussian belongs to which true object takes masks and depth.")
+    if values is None or not sequence.has_masks:
+        notes.add("Labels were not scored: the recording has no masks.")
+    if not sequence.has_depth:
+        notes.add("Depth was not scored: the recording has none.")
+    for name, scored in found["objects"].items():
+        if scored["gaussians"] == 0:
+            notes.add(f"{name}: not tracked, it is not in the first mask.")
+        elif sequence.truth is not None and scored["gaussians_scored"] == 0:
+            why = (
+                "the truth holds no pose of it"
+                if name not in sequence.truth.names
+                else "no Gaussian is surely its"
+            )
+            notes.add(f"{name}: motion not scored, {why}.")
+    unseen = [np.flatnonzero(~seen) for seen in tracking.visible]
+    counts = np.bincount(np.concatenate([*unseen, []]).astype(int), minlength=tracking.scene.num_objects)
+    names = list(object_names(tracking, recording, mask, None if values is None else values).items())
+    ids = tracking.scene.label_ids if values is None else values.tolist()
+    for group in np.flatnonzero(counts):
+        name = dict(names).get(ids[group + 1], f"object {ids[group + 1]}")
+        notes.add(f"{name}: no camera saw it in {counts[group]} frames; it stood still meanwhile.")
