@@ -59,36 +59,38 @@ def intrinsics(
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
-def world_to_camera(
-    points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]
-) -> Float[Array, "*n 3"]:
+def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) -> Float[Array, "*n 3"]:
     """Points in the frame of one camera."""
-    return points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    return jnp.matmul(points, viewmat[:3, :3].T, precision="highest") + viewmat[:3, 3]
 
 
 def project(
     points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
-    """Pixel positions and depths of world points in one camera. Depths at or behind 1e-6 m project as if there."""
+    """Pixel positions and depths of world points in one camera; those nearer than 1e-6 m as if there."""
     local = world_to_camera(points, viewmat)
     z = local[..., 2]
-    homogeneous = local @ K.T
+    homogeneous = jnp.matmul(local, K.T, precision="highest")
     return homogeneous[..., :2] / jnp.maximum(z, 1e-6)[..., None], z
 
 
 def unproject(
-    pixels: Float[Array, "*n 2"], depths: Float[Array, "*n"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
+    pixels: Float[Array, "*n 2"],
+    depths: Float[Array, "*n"],
+    viewmat: Float[Array, "4 4"],
+    K: Float[Array, "3 3"],
 ) -> Float[Array, "*n 3"]:
     """World points at z-depth `depths` behind `pixels` of one camera; the inverse of `project`."""
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * (pixels[..., 1] - K[1, 2]) / K[1, 1]) / K[0, 0]
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     local = jnp.stack([x, y, jnp.ones_like(x)], axis=-1) * depths[..., None]
-    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    return jnp.matmul(local - viewmat[:3, 3], viewmat[:3, :3], precision="highest")
 
 
 def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 3"]:
     """Positions of cameras in the world: -R^T t."""
-    return -jnp.einsum("...ji,...j->...i", viewmats[..., :3, :3], viewmats[..., :3, 3])
+    rotations, translations = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    return -jnp.einsum("...ji,...j->...i", rotations, translations, precision="highest")
 
 
 def pixel_grid(width: int, height: int) -> Float[Array, "height width 2"]:

@@ -11,7 +11,7 @@ MIN_SQUARED_NORM = 1e-12
 
 
 def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-    """Unit quaternions. A quaternion too short to name a rotation becomes the identity, with zero gradient."""
+    """Unit quaternions. One that is too short to name a rotation becomes the identity, with zero gradient."""
     squared = jnp.sum(quats * quats, axis=-1, keepdims=True)
     usable = squared >= MIN_SQUARED_NORM
     identity = jnp.zeros_like(quats).at[..., 0].set(1.0)

@@ -70,7 +70,7 @@ def evaluate_sh(
     unit = jnp.where(usable, directions, fallback) / jnp.sqrt(jnp.where(usable, squared, 1.0))
     bases = sh_bases(degree, unit)
     used = coefficients[..., : num_sh_bases(degree), :]
-    return jnp.einsum("...k,...kc->...c", bases, used) + 0.5
+    return jnp.einsum("...k,...kc->...c", bases, used, precision="highest") + 0.5
 
 
 def rgb_to_sh0(rgb: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from gsjax.rasterize.plan import TILE, Plan
 from gsjax.rasterize.projection import ALPHA_MIN, Projected
@@ -64,11 +64,14 @@ def _touches(mean, conic, opacity, tile_x, tile_y) -> Bool[Array, "pairs"]:
     edge_x = jnp.clip(0.0, low_x, high_x)
     edge_y = jnp.clip(0.0, low_y, high_y)
 
-    def form(dx, dy):
-        return a * dx * dx + 2 * b * dx * dy + c * dy * dy
+    def form(dx, dy):  # less what its terms, which may cancel, can have lost to rounding
+        squares = a * dx * dx + c * dy * dy
+        return squares + 2 * b * dx * dy - rounding * squares
 
-    on_vertical = form(edge_x, jnp.clip(-b * edge_x / c, low_y, high_y))
-    on_horizontal = form(jnp.clip(-b * edge_y / a, low_x, high_x), edge_y)
+    rounding = 8 * jnp.finfo(a.dtype).eps
+    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
+    on_vertical = form(edge_x, jnp.clip(-b * edge_x / jnp.maximum(c, tiny), low_y, high_y))
+    on_horizontal = form(jnp.clip(-b * edge_y / jnp.maximum(a, tiny), low_x, high_x), edge_y)
     least = jnp.minimum(
         jnp.where(edge_x == 0, jnp.inf, on_vertical), jnp.where(edge_y == 0, jnp.inf, on_horizontal)
     )
@@ -77,9 +80,7 @@ def _touches(mean, conic, opacity, tile_x, tile_y) -> Bool[Array, "pairs"]:
     return least <= 2 * jnp.log(opacity / ALPHA_MIN) * 1.001 + 1e-3
 
 
-def bin_gaussians(
-    projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
-) -> TileLists:
+def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan) -> TileLists:
     """Front-to-back lists of every tile of one camera.
 
     Equal depths keep the order of the input. Tiles outside `tile_mask`, where there is one, get empty lists.
@@ -105,9 +106,8 @@ def bin_gaussians(
     tile_y = low[gaussian, 1] + within // columns
 
     # Keep the pairs that are real, whose ellipse reaches the tile, and whose tile is asked for.
-    mean, conic, opacity = jax.lax.stop_gradient(
-        (projected.means2d, projected.conics, projected.opacities)
-    )
+    drawn_with = (projected.means2d, projected.conics, projected.opacities)
+    mean, conic, opacity = jax.lax.stop_gradient(drawn_with)
     keep = slot < ends[-1]
     keep &= _touches(
         (mean[:, 0][gaussian], mean[:, 1][gaussian]),

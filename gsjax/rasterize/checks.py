@@ -24,9 +24,22 @@ def _expect(name: str, array, want: tuple, meaning: str) -> None:
 
 
 def check_inputs(
-    plan: Plan, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, features, roi, means2d_offset
+    plan: Plan,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    backgrounds,
+    features,
+    roi,
+    means2d_offset,
 ) -> tuple[tuple, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
+
+    Half precision is computed in float32.
 
     Raises:
         ValueError: names the argument, the shape it got and the shape it wants.
@@ -47,35 +60,40 @@ def check_inputs(
     _expect("scales", scales, (*lead, n, 3), lead_words)
     _expect("opacities", opacities, (*lead, n), lead_words)
     if viewmats.ndim != len(lead) + 3:
+        wanted = ", ".join(map(str, (*lead, "C", 4, 4)))
         raise ValueError(
-            f"viewmats must have shape ({', '.join(map(str, (*lead, 'C', 4, 4)))}); got {tuple(viewmats.shape)}. "
-            "One camera is viewmats[None]"
+            f"viewmats must have shape ({wanted}); got {tuple(viewmats.shape)}. One camera is viewmats[None]"
         )
     num_cameras = viewmats.shape[-3]
     _expect("viewmats", viewmats, (*lead, num_cameras, 4, 4), "leading axes as in means")
     _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one matrix for each of viewmats")
+    if 0 in (*lead, num_cameras):
+        raise ValueError(f"viewmats must hold at least one camera of one scene; got {tuple(viewmats.shape)}")
     colors = _check_colors(colors, plan, lead, num_cameras, n)
 
     scenes = math.prod(lead)
-    dtype = jnp.result_type(means, quats, scales, opacities, colors, viewmats, Ks)
+    dtype = jnp.result_type(means, quats, scales, opacities, colors, viewmats, Ks, jnp.float32)
 
     def flat(array, inner):
         return jnp.asarray(array, dtype).reshape(scenes, *inner)
 
     channels = colors.shape[-1]
     if backgrounds is not None:
-        _expect("backgrounds", backgrounds, (*lead, num_cameras, channels), "one row a camera, as wide as colors")
+        wanted = (*lead, num_cameras, channels)
+        _expect("backgrounds", backgrounds, wanted, "one row a camera, as wide as colors")
         backgrounds = flat(backgrounds, (num_cameras, channels))
     if features is not None:
         _expect("features", features, (*lead, n, None), lead_words)
         features = flat(features, features.shape[-2:])
     if means2d_offset is not None:
-        _expect("means2d_offset", means2d_offset, (*lead, num_cameras, n, 2), "a pixel offset a camera and Gaussian")
+        wanted = (*lead, num_cameras, n, 2)
+        _expect("means2d_offset", means2d_offset, wanted, "a pixel offset a camera and Gaussian")
         means2d_offset = flat(means2d_offset, (num_cameras, n, 2))
     tile_mask = None
     if roi is not None:
-        _expect("roi", roi, (*lead, num_cameras, plan.height, plan.width), "a pixel mask a camera")
-        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, num_cameras, plan.height, plan.width))
+        inner = (num_cameras, plan.height, plan.width)
+        _expect("roi", roi, (*lead, *inner), "a pixel mask a camera")
+        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner))
 
     views = (
         flat(means, (n, 3)),
@@ -99,7 +117,9 @@ def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n
     per_camera = colors.ndim == len(lead) + 2 + inner
     bases = () if plan.sh_degree is None else (None,)
     cameras = (num_cameras,) if per_camera else ()
-    meaning = "values [N, D]" if plan.sh_degree is None else "SH coefficients [N, K, D] since sh_degree is given"
+    meaning = "values [N, D]"
+    if plan.sh_degree is not None:
+        meaning = "SH coefficients [N, K, D] since sh_degree is given"
     _expect("colors", colors, (*lead, *cameras, n, *bases, None), meaning)
     if plan.sh_degree is not None and colors.shape[-2] < num_sh_bases(plan.sh_degree):
         raise ValueError(
@@ -114,4 +134,3 @@ def _tiles_with_a_pixel(roi):
     padded = jnp.pad(roi, ((0, 0), (0, 0), (0, -height % TILE), (0, -width % TILE)))
     tiles = padded.reshape(scenes, cameras, padded.shape[2] // TILE, TILE, padded.shape[3] // TILE, TILE)
     return tiles.any(axis=(3, 5)).reshape(scenes, cameras, -1)
-

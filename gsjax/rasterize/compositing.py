@@ -40,7 +40,7 @@ class TileState(NamedTuple):
 
     values: Float[Array, "*tiles channels pixels"]
     transmittance: Float[Array, "*tiles pixels"]  # what light still passes
-    product: Float[Array, "*tiles pixels"]  # the same without the early stop: falls to 1e-4 and ends the pixel
+    product: Float[Array, "*tiles pixels"]  # the same without the early stop, which it decides
     read: Int[Array, "*tiles pixels"]  # list entries before the one that ended the pixel
     position: Int[Array, "*tiles"]  # list entries seen
 
@@ -58,11 +58,11 @@ def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
 
 
 def _alpha(mean, conic, opacity, pixels, alpha_max):
-    """(clamped alpha, unclamped alpha, whether it is drawn) at `pixels`; coordinates stand on the last axis."""
+    """(clamped alpha, unclamped alpha, whether it is drawn) at `pixels`; coordinates on the last axis."""
     dx, dy = pixels[..., 0] - mean[..., 0], pixels[..., 1] - mean[..., 1]
     power = -0.5 * (conic[..., 0] * dx * dx + conic[..., 2] * dy * dy) - conic[..., 1] * dx * dy
     raw = opacity * jnp.exp(power)
-    alpha = jnp.minimum(raw, alpha_max)
+    alpha = jnp.where(raw < alpha_max, raw, alpha_max)  # at the clamp itself the gradient is 0, not 1/2
     return alpha, raw, (power <= 0) & (alpha >= ALPHA_MIN)
 
 
@@ -122,14 +122,14 @@ def composite_tile(
 def _composite_long(splats: Splats, pixels, state: TileState, alpha_max: float) -> TileState:
     length = splats.opacities.shape[0]
     padding = -length % CHUNK
-    chunks = jax.tree.map(
-        lambda a: jnp.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, CHUNK, *a.shape[1:]), splats
-    )
+
+    def chunked(a):
+        return jnp.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, CHUNK, *a.shape[1:])
 
     def body(state, chunk):
         return composite_tile(chunk, pixels, state, alpha_max=alpha_max), None
 
-    return jax.lax.scan(body, state, chunks)[0]
+    return jax.lax.scan(body, state, jax.tree.map(chunked, splats))[0]
 
 
 class Lists(NamedTuple):
@@ -176,7 +176,7 @@ def _chunk(splats: Splats, lists: Lists, centers, starts, counts, first):
 
 
 def _forward(splats: Splats, lists: Lists, plan: Plan):
-    """Composite every tile: values [tiles, channels, pixels], transmittance and entries read [tiles, pixels]."""
+    """Every tile's values [tiles, channels, pixels], transmittance and entries read [tiles, pixels]."""
     dtype, channels = splats.values.dtype, splats.values.shape[1]
     pixels = jnp.asarray(_tile_pixels(dtype))
     order, batches = _batches(lists, plan)
@@ -203,7 +203,8 @@ def _forward(splats: Splats, lists: Lists, plan: Plan):
 
     def unsort(a):
         a = a.reshape(-1, *a.shape[2:])
-        return jnp.zeros((num_tiles, *a.shape[1:]), a.dtype).at[place].set(a, mode="drop", unique_indices=True)
+        empty = jnp.zeros((num_tiles, *a.shape[1:]), a.dtype)
+        return empty.at[place].set(a, mode="drop", unique_indices=True)
 
     return jax.tree.map(unsort, outputs)
 
@@ -222,7 +223,7 @@ def _composite_fwd(splats, lists, plan):
 def _composite_bwd(plan: Plan, residuals, cotangents):
     splats, lists, transmittance, read = residuals
     d_values, d_transmittance = cotangents
-    dtype, channels = splats.values.dtype, splats.values.shape[1]
+    dtype = splats.values.dtype
     pixels = jnp.asarray(_tile_pixels(dtype))
     x, y = pixels[:, 0], pixels[:, 1]
     monomials = jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
@@ -310,7 +311,7 @@ _composite_reverse.defvjp(_composite_fwd, _composite_bwd)
 def composite(
     splats: Splats, lists: Lists, plan: Plan
 ) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"]]:
-    """Composite the lists of all tiles: values, and the transmittance left. Differentiable as the plan says."""
+    """Values of all tiles, and the transmittance left. Differentiable as the plan says."""
     if plan.derivative == "forward":
         values, transmittance, _ = _forward(splats, lists, plan)
         return values, transmittance

@@ -86,14 +86,26 @@ class Plan:
         return self.tiles_x * self.tiles_y
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
-        """The same plan on the lowest rung that holds `needed` pairs, and never below this one."""
+        """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
+
+        Raises:
+            ValueError: `needed` is 2^31 - 1, which stands for more than can be counted.
+        """
+        if needed >= 2**31 - 1:
+            raise ValueError(
+                f"these Gaussians touch more than 2^30 tiles of a {self.width}x{self.height} image; "
+                "prune the ones that fill the frame, or draw fewer at a time"
+            )
         return dataclasses.replace(self, capacity=max(self.capacity, rung(needed * headroom)))
 
 
 def rung(pairs: float) -> int:
     """The smallest capacity of the ladder that holds `pairs`."""
-    steps = max(0, math.ceil(math.log(max(pairs, 1) / _LADDER_START) / math.log(_LADDER_RATIO) - 1e-9))
-    return math.ceil(_LADDER_START * _LADDER_RATIO**steps / 16) * 16
+    capacity, steps = _LADDER_START, 0
+    while capacity < pairs:
+        steps += 1
+        capacity = math.ceil(_LADDER_START * _LADDER_RATIO**steps / 16) * 16
+    return capacity
 
 
 class _Unset:
@@ -105,9 +117,8 @@ class _Unset:
 
 UNSET: Any = _Unset()
 
-OPTION_NAMES = tuple(
-    f.name for f in dataclasses.fields(Plan) if f.name not in ("width", "height", "capacity")
-)
+_SIZES = ("width", "height", "capacity")
+OPTION_NAMES = tuple(f.name for f in dataclasses.fields(Plan) if f.name not in _SIZES)
 
 
 def resolve(plan: Plan | None, width: int, height: int, options: dict[str, Any]) -> Plan:

@@ -25,13 +25,13 @@ class Projected(NamedTuple):
     conics: Float[Array, "n 3"]  # inverse covariance (A, B, C): A dx^2 + 2 B dx dy + C dy^2
     depths: Float[Array, "n"]  # z in the camera's frame, metres
     opacities: Float[Array, "n"]  # after antialiasing
-    extents: Float[Array, "n 2"]  # half-widths in pixels of the box outside which alpha < 1/255; 0 if not visible
+    extents: Float[Array, "n 2"]  # half-widths of the box where alpha can be 1/255, pixels; else 0
     visible: Bool[Array, "n"]
     culled: Int[Array, ""]  # rows refused for their values: not finite, no rotation, no area
 
 
 def _finite_rows(*arrays: Float[Array, "n ..."]) -> Bool[Array, "n"]:
-    flags = [jnp.isfinite(a).reshape(a.shape[0], -1).all(axis=1) for a in arrays]
+    flags = [jnp.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays]
     return jnp.stack(flags).all(axis=0)
 
 
@@ -43,22 +43,22 @@ def _image_covariance(local, quats, scales, viewmat, K, width, height):
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     tx = jnp.clip(x / z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
     ty = jnp.clip(y / z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
-    axes = jnp.einsum("ij,njk->nik", viewmat[:3, :3], quats_to_matrices(quats)) * scales[:, None, :]
+    rotations = quats_to_matrices(quats)
+    axes = jnp.einsum("ij,njk->nik", viewmat[:3, :3], rotations, precision="highest") * scales[:, None, :]
     axes = axes / z[:, None, None]
-    row_v = fy * (axes[:, 1] - ty[:, None] * axes[:, 2])
-    row_u = fx * (axes[:, 0] - tx[:, None] * axes[:, 2]) + skew * (axes[:, 1] - ty[:, None] * axes[:, 2])
+    slope_x, slope_y = axes[:, 0] - tx[:, None] * axes[:, 2], axes[:, 1] - ty[:, None] * axes[:, 2]
+    row_u, row_v = fx * slope_x + skew * slope_y, fy * slope_y
     means2d = jnp.stack([(fx * x + skew * y) / z + cx, fy * y / z + cy], axis=-1)
     return row_u, row_v, means2d
 
 
-def _project(means, quats, scales, opacities, viewmat, K, plan: Plan):
-    """Projection without a thought for bad values; also the determinant, for the caller to judge."""
-    # Three explicit products: a matmul may run in lower precision on accelerators.
-    local = sum(means[:, i : i + 1] * viewmat[:3, i] for i in range(3)) + viewmat[:3, 3]
-    return local, *_project_local(local, quats, scales, opacities, viewmat, K, plan)
+def _to_camera(means, viewmat):
+    """Means in the camera's frame, by explicit products: a matmul may be less precise on accelerators."""
+    return sum(means[:, i : i + 1] * viewmat[:3, i] for i in range(3)) + viewmat[:3, 3]
 
 
-def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
+def _project_local(local, quats, scales, opacities, viewmat, K, offset, plan: Plan):
+    """(means2d, conics, opacities, variances (xx, yy), determinant), without a thought for bad values."""
     row_u, row_v, means2d = _image_covariance(local, quats, scales, viewmat, K, plan.width, plan.height)
     xx, xy, yy = (row_u * row_u).sum(1), (row_u * row_v).sum(1), (row_v * row_v).sum(1)
     normal = _cross(row_u, row_v)
@@ -70,7 +70,7 @@ def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
     if plan.rasterize_mode == "antialiased":
         ratio = jnp.maximum(det / det_blurred, MIN_COMPENSATION**2)
         opacities = opacities * jnp.sqrt(ratio)
-    return means2d, conics, opacities, xx, yy, det_blurred
+    return means2d + offset, conics, opacities, jnp.stack([xx, yy], axis=-1), det_blurred
 
 
 def _cross(a, b):
@@ -92,51 +92,56 @@ def project_gaussians(
 ) -> Projected:
     """Project N Gaussians into one camera.
 
-    A row that is not finite, has |q|^2 < 1e-12, no area on the image or z outside (near, far) is not visible
-    and its gradients are exactly zero: validity is found first, on values alone; then the same arithmetic
-    runs on inputs in which such rows were replaced. `usable` marks rows whose colours can be drawn.
+    A row that is not finite, has |q|^2 < 1e-12, no area on the image or z outside (near, far), or does not
+    reach into the frame, is not visible and its gradients are exactly zero: visibility is found first, on
+    values alone; then the same arithmetic runs on inputs in which such rows were replaced. `usable` marks
+    rows whose colours can be drawn.
     """
     camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & (K[0, 0] * K[1, 1] != 0)
     viewmat = jnp.where(camera_finite, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(camera_finite, K, jnp.eye(3, dtype=K.dtype))
-    opacities = jnp.clip(opacities, 0.0, 1.0)
+    # Unlike jnp.clip this hands the whole gradient on at exactly 0 and 1.
+    opacities = jnp.where(opacities < 0, 0.0, jnp.where(opacities > 1, 1.0, opacities))
+    offset = jnp.zeros_like(means[:, :2]) if means2d_offset is None else means2d_offset
 
+    # First on values alone: which rows can be drawn, and how far they reach.
     inputs = (means, quats, scales, opacities)
-    sound = _finite_rows(*inputs) & usable & ((quats * quats).sum(1) >= MIN_SQUARED_NORM) & camera_finite
-    if means2d_offset is not None:
-        sound &= _finite_rows(means2d_offset)
-    local, means2d, conics, _, xx, yy, det = _project(*jax.lax.stop_gradient((*inputs, viewmat, K)), plan)
+    values = jax.lax.stop_gradient((*inputs, viewmat, K, offset))
+    local = _to_camera(values[0], values[4])
+    means2d, conics, alphas, variances, det = _project_local(local, *values[1:], plan)
+    squared = (values[1] * values[1]).sum(1)
+    sound = _finite_rows(*inputs, offset) & usable & camera_finite
+    sound &= (squared >= MIN_SQUARED_NORM) & jnp.isfinite(squared)
+    # The gradient of 1 / det holds its square. A det of 0, infinity or NaN fails too.
+    has_area = _finite_rows(means2d, conics, variances) & jnp.isfinite(det) & jnp.isfinite(1 / (det * det))
     z = local[:, 2]
     in_range = (z > plan.near_plane) & (z < plan.far_plane)
-    has_area = _finite_rows(means2d, conics, xx, yy) & jnp.isfinite(det) & (det > 0)
-    drawable = sound & in_range & has_area
     culled = jnp.sum(~sound | (in_range & ~has_area))
 
-    keep = drawable[:, None]
+    # The box in which alpha = o exp(-q/2) >= 1/255, that is q <= 2 ln(255 o).
+    reach = jnp.minimum(MAX_SIGMA**2, 2 * jnp.log(jnp.maximum(alphas / ALPHA_MIN, 1e-30)))
+    half = jnp.sqrt(jnp.maximum(reach, 0.0)[:, None] * variances)
+    half = half * 1.0001 + 1e-3  # rounding must not shave a pixel off
+    size = jnp.array([plan.width, plan.height], means2d.dtype)
+    in_frame = ((means2d + half > 0) & (means2d - half < size)).all(axis=1)
+    visible = sound & in_range & has_area & (reach > 0) & in_frame
+
+    # Then in earnest, on inputs whose other rows are harmless: their gradients are zero, and never 0 * inf.
+    keep = visible[:, None]
     means = jnp.where(keep, means, 0.0)
     quats = jnp.where(keep, quats, jnp.array([1.0, 0.0, 0.0, 0.0], quats.dtype))
     scales = jnp.where(keep, scales, 1.0)
-    opacities = jnp.where(drawable, opacities, 0.0)
-    local = sum(means[:, i : i + 1] * viewmat[:3, i] for i in range(3)) + viewmat[:3, 3]
-    local = jnp.where(keep, local, jnp.array([0.0, 0.0, 1.0], local.dtype))
-    means2d, conics, opacities, xx, yy, _ = _project_local(local, quats, scales, opacities, viewmat, K, plan)
-    if means2d_offset is not None:
-        means2d = means2d + jnp.where(keep, means2d_offset, 0.0)
-
-    # The box in which alpha = o exp(-q/2) >= 1/255, that is q <= 2 ln(255 o).
-    reach = jnp.minimum(MAX_SIGMA**2, 2 * jnp.log(jnp.maximum(opacities / ALPHA_MIN, 1e-30)))
-    half = jnp.sqrt(jnp.maximum(reach, 0.0)[:, None] * jnp.stack([xx, yy], axis=-1))
-    half = jax.lax.stop_gradient(half) * 1.0001 + 1e-3  # rounding must not shave a pixel off
-    size = jnp.array([plan.width, plan.height], means2d.dtype)
-    position = jax.lax.stop_gradient(means2d)
-    in_frame = ((position + half > 0) & (position - half < size)).all(axis=1)
-    visible = drawable & (reach > 0) & in_frame
+    opacities = jnp.where(visible, opacities, 0.0)
+    offset = jnp.where(keep, offset, 0.0)
+    local = jnp.where(keep, _to_camera(means, viewmat), jnp.array([0.0, 0.0, 1.0], means.dtype))
+    inputs = (quats, scales, opacities, viewmat, K, offset)
+    means2d, conics, opacities, _, _ = _project_local(local, *inputs, plan)
     return Projected(
         means2d=means2d,
         conics=conics,
         depths=local[:, 2],
         opacities=opacities,
-        extents=jnp.where(visible[:, None], half, 0.0),
+        extents=jnp.where(keep, half, 0.0),
         visible=visible,
         culled=culled.astype(jnp.int32),
     )

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers
-from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
 from gsjax.rasterize.binning import bin_gaussians, count_pairs
 from gsjax.rasterize.checks import check_inputs, is_concrete
 from gsjax.rasterize.compositing import Lists, Splats, composite
@@ -28,7 +29,7 @@ class Meta(NamedTuple):
     depths: Float[Array, "*batch n"]  # z in the camera's frame
     features: Float[Array, "*batch height width channels"] | None
     pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
-    culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area), not for where they are
+    culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area)
     overflow: Bool[Array, "*batch"]  # the plan was too small: nothing was drawn
     needed: Int[Array, "*batch"]  # pairs that the plan's capacity has to hold
 
@@ -54,7 +55,7 @@ def rasterization(
     quats: Float[Array, "*batch n 4"],
     scales: Float[Array, "*batch n 3"],
     opacities: Float[Array, "*batch n"],
-    colors: Float[Array, "*batch n channels"] | Float[Array, "*batch n bases channels"],
+    colors: Float[Array, "*batch_and_cameras n channels"] | Float[Array, "*batch_and_cameras n bases channels"],
     viewmats: Float[Array, "*batch c 4 4"],
     Ks: Float[Array, "*batch c 3 3"],
     width: int,
@@ -78,8 +79,8 @@ def rasterization(
     """Draw 3D Gaussians (Kerbl et al. 2023) into one or many cameras.
 
     Differentiable in everything continuous: means, quats, scales, opacities, colors, features, viewmats, Ks,
-    backgrounds, means2d_offset. What cannot be drawn (NaN, a zero quaternion, no area) is culled, counted in
-    `meta.culled`, and receives gradients of exactly zero.
+    backgrounds, means2d_offset. What cannot be drawn (NaN, a zero quaternion, no area, a colour whose square
+    overflows) is culled, counted in `meta.culled`, and receives gradients of exactly zero.
 
     Args:
         means: centres, metres.
@@ -96,7 +97,8 @@ def rasterization(
         near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
         eps2d: variance added on the image, square pixels (default 0.3).
         sh_degree: degree to which coefficients are read, 0 to 3 (default None: colors are values).
-        backgrounds: value behind everything, one row a camera, of the colours' dimension; black unless given.
+        backgrounds: value behind everything, one row a camera, of the colours' dimension; black unless given,
+            and where it is not finite.
         render_mode: RGB (default), D (sum of w z), ED (D over alpha), RGB+D or RGB+ED: depth comes last.
         rasterize_mode: classic (default) or antialiased.
         features: more values [N, F], composited in the same pass into `meta.features`, without background.
@@ -114,9 +116,8 @@ def rasterization(
             values are traced.
     """
     plan = resolve(plan, width, height, _options(locals()))
-    views, batch = check_inputs(
-        plan, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, features, roi, means2d_offset
-    )
+    gaussians = (means, quats, scales, opacities, colors)
+    views, batch = check_inputs(plan, *gaussians, viewmats, Ks, backgrounds, features, roi, means2d_offset)
     if plan.capacity == 0:
         plan = _planned(views, plan, headroom=1.0)
     return _rasterize(_Views(*views), plan, batch)
@@ -143,7 +144,7 @@ def plan(
     alpha_max: float = UNSET,
     tiles_per_batch: int = UNSET,
 ) -> Plan:
-    """A plan whose capacity holds what these Gaussians need in the neediest of these cameras, times `headroom`.
+    """A plan whose capacity holds what the neediest of these cameras needs, times `headroom`.
 
     Arguments as for `rasterization`. Values must be concrete: call it outside jit.
 
@@ -151,10 +152,10 @@ def plan(
         ValueError: a shape or an option is wrong, or values are traced.
     """
     bare = resolve(None, width, height, _options(locals()))
-    colors = jnp.zeros((*means.shape[:-1], 1), means.dtype)
-    if bare.sh_degree is not None:
-        colors = jnp.zeros((*means.shape[:-1], (bare.sh_degree + 1) ** 2, 1), means.dtype)
-    views, _ = check_inputs(bare, means, quats, scales, opacities, colors, viewmats, Ks, None, None, None, None)
+    bases = () if bare.sh_degree is None else (num_sh_bases(bare.sh_degree),)
+    colors = jnp.zeros((*np.shape(means)[:-1], *bases, 1))
+    gaussians = (means, quats, scales, opacities, colors)
+    views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, None, None)
     return _planned(views, bare, headroom)
 
 
@@ -167,16 +168,10 @@ def _planned(views, bare: Plan, headroom: float) -> Plan:
     if not is_concrete(values):
         raise ValueError(
             "rasterization without a plan looks at values, and these are traced (jit, vmap or scan). Call "
-            "plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, with "
-            "typical values, and pass plan=plan inside; meta.overflow tells if it ever becomes too small"
+            "plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, "
+            "with typical values, and pass plan=plan inside; meta.overflow tells if it becomes too small"
         )
-    needed = int(_needed(_Views(*values), bare))
-    if needed == jnp.iinfo(jnp.int32).max:
-        raise ValueError(
-            f"these Gaussians touch more than 2^30 tiles of a {bare.width}x{bare.height} image; "
-            "prune the ones that fill the frame, or draw fewer at a time"
-        )
-    return bare.grown(needed, headroom)
+    return bare.grown(int(_needed(_Views(*values), bare)), headroom)
 
 
 @partial(jax.jit, static_argnames="plan")
@@ -191,11 +186,14 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
     def one_camera(means, quats, scales, opacities, usable, viewmat, K, offset):
         return project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
 
-    # What a Gaussian is painted with decides too whether it can be drawn.
-    painted = [views.colors.reshape(*views.colors.shape[:3], -1)]
+    # What a Gaussian is painted with decides too whether it can be drawn; so large that its square overflows,
+    # it would drown the gradients of all that share a pixel with it.
+    def paintable(a):
+        return jnp.isfinite(a * a).all(axis=(1, *range(3, a.ndim)))
+
+    usable = paintable(views.colors)
     if views.features is not None:
-        painted.append(views.features[:, None])
-    usable = jnp.stack([jnp.isfinite(a).all(-1).all(1) for a in painted]).all(0)
+        usable &= paintable(views.features[:, None])
 
     offset_axis = None if views.means2d_offset is None else 0
     cameras = jax.vmap(one_camera, in_axes=(None,) * 5 + (0, 0, offset_axis))
@@ -206,22 +204,21 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
 
 def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c n channels"]:
     """The values each camera composites: colours, depth, features, as the plan asks."""
-    drawable = projected.visible[..., None]
+    seen = projected.visible[..., None]
     columns = []
     if "RGB" in plan.render_mode:
         colors = views.colors
         if plan.sh_degree is not None:
-            seen = projected.visible[..., None]
             means = jnp.where(seen, views.means[:, None], 0.0)
             viewmats = jnp.where(jnp.isfinite(views.viewmats), views.viewmats, 0.0)
             directions = jnp.where(seen, means - camera_centers(viewmats)[:, :, None], 0.0)
             colors = jnp.where(seen[..., None], colors, 0.0)
             colors = jnp.maximum(evaluate_sh(plan.sh_degree, colors, directions), 0.0)
-        columns.append(jnp.where(drawable, colors, 0.0))
+        columns.append(jnp.where(seen, colors, 0.0))
     if "D" in plan.render_mode:
         columns.append(projected.depths[..., None])
     if views.features is not None:
-        columns.append(jnp.where(drawable, views.features[:, None], 0.0))
+        columns.append(jnp.where(seen, views.features[:, None], 0.0))
     return jnp.concatenate(columns, axis=-1)
 
 
@@ -250,10 +247,15 @@ def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
 def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, plan: Plan):
     """Bin and composite all views at once, every view's tiles after the last one's."""
     num_views, n, channels = values.shape
+    if num_views * max(n, plan.capacity) >= 2**31:
+        raise ValueError(
+            f"{num_views} views of {n} Gaussians and {plan.capacity} pairs each are more than 32-bit indices "
+            "reach; draw fewer cameras or scenes at a time"
+        )
     if n == 0:
         zeros = jnp.zeros(num_views, jnp.int32)
         tiles = jnp.zeros((num_views * plan.num_tiles, channels, TILE * TILE), values.dtype)
-        return tiles, jnp.ones_like(tiles, shape=(tiles.shape[0], TILE * TILE)), _Counts(zeros, zeros > 0, zeros)
+        return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(zeros, zeros > 0, zeros)
 
     bin_view = partial(bin_gaussians, plan=plan)
     binned = jax.vmap(bin_view, in_axes=(0, None if mask is None else 0))(projected, mask)
@@ -285,7 +287,8 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     num_colors = views.colors.shape[-1] if "RGB" in plan.render_mode else 0
     colors = image[..., :num_colors]
     if views.backgrounds is not None and num_colors:
-        colors = colors + (1 - alphas) * views.backgrounds[:, :, None, None, :]
+        backgrounds = jnp.where(jnp.isfinite(views.backgrounds), views.backgrounds, 0.0)
+        colors = colors + (1 - alphas) * backgrounds[:, :, None, None, :]
     depth = image[..., num_colors : num_colors + depth_channels]
     if "ED" in plan.render_mode:
         depth = depth / jnp.maximum(alphas, 1e-10)
@@ -297,7 +300,7 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     counts = jax.tree.map(lambda a: outer(a.reshape(*shape)), counts)
     meta = Meta(
         means2d=outer(projected.means2d),
-        radii=outer(jnp.ceil(projected.extents).astype(jnp.int32)),
+        radii=outer(jnp.ceil(jnp.minimum(projected.extents, 2.0**30)).astype(jnp.int32)),
         depths=outer(projected.depths),
         features=None if features is None else outer(features),
         pairs=counts.pairs,

@@ -15,6 +15,7 @@ from gsjax.geometry.spherical_harmonics import evaluate_sh
 
 _DOUBT = 1e-5  # relative distance to a threshold at which float32 may decide otherwise
 _TIE = 5e-7  # the same for two depths: a few units in the last place of float32
+_BLOCK = 256  # pixels at once; of speed and memory alone
 _VISIBLE = 1e-3  # behind less transmittance than this a flip changes a pixel by less than 4e-6
 
 
@@ -86,36 +87,41 @@ def rasterization_reference(
         center = -viewmat[:3, :3].T @ viewmat[:3, 3]
         colors = jnp.maximum(evaluate_sh(sh_degree, colors, means - center), 0.0)
     order = jnp.argsort(depths, stable=True)
-    means2d, conics, depths, opacities, colors = (a[order] for a in (means2d, conics, depths, opacities, colors))
+    unsorted = (means2d, conics, depths, opacities, colors)
+    means2d, conics, depths, opacities, colors = (a[order] for a in unsorted)
     in_range = (depths > near_plane) & (depths < far_plane)
     painted = [colors, depths[:, None]] + ([] if features is None else [features[order]])
     painted = jnp.where(in_range[:, None], jnp.concatenate(painted, axis=-1), 0.0)
     gaps = jnp.abs(jnp.diff(depths)) <= _TIE * jnp.abs(depths[1:])
 
-    def one_pixel(pixel):
-        d = pixel - means2d
-        power = -0.5 * jnp.einsum("ni,nij,nj->n", d, conics, d)
-        raw = opacities * jnp.exp(power)
+    def some_pixels(pixels):
+        dx, dy = (pixels[:, None, :] - means2d).transpose(2, 1, 0)  # [N, pixels]
+        a, b, c, d = (conics[:, i, j, None] for i in range(2) for j in range(2))
+        raw = opacities[:, None] * jnp.exp(-0.5 * (a * dx * dx + (b + c) * dx * dy + d * dy * dy))
         alpha = jnp.minimum(raw, alpha_max)
-        drawn = in_range & (alpha >= 1 / 255)
+        drawn = in_range[:, None] & (alpha >= 1 / 255)
         alpha = jnp.where(drawn, alpha, 0.0)
-        after = jnp.cumprod(1 - alpha)
-        before = jnp.concatenate([jnp.ones(1), after[:-1]])
-        live = after > 1e-4
-        weights = jnp.where(live, alpha * before, 0.0)
-        left = jnp.where(live, 1 - alpha, 1.0).prod()
+        # A product from front to back, one Gaussian after the other.
+        _, before = jax.lax.scan(lambda t, a: (t * (1 - a), t), jnp.ones(len(pixels)), alpha)
+        after = before * (1 - alpha)
+        weights = jnp.where(after > 1e-4, alpha * before, 0.0)
 
         def near(value, threshold, where):
-            return jnp.any(where & (jnp.abs(value / threshold - 1) < _DOUBT))
+            return jnp.any(where & (jnp.abs(value / threshold - 1) < _DOUBT), axis=0)
 
-        seen = in_range & (before > _VISIBLE)
+        seen = in_range[:, None] & (before > _VISIBLE)
         doubtful = near(raw, 1 / 255, seen) | near(raw, alpha_max, seen) | near(after, 1e-4, drawn)
-        doubtful |= jnp.any(gaps & drawn[1:] & drawn[:-1] & seen[:-1])
-        return weights @ painted, 1 - left, doubtful
+        doubtful |= jnp.any(gaps[:, None] & drawn[1:] & drawn[:-1] & seen[:-1], axis=0)
+        return weights.T @ painted, weights.sum(axis=0), doubtful
 
     x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
-    rows = jax.lax.map(jax.checkpoint(jax.vmap(one_pixel)), jnp.stack([x, y], axis=-1))
-    values, alphas, doubtful = rows
+    pixels = jnp.stack([x, y], axis=-1).reshape(-1, 2)
+    # A few hundred pixels at a time, whose intermediate values are computed again for the gradient.
+    pixels = jnp.pad(pixels, ((0, -len(pixels) % _BLOCK), (0, 0))).reshape(-1, _BLOCK, 2)
+    blocks = jax.lax.map(jax.checkpoint(some_pixels), pixels)
+    values, alphas, doubtful = (
+        a.reshape(-1, *a.shape[2:])[: width * height].reshape(height, width, *a.shape[2:]) for a in blocks
+    )
     num_colors = colors.shape[-1]
     image, depth = values[..., :num_colors], values[..., num_colors : num_colors + 1]
     if background is not None:

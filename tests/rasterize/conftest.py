@@ -1,0 +1,37 @@
+"""Small scenes, and annotations switched off where the package's own errors must speak."""
+
+import dataclasses
+
+import jaxtyping
+import numpy as np
+import pytest
+
+from benchmarks.scenes import ARRAYS, Case, case, cast, make_scene
+
+
+@pytest.fixture
+def as_users_run():
+    """Annotations unchecked, as in use."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def small():
+    """make(seed, **case fields) -> (case, scene in float32): 40 Gaussians on 33 x 17 pixels unless told."""
+
+    def make(seed: int = 0, dtype=np.float32, **fields) -> tuple[Case, dict]:
+        plain = {"width": 33, "height": 17, "render_mode": "RGB", "rasterize_mode": "classic"}
+        plain |= {"sh_degree": None, "channels": 3, "feature_channels": None}
+        this = dataclasses.replace(case(seed, 40), **plain | fields)
+        return this, {k: v for k, v in cast(make_scene(this), dtype).items() if v is not None}
+
+    return make
+
+
+@pytest.fixture
+def geometry():
+    """The arguments of `gsjax.plan` out of a scene."""
+    names = (*ARRAYS[:4], "viewmats", "Ks")
+    return lambda scene: tuple(scene[name] for name in names)

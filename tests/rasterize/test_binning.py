@@ -1,0 +1,102 @@
+"""Tile lists against brute force: no pair that a pixel could see is missing, and all are in order of depth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsjax.rasterize.binning import _sort_by_tile, _total, bin_gaussians, count_pairs
+from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.projection import project_gaussians
+
+PLAN = Plan(70, 40, capacity=4096)
+N = 30
+
+
+@jax.jit
+def binned(means, quats, scales, opacities):
+    K = jnp.array([[50.0, 0.0, 35.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
+    projected = project_gaussians(means, quats, scales, opacities, jnp.ones(N, bool), jnp.eye(4), K, PLAN)
+    return projected, bin_gaussians(projected, None, PLAN), count_pairs(projected, PLAN)
+
+
+def seen_pairs(projected) -> set[tuple[int, int]]:
+    """(tile, Gaussian) with a pixel at which alpha reaches 1/255 by more than rounding."""
+    means, conics, opacities = (np.float64(a) for a in projected[:2] + (projected.opacities,))
+    x, y = np.meshgrid(np.arange(PLAN.width) + 0.5, np.arange(PLAN.height) + 0.5)
+    tile = (y // TILE * PLAN.tiles_x + x // TILE).astype(int)
+    pairs = set()
+    for i in np.flatnonzero(np.asarray(projected.visible)):
+        dx, dy = x - means[i, 0], y - means[i, 1]
+        a, b, c = conics[i]
+        alpha = opacities[i] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+        pairs |= {(int(t), int(i)) for t in np.unique(tile[alpha >= 1.0001 / 255])}
+    return pairs
+
+
+@given(seed=st.integers(0, 10_000), size=st.sampled_from([0.001, 0.03, 0.3, 3.0]), needle=st.booleans())
+def test_lists_hold_every_pair_that_a_pixel_sees_front_to_back(seed, size, needle):
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-3, -2, 0.5], [3, 2, 4], (N, 3))
+    scales = size * rng.uniform(0.3, 1.5, (N, 3)) * ([1, 1e-3, 1e-3] if needle else [1, 1, 1])
+    arrays = (means, rng.normal(size=(N, 4)), scales, rng.uniform(0, 1, N))
+    projected, lists, needed = binned(*(jnp.asarray(a, jnp.float32) for a in arrays))
+    ids, starts, counts = map(np.asarray, lists[:3])
+    depths = np.asarray(projected.depths)
+    listed = set()
+    for tile in range(PLAN.num_tiles):
+        here = ids[starts[tile] : starts[tile] + counts[tile]]
+        assert len(set(here)) == len(here)
+        assert (np.diff(depths[here]) >= 0).all()
+        listed |= {(tile, int(i)) for i in here}
+    missing = seen_pairs(projected) - listed
+    assert not missing
+    assert len(listed) == int(lists.pairs) <= int(lists.needed) == int(needed)
+
+
+def test_equal_depths_keep_the_order_of_the_input():
+    means = jnp.zeros((N, 3)).at[:, 2].set(2.0)
+    ones = jnp.ones((N, 3))
+    _, lists, _ = binned(means, jnp.ones((N, 4)), 0.1 * ones, 0.5 * ones[:, 0])
+    first = int(np.flatnonzero(lists.counts)[0])
+    np.testing.assert_array_equal(lists.ids[lists.starts[first] :][:N], np.arange(N))
+
+
+def test_only_tiles_of_the_mask_get_lists():
+    rng = np.random.default_rng(0)
+    means = jnp.asarray(rng.uniform([-1, -1, 1], [1, 1, 3], (N, 3)), jnp.float32)
+    ones = jnp.ones((N, 3))
+    projected, lists, _ = binned(means, jnp.ones((N, 4)), 0.1 * ones, 0.5 * ones[:, 0])
+    mask = jnp.arange(PLAN.num_tiles) % 2 == 0
+    masked = jax.jit(bin_gaussians, static_argnames="plan")(projected, mask, PLAN)
+    np.testing.assert_array_equal(masked.counts, jnp.where(mask, lists.counts, 0))
+
+
+def test_keys_wider_than_32_bits_sort_in_two_columns():
+    # 1e6 Gaussians x 32,400 tiles need 35 bits, and without x64 there is no wider integer to hide in.
+    assert not jax.config.jax_enable_x64
+    rng = np.random.default_rng(0)
+    n, num_tiles = 1_000_000, 32_400
+    tile, rank = rng.integers(0, num_tiles + 1, 5000), rng.integers(0, n, 5000)
+    by_depth = rng.permutation(n)
+    columns = (jnp.asarray(a, jnp.int32) for a in (tile, rank, by_depth))
+    sorted_tile, sorted_ids = _sort_by_tile(*columns, num_tiles, n)
+    order = np.lexsort((rank, tile))
+    np.testing.assert_array_equal(sorted_tile, tile[order])
+    np.testing.assert_array_equal(sorted_ids, by_depth[rank[order]])
+
+
+def test_keys_that_just_fit_32_bits_sort_in_one():
+    n, num_tiles = 2**20, 2**12 - 1  # 20 + 12 bits, the tile of unused slots included
+    tile = jnp.array([num_tiles, num_tiles - 1, 0, num_tiles - 1], jnp.int32)
+    rank = jnp.array([n - 1, n - 1, 5, 3], jnp.int32)
+    sorted_tile, ids = _sort_by_tile(tile, rank, jnp.arange(n, dtype=jnp.int32), num_tiles, n)
+    np.testing.assert_array_equal(sorted_tile, [0, num_tiles - 1, num_tiles - 1, num_tiles])
+    np.testing.assert_array_equal(ids, [5, 3, n - 1, n - 1])
+
+
+def test_a_count_beyond_int32_saturates_instead_of_wrapping():
+    counts = jnp.full(100_000, 32_400, jnp.int32)  # 3.2e9 pairs
+    assert int(_total(counts)) == np.iinfo(np.int32).max
+    assert int(_total(counts[:10])) == 324_000
