@@ -14,7 +14,7 @@ COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
 }
-"""Each command's module, which has `Options`, a dataclass, and `run(options)`, which returns the exit code."""
+"""Each command's module, which has a dataclass `Options` and `run(options)`, which returns the exit code."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -64,9 +64,7 @@ class Tracking:
         return np.stack([pose.quats for pose in self.poses])
 
 
-def follow(
-    scene: TrackedScene, tracked: Sequence, config: TrackerConfig, console: Console, total: int | None = None
-) -> Tracking:
+def follow(scene: TrackedScene, tracked: Sequence, config: TrackerConfig, console: Console) -> Tracking:
     """Track all frames after the first. Ctrl-C or an error ends the loop; what was tracked until then stays.
 
     Args:

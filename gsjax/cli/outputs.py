@@ -103,7 +103,11 @@ def write_plots(
             errors = {name: motion[label].centroid_errors_mm for name, label in known.items()}
             figure = plots.error_over_frames(errors, known, limit_mm=5.0)
             keep("centroid_error", figure, "How far each object's centroid is from the truth")
-        keep("update_time", plots.update_time(np.array(tracking.update_s[1:])), "Seconds of each update")
+        keep(
+            "update_time",
+            plots.update_time(np.array([np.nan, *tracking.update_s[1:]])),
+            "Seconds of each update",
+        )
     if scores.num_frames > 1:
         lines = {
             kind: {

@@ -9,12 +9,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Int
+from rich.console import Console
+from rich.progress import track
 
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence, open_sequence
 from gsjax.data.open import SIMULATED_PREFIX
-
-FIRST_LABEL_NAMES = {0: "background"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,13 @@ class Recording:
         tracked: as its tracked cameras saw them; the others are not even opened while tracking.
         judged: the same frames with the cameras that are only judged behind the tracked ones.
         frames_in_data: how many frames there were to choose from.
+        simulated: pictures are drawn when asked for, which takes longer than reading them, and are then kept.
     """
 
     tracked: Sequence
     judged: Sequence
     frames_in_data: int
+    simulated: bool = False
 
     @property
     def held_out(self) -> tuple[int, ...]:
@@ -63,12 +65,14 @@ def open_recording(
         raise ValueError(f"--cameras: no camera is left to track; {sequence.name} has {known}.")
     total = sequence.num_frames
     sequence = sequence.select(frames=parse_frames(frames))
-    if dataset.startswith(SIMULATED_PREFIX):
+    simulated = dataset.startswith(SIMULATED_PREFIX)
+    if simulated:
         sequence = _remember(sequence)
     return Recording(
         tracked=sequence.select(cameras=chosen),
         judged=sequence.select(cameras=[*chosen, *eval_cameras]),
         frames_in_data=total,
+        simulated=simulated,
     )
 
 
@@ -85,7 +89,8 @@ def parse_frames(text: str) -> slice:
     if not 1 <= len(parts) <= 3 or (len(parts) == 1 and parts[0] is None):
         raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, found {text!r}.")
     if len(parts) == 1:
-        return slice(parts[0], None if parts[0] == -1 else parts[0] + 1)
+        first = parts[0] or 0
+        return slice(first, None if first == -1 else first + 1)
     if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
         raise ValueError(f"--frames: frames are tracked forwards; found the step {parts[2]}.")
     return slice(*parts)
@@ -95,6 +100,8 @@ def _remember(sequence: Sequence) -> Sequence:
     """The same sequence with what was loaded kept in memory: a simulated picture is slow to draw twice."""
 
     def kept(loader: Callable | None) -> Callable | None:
+        if loader is None:
+            return None
         seen: dict[tuple[int, int], Any] = {}
 
         def load(t: int, c: int) -> Any:
@@ -102,9 +109,25 @@ def _remember(sequence: Sequence) -> Sequence:
                 seen[t, c] = loader(t, c)
             return seen[t, c]
 
-        return loader and load
+        return load
 
     return replace(sequence, load_image=kept(sequence.load_image), load_depth=kept(sequence.load_depth))
+
+
+def draw_ahead(recording: Recording, console: Console) -> None:
+    """Draw the tracked pictures of a simulated recording, so that updates need not share the processor."""
+    if not recording.simulated:
+        return
+    sequence = recording.tracked
+    views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
+    with ThreadPoolExecutor(2) as executor:
+        jobs = [executor.submit(sequence.image, *view) for view in views]
+        try:
+            for job in track(jobs, "drawing the simulated scene", console=console, transient=True):
+                job.result()
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
 
 
 class FirstMask(NamedTuple):
@@ -159,7 +182,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
     """The name of each mask value that has one. The segmenter's own values have none."""
-    names = dict(FIRST_LABEL_NAMES)
+    names = {0: "background"}
     if source == "segment":
         return names
     names |= {model.label: model.name for model in recording.tracked.models if model.label}

@@ -32,6 +32,7 @@ class Table:
         columns: heads; the first column names the row.
         rows: cells of each row: text, numbers, or None where there is nothing to say.
         units: one a column, "" for none; shown small below the heads.
+        decimals: one a column: digits behind the point of its fractions, None for three digits in all.
         note: a line below the table.
     """
 
@@ -40,11 +41,14 @@ class Table:
     rows: Sequence[Sequence[Any]]
     units: Sequence[str] = ()
     note: str = ""
+    decimals: Sequence[int | None] = ()
 
     def __post_init__(self):
         width = len(self.columns)
         if self.units and len(self.units) != width:
             raise ValueError(f"Table {self.title!r}: {len(self.units)} units for {width} columns")
+        if self.decimals and len(self.decimals) != width:
+            raise ValueError(f"Table {self.title!r}: {len(self.decimals)} decimals for {width} columns")
         for i, row in enumerate(self.rows):
             if len(row) != width:
                 raise ValueError(f"Table {self.title!r}: {len(row)} cells in row {i} for {width} columns")
@@ -78,7 +82,8 @@ def write_report(
         summary: headline figures, name to value or (value, unit); each becomes a card.
         subtitle: a line below the heading: what ran on what.
         tables, images, videos, plots: what to show; media are embedded, a plain path has no caption.
-        notes: what was not scored and why. A medium whose file is missing is left out and added here.
+        notes: what was not scored and why, warnings, the machine.
+            A medium whose file is missing is left out and added here.
 
     Raises:
         ValueError: a medium's suffix is none that browsers show.
@@ -107,8 +112,11 @@ def write_report(
         temporary.write_text(page, encoding="utf-8")
 
 
-def format_number(value: Any) -> str:
-    """A cell's text: three digits for fractions, thin spaces between thousands, a dash for nothing."""
+def format_number(value: Any, decimals: int | None = None) -> str:
+    """A cell's text: three digits for fractions, thin spaces between thousands, a dash for nothing.
+
+    With `decimals`, fractions have that many digits behind the point, so that a column lines up.
+    """
     if value is None:
         return "–"
     if isinstance(value, (str, bool)):
@@ -118,6 +126,9 @@ def format_number(value: Any) -> str:
     value = float(value)
     if not math.isfinite(value):
         return "–"
+    if decimals is not None:
+        value = round(value, decimals) + 0.0  # no minus before a zero
+        return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.2e}".replace("-", "−")
     decimals = 0 if value == 0 else max(0, 2 - math.floor(math.log10(abs(value))))
@@ -152,7 +163,9 @@ def _table(table: Table) -> str:
         _text(name) + (f"<small>{_text(unit)}</small>" if unit else "")
         for name, unit in zip(table.columns, units, strict=True)
     ]
-    body = "".join(f"<tr>{cells([_text(format_number(v)) for v in row], 'td')}</tr>" for row in table.rows)
+    decimals = table.decimals or [None] * len(table.columns)
+    texts = [[_text(format_number(v, d)) for v, d in zip(row, decimals, strict=True)] for row in table.rows]
+    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in texts)
     note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
     return (
         f'<section><h2>{_text(table.title)}</h2><div class="scroll"><table>'
@@ -201,4 +214,4 @@ def _notes(notes: Sequence[str]) -> str:
     if not notes:
         return ""
     items = "".join(f"<li>{_text(note)}</li>" for note in notes)
-    return f'<section class="notes"><h2>What was not scored, and why</h2><ul>{items}</ul></section>'
+    return f'<section class="notes"><h2>Notes</h2><ul>{items}</ul></section>'

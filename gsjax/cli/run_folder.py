@@ -23,7 +23,7 @@ class RunFolder:
           config.yml              the settings, written first
           metrics.json            every score; what could not be computed is null
           trajectory.npz          means [T,N,3], labels [N], label_ids [K+1], times [T], update_s [T]
-          scene.ply               the Gaussians of the last frame
+          scene.ply               the Gaussians of the first frame, with their labels
           renders/CAM/FRAME.png   rendered images
           video_CAM.mp4           input, render, error and labels side by side
           plots/NAME.svg|png      update time, error over frames, ...

@@ -3,7 +3,7 @@
 import os
 import platform
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from rich.console import Console
@@ -12,42 +12,58 @@ from rich.table import Table as Grid
 from gsjax.cli.report import Media, Table, format_number, write_report
 from gsjax.cli.run_folder import RunFolder
 
+
+class Column(NamedTuple):
+    """A column of a table: its head, the metric in it, the unit, and digits behind the point."""
+
+    head: str
+    key: str
+    unit: str = ""
+    decimals: int | None = None
+
+
 OBJECT_COLUMNS = (
-    ("centroid error", "centroid_error_mm", "mm"),
-    ("point error", "point_error_mm", "mm"),
-    ("median", "median_point_error_mm", "mm"),
-    ("moved", "moved_mm", "mm"),
-    ("turned", "turned_deg", "°"),
+    Column("object", "name"),
+    Column("centroid error", "centroid_error_mm", "mm", 2),
+    Column("point error", "point_error_mm", "mm", 2),
+    Column("median", "median_point_error_mm", "mm", 2),
+    Column("moved", "moved_mm", "mm", 1),
+    Column("turned", "turned_deg", "°", 1),
+    Column("IoU", "iou", "", 3),
+    Column("IoU held out", "iou_held_out", "", 3),
+    Column("mask", "mask_pixels", "pixels"),
+    Column("Gaussians", "gaussians"),
 )
 CAMERA_COLUMNS = (
-    ("PSNR", "psnr", "dB"),
-    ("SSIM", "ssim", ""),
-    ("depth error", "depth_error_mm", "mm"),
-    ("drawn", "coverage", ""),
-    ("PSNR of it", "psnr_covered", "dB"),
-    ("PSNR robot", "psnr_robot", "dB"),
+    Column("camera", "name"),
+    Column("", "kind"),
+    Column("PSNR", "psnr", "dB", 2),
+    Column("SSIM", "ssim", "", 3),
+    Column("depth error", "depth_error_mm", "mm", 1),
+    Column("drawn", "coverage", "%", 1),
+    Column("PSNR drawn", "psnr_covered", "dB", 2),
+    Column("PSNR robot", "psnr_robot", "dB", 2),
 )
 TIMES = (
-    ("preparing", "opening the recording, the first mask"),
-    ("start", "first frame to a fitted scene"),
-    ("compile", "compiling the update, once a plan"),
-    ("updates", "updates: what a robot would wait for"),
-    ("loading", "waiting for images"),
-    ("loop_rest", "the rest of the loop"),
-    ("loop_wall", "the loop, all together"),
-    ("evaluation", "rendering, scoring and videos, after tracking"),
+    ("preparing", "opening the recording, the first mask; drawing it if simulated"),
+    ("start", "from the first frame to a fitted scene, compiling included"),
+    ("compile", "loop: compiling the update, once a plan"),
+    ("updates", "loop: updates, from images in memory to the new state"),
+    ("loading", "loop: waiting for images"),
+    ("loop_rest", "loop: the rest"),
+    ("loop_wall", "loop, all together"),
+    ("evaluation", "afterwards: rendering, scoring and videos"),
     ("total", "all of it"),
 )
+_MOVED_MM = 30.0  # an object that moved less says little about a tracker
 
 
 def machine() -> dict[str, Any]:
     """What ran it: processor, cores, and JAX's device. No name that someone gave it."""
     cpu, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
     if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        cpu = names[0] if names else cpu
+        lines = info.read_text().splitlines()
+        cpu = next((line.split(":", 1)[1].strip() for line in lines if "model name" in line), cpu)
     devices = jax.devices()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -60,63 +76,61 @@ def machine() -> dict[str, Any]:
     }
 
 
-def object_rows(found: dict[str, Any]) -> list[list[Any]]:
-    """One row an object: name, pixels, Gaussians, the columns above, IoU tracked and held out."""
+def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row an object, by the keys of `OBJECT_COLUMNS`."""
     return [
-        [
-            name,
-            *(scored[key] for _, key, _ in OBJECT_COLUMNS),
-            found["iou"].get(name),
-            found["iou_held_out"].get(name),
-            scored["mask_pixels"],
-            scored["gaussians"],
-        ]
+        {
+            **scored,
+            "name": name,
+            "iou": found["iou"].get(name),
+            "iou_held_out": found["iou_held_out"].get(name),
+        }
         for name, scored in found["objects"].items()
     ]
 
 
-def camera_rows(found: dict[str, Any]) -> list[list[Any]]:
-    """One row a camera."""
+def camera_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row a camera, by the keys of `CAMERA_COLUMNS`."""
     return [
-        [
-            camera,
-            "tracked" if scored["tracked"] else "held out",
-            *(scored[key] for _, key, _ in CAMERA_COLUMNS),
-        ]
+        {
+            **scored,
+            "name": camera,
+            "kind": "tracked" if scored["tracked"] else "held out",
+            "coverage": None if scored["coverage"] is None else 100 * scored["coverage"],
+        }
         for camera, scored in found["cameras"].items()
     ]
 
 
-_OBJECT_HEADS = ("object", *(n for n, _, _ in OBJECT_COLUMNS), "IoU", "IoU held out", "mask", "Gaussians")
-_OBJECT_UNITS = ("", *(u for _, _, u in OBJECT_COLUMNS), "", "", "pixels", "")
-_CAMERA_HEADS = ("camera", "", *(n for n, _, _ in CAMERA_COLUMNS))
-_CAMERA_UNITS = ("", "", *(u for _, _, u in CAMERA_COLUMNS))
+def _shown(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> list[Column]:
+    """The columns in which something stands."""
+    return [column for column in columns if any(row[column.key] is not None for row in rows)]
 
 
 def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     """Print objects, cameras, the rate and where the report is, to stdout."""
     console = Console(highlight=False)
     console.print()
-    console.print(_grid(_OBJECT_HEADS, _OBJECT_UNITS, object_rows(found)))
-    console.print(_grid(_CAMERA_HEADS, _CAMERA_UNITS, camera_rows(found)))
+    console.print(_grid(tuple(c for c in OBJECT_COLUMNS if c.key != "gaussians"), object_rows(found)))
+    console.print(_grid(CAMERA_COLUMNS, camera_rows(found)))
     frames, rate = found["frames"], found["update_hz"]
-    speed = (
-        "no updates" if rate is None else f"{rate:.2f} Hz ({found['update_ms']['median']:.0f} ms an update)"
-    )
-    console.print(f"[bold]{frames['tracked']}[/] of {frames['asked']} frames at [bold]{speed}[/]")
+    speed = f"{rate:.2f} Hz ({found['update_ms']['median']:.0f} ms an update)" if rate else "no updates"
+    part = "" if found["complete"] else " [bold yellow](partial run)[/]"
+    console.print(f"[bold]{frames['tracked']}[/] of {frames['asked']} frames, [bold]{speed}[/]{part}")
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
 
 
-def _grid(heads: tuple[str, ...], units: tuple[str, ...], rows: list[list[Any]]) -> Grid:
-    """A table without the columns in which nothing stands."""
-    shown = [i for i in range(len(heads)) if any(row[i] is not None for row in rows)]
+def _grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
     grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for i in shown:
-        text = any(isinstance(row[i], str) for row in rows)
-        unit = f"[dim]{units[i]}[/]" if units[i] else ""
-        grid.add_column(f"{heads[i]}\n{unit}" if unit else heads[i], justify="left" if text else "right")
+    shown = _shown(columns, rows)
+    for column in shown:
+        text = any(isinstance(row[column.key], str) for row in rows)
+        *first, last = column.head.split(" ", 1)
+        head = "\n".join([*first, last] if first else ["", last])
+        unit = f"\n[dim]{column.unit}[/]" if any(c.unit for c in shown) else ""
+        grid.add_column(head + unit, justify="left" if text else "right", no_wrap=True)
     for row in rows:
-        grid.add_row(*(format_number(row[i]) for i in shown))
+        grid.add_row(*(format_number(row[c.key], c.decimals) for c in shown))
     grid.add_row()
     return grid
 
@@ -125,88 +139,88 @@ def write_run_report(
     folder: RunFolder, found: dict[str, Any], plots: list[tuple[Path, str]], first_mask: Path | None
 ) -> None:
     """Writes report.html."""
-    frames, cameras = found["frames"], found["cameras"]
-    size = f"{found['image']['width']}×{found['image']['height']}"
-    subtitle = (
-        f"Object-aware tracker on frames {frames['first_id']} to {frames['last_id']} ({frames['tracked']} of "
-        f"{frames['asked']} asked for), {size}, cameras {_listed(found['tracked_cameras'])}"
-    )
-    if found["held_out_cameras"]:
-        subtitle += f"; held out: {_listed(found['held_out_cameras'])}"
-    partial = "" if found["complete"] else " (partial run)"
-    machine = found["machine"]
-    ran = (
-        f"Machine: {machine['processor']}, {machine['cores']} cores; JAX {machine['jax']} on "
-        f"{machine['devices']} × {machine['device']}."
-    )
+    caption = f"Where objects come from: the first mask of camera {found['mask']['camera']}"
     write_report(
         folder.report,
-        title=found["dataset"] + partial,
-        subtitle=subtitle,
+        title=found["dataset"] + ("" if found["complete"] else " (partial run)"),
+        subtitle=_subtitle(found),
         summary=_headline(found),
         videos=[
             Media(folder.video(camera), f"Camera {camera}, {'tracked' if scored['tracked'] else 'held out'}")
-            for camera, scored in cameras.items()
+            for camera, scored in found["cameras"].items()
         ],
-        plots=[Media(path, caption) for path, caption in plots],
-        images=[
-            Media(first_mask, f"The only mask that was seen: camera {found['mask']['camera']}, first frame")
-        ]
-        if first_mask
-        else [],
+        plots=[Media(path, text) for path, text in plots],
+        images=[Media(first_mask, caption)] if first_mask else [],
         tables=[
-            _table("Objects", _OBJECT_HEADS, _OBJECT_UNITS, object_rows(found), _OBJECT_NOTE),
-            _table("Cameras", _CAMERA_HEADS, _CAMERA_UNITS, camera_rows(found), _CAMERA_NOTE),
-            Table(
-                "Time",
-                ("part", "", "seconds"),
-                [[name, says, found["seconds"].get(name)] for name, says in TIMES],
-                note="Updates count from images in memory to the new state; the loop is compiling, updates, "
-                "waiting and the rest.",
-            ),
+            _table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
+            _table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
+            _time_table(found["seconds"]),
         ],
-        notes=[*found["notes"], ran],
+        notes=[*found["notes"], _machine_note(found["machine"])],
     )
 
 
 _OBJECT_NOTE = (
-    "Errors are means over frames and Gaussians against the true motion; IoU pools pixels over frames and "
-    "cameras. Pixels are those of the first mask."
+    "Errors are means over frames and Gaussians, against where the true motion would have carried each. IoU "
+    "pools pixels over frames and cameras. Pixels are those of the first mask."
 )
-_CAMERA_NOTE = "PSNR and SSIM are over whole pictures; 'drawn' is the share of pixels that the scene covers."
+_CAMERA_NOTE = (
+    "PSNR and SSIM are over whole pictures, black where the scene has nothing; 'drawn' is the part that it "
+    "covers, and 'PSNR drawn' is over that part."
+)
+
+
+def _subtitle(found: dict[str, Any]) -> str:
+    frames, image = found["frames"], found["image"]
+    text = (
+        f"Object-aware tracker; frames {frames['first_id']} to {frames['last_id']} ({frames['tracked']} of "
+        f"{frames['asked']} asked for), {image['width']}×{image['height']}; "
+        f"tracked with camera {_listed(found['tracked_cameras'])}"
+    )
+    held_out = found["held_out_cameras"]
+    return text + (f", judged by camera {_listed(held_out)} as well" if held_out else "")
 
 
 def _headline(found: dict[str, Any]) -> dict[str, Any]:
-    moved = [
-        s for s in found["objects"].values() if s["centroid_error_mm"] is not None and s["moved_mm"] > 30
-    ]
-    cards: dict[str, Any] = {"Update rate": (found["update_hz"], "Hz")}
+    scored = [s for s in found["objects"].values() if s["centroid_error_mm"] is not None]
+    moved = [s["centroid_error_mm"] for s in scored if s["moved_mm"] > _MOVED_MM]
+    cards: dict[str, Any] = {}
+    if found["update_hz"]:
+        cards["Update rate"] = (format_number(found["update_hz"], 2), "Hz")
     if moved:
-        worst = max(scored["centroid_error_mm"] for scored in moved)
-        cards["Worst centroid error of what moved"] = (worst, "mm")
+        cards["Largest centroid error"] = (format_number(max(moved), 1), "mm")
     if found["iou"]:
-        cards["Least label IoU"] = min(v for v in found["iou"].values())
-    cards["PSNR, tracked cameras"] = (found["tracked"]["psnr"], "dB")
+        cards["Lowest label IoU"] = format_number(min(found["iou"].values()), 3)
+    cards["PSNR, tracked"] = (format_number(found["tracked"]["psnr"], 1), "dB")
     if found["held_out"]["psnr"] is not None:
-        cards["PSNR, held out"] = (found["held_out"]["psnr"], "dB")
+        cards["PSNR, held out"] = (format_number(found["held_out"]["psnr"], 1), "dB")
     return cards | {"Gaussians": found["gaussians"]["all"], "Frames": found["frames"]["tracked"]}
 
 
-def _table(title: str, heads: tuple[str, ...], units: tuple[str, ...], rows: list, note: str) -> Table:
-    """A table without the columns in which nothing stands."""
-    shown = [i for i in range(len(heads)) if any(row[i] is not None for row in rows)] or [0]
+def _table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> Table:
+    shown = _shown(columns, rows)
     return Table(
         title,
-        [heads[i] for i in shown],
-        [[row[i] for i in shown] for row in rows],
-        [units[i] for i in shown],
+        [c.head for c in shown],
+        [[row[c.key] for c in shown] for row in rows],
+        [c.unit for c in shown],
         note,
+        [c.decimals for c in shown],
+    )
+
+
+def _time_table(seconds: dict[str, float]) -> Table:
+    rows = [[says, seconds.get(name)] for name, says in TIMES]
+    return Table("Time", ("what", "time"), rows, ("", "s"), decimals=(None, 2))
+
+
+def _machine_note(machine: dict[str, Any]) -> str:
+    return (
+        f"Machine: {machine['processor']}, {machine['cores']} cores; JAX {machine['jax']} on "
+        f"{machine['devices']} × {machine['device']}; Python {machine['python']}."
     )
 
 
 def _listed(numbers: list[int]) -> str:
-    return (
-        " and ".join([", ".join(map(str, numbers[:-1])), str(numbers[-1])])
-        if len(numbers) > 1
-        else str(*numbers)
-    )
+    *front, last = map(str, numbers)
+    return f"{', '.join(front)} and {last}" if front else last

@@ -13,7 +13,14 @@ from rich.console import Console
 from gsjax.cli.loop import Tracking, follow
 from gsjax.cli.messages import Notes, describe, say_error
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
-from gsjax.cli.recording import FirstMask, Recording, first_mask, open_recording, warn_of_missing
+from gsjax.cli.recording import (
+    FirstMask,
+    Recording,
+    draw_ahead,
+    first_mask,
+    open_recording,
+    warn_of_missing,
+)
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
 from gsjax.cli.summary import machine, print_summary, write_run_report
@@ -60,6 +67,7 @@ def run(options: Options) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite)
         folder.write_config(dataclasses.replace(options, cameras=recording.tracked.camera_ids))
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         scene, seconds["start"] = _start(recording, mask, options.tracker, console, notes)
         tracking = follow(scene, recording.tracked, options.tracker, console)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from gsjax.viz.colors import label_color
 
@@ -138,6 +139,8 @@ def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) ->
     axes.set_xlabel(xlabel, color=_FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=_FAINT, fontsize=10)
     axes.tick_params(colors=_FAINT, labelsize=9.5, length=0)
+    if xlabel == "frame":
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(color=_GRID, lw=0.8)
     axes.set_axisbelow(True)
     for side in ("top", "right", "left"):

@@ -1,0 +1,142 @@
+"""`gsjax info`: what is understood of a recording, before anything is made of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from gsjax.cli.messages import Notes
+from gsjax.data import Sequence, open_sequence
+
+MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax info` is told."""
+
+    dataset: tyro.conf.Positional[str]
+    """Folder of a recording, or a built-in scene such as simulated:tabletop."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+
+
+def run(options: Options) -> int:
+    """Print what a recording holds.
+
+    Raises:
+        DataError, ValueError: it cannot be read.
+    """
+    with Notes(Console(stderr=True, highlight=False)):
+        sequence = open_sequence(options.dataset)
+        masks = first_masks(sequence)
+        table = Table.grid(padding=(0, 3, 0, 0))
+        for name, text in describe_sequence(sequence, masks).items():
+            table.add_row(f"[bold]{name}[/]", text)
+    console = Console(highlight=False)
+    console.print(f"[bold cyan]{sequence.name}[/]")
+    console.print(table)
+    pixels = mask_table(masks, sequence)
+    if pixels is not None:
+        console.print()
+        console.print(pixels)
+    return 0
+
+
+def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
+    """The first mask of each camera that has one, by camera id."""
+    masks = {camera: sequence.mask(0, c) for c, camera in enumerate(sequence.camera_ids)}
+    return {camera: mask for camera, mask in masks.items() if mask is not None}
+
+
+def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[str, str]:
+    """What there is, in words; opens the first depth images."""
+    return {
+        "cameras": f"{_listed(sequence.camera_ids)}{_movement(sequence)}",
+        "image": f"{sequence.width} x {sequence.height}, {_fields_of_view(sequence)}",
+        "frames": f"{sequence.num_frames}, numbered {sequence.frame_ids[0]} to {sequence.frame_ids[-1]}",
+        "times": _times(sequence),
+        "depth": _depth(sequence),
+        "masks": _masks(masks, sequence),
+        "flow": "yes" if sequence.has_flow else "none",
+        "truth": _truth(sequence),
+        "shapes": ", ".join(f"{m.name} ({len(m.means):,} Gaussians)" for m in sequence.models) or "none",
+    }
+
+
+def _listed(ids: tuple[int, ...]) -> str:
+    return f"{len(ids)}: {', '.join(map(str, ids))}"
+
+
+def _movement(sequence: Sequence) -> str:
+    moving = np.ptp(sequence.viewmats, axis=0).max(axis=(1, 2)) > 1e-6
+    if not moving.any():
+        return " (fixed)"
+    return " (moving)" if moving.all() else f" ({moving.sum()} of them moving)"
+
+
+def _fields_of_view(sequence: Sequence) -> str:
+    degrees = np.degrees(2 * np.arctan(sequence.width / (2 * sequence.Ks[0, :, 0, 0])))
+    low, high = degrees.min(), degrees.max()
+    return f"{low:.0f}° wide" if high - low < 1 else f"{low:.0f}° to {high:.0f}° wide"
+
+
+def _times(sequence: Sequence) -> str:
+    first, last = sequence.times[0], sequence.times[-1]
+    if sequence.num_frames == 1:
+        return f"at {first:.3f} s"
+    steps = np.diff(sequence.times)
+    return f"{last - first:.2f} s, every {1e3 * np.median(steps):.1f} ms ({1 / np.median(steps):.1f} Hz)"
+
+
+def _depth(sequence: Sequence) -> str:
+    known = {}
+    for c, camera in enumerate(sequence.camera_ids):
+        depth = sequence.depth(0, c)
+        if depth is not None:
+            known[camera] = depth
+    if not known:
+        return "none"
+    values = np.concatenate([depth[depth > 0] for depth in known.values()])
+    whose = "all cameras" if len(known) == sequence.num_cameras else f"cameras {', '.join(map(str, known))}"
+    if not len(values):
+        return f"{whose}, but no pixel of the first frame is valid"
+    low, high = np.percentile(values, [1, 99])
+    return f"{whose}, {low:.2f} to {high:.2f} m in the first frame"
+
+
+def _masks(masks: dict[int, np.ndarray], sequence: Sequence) -> str:
+    if not masks:
+        return "none"
+    whose = "all cameras" if len(masks) == sequence.num_cameras else f"{len(masks)} cameras"
+    labels = sorted({int(value) for mask in masks.values() for value in np.unique(mask)} - {0})
+    return f"{whose}, labels {', '.join(map(str, labels)) or 'none but the background'} in the first frame"
+
+
+def mask_table(masks: dict[int, np.ndarray], sequence: Sequence) -> Table | None:
+    """Pixels of each label in the first masks, a row a camera; None where there is nothing to compare."""
+    labels = sorted({int(value) for mask in masks.values() for value in np.unique(mask)} - {0})
+    if not labels or len(labels) > MOST_LABELS:
+        return None
+    truth = sequence.truth
+    names = {} if truth is None else dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
+    names |= {} if truth is None or truth.robot is None else {truth.robot: "robot"}
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), title_justify="left", title_style="bold")
+    table.add_column("first masks")
+    for label in labels:
+        table.add_column(f"{label} {names.get(label, '')}".strip(), justify="right")
+    for camera, mask in list(masks.items())[:MOST_CAMERAS]:
+        pixels = [f"{int((mask == label).sum()):,} px" for label in labels]
+        table.add_row(f"camera {camera}", *pixels)
+    return table
+
+
+def _truth(sequence: Sequence) -> str:
+    truth = sequence.truth
+    if truth is None:
+        return "none"
+    named = [f"{name} (label {label})" for name, label in zip(truth.names, truth.label_ids, strict=True)]
+    robot = [] if truth.robot is None else [f"robot (label {truth.robot})"]
+    return "poses of " + ", ".join(named) + (f"; {', '.join(robot)}" if robot else "")
