@@ -1,5 +1,7 @@
 """Images and all gradients against the float64 reference, over seeded scenes and every mode.
 
+Run it with
+
     python -m benchmarks.exactness              # 52 scenes; writes benchmarks/results/exactness.json
     python -m benchmarks.exactness --scenes 5   # a quick look; writes nothing
 """

@@ -100,17 +100,16 @@ def project_gaussians(
     camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & (K[0, 0] * K[1, 1] != 0)
     viewmat = jnp.where(camera_finite, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(camera_finite, K, jnp.eye(3, dtype=K.dtype))
+    offset = jnp.zeros_like(means[:, :2]) if means2d_offset is None else means2d_offset
+    sound = _finite_rows(means, quats, scales, opacities, offset) & usable & camera_finite
     # Unlike jnp.clip this hands the whole gradient on at exactly 0 and 1.
     opacities = jnp.where(opacities < 0, 0.0, jnp.where(opacities > 1, 1.0, opacities))
-    offset = jnp.zeros_like(means[:, :2]) if means2d_offset is None else means2d_offset
 
     # First on values alone: which rows can be drawn, and how far they reach.
-    inputs = (means, quats, scales, opacities)
-    values = jax.lax.stop_gradient((*inputs, viewmat, K, offset))
+    values = jax.lax.stop_gradient((means, quats, scales, opacities, viewmat, K, offset))
     local = _to_camera(values[0], values[4])
     means2d, conics, alphas, variances, det = _project_local(local, *values[1:], plan)
     squared = (values[1] * values[1]).sum(1)
-    sound = _finite_rows(*inputs, offset) & usable & camera_finite
     sound &= (squared >= MIN_SQUARED_NORM) & jnp.isfinite(squared)
     # The gradient of 1 / det holds its square. A det of 0, infinity or NaN fails too.
     has_area = _finite_rows(means2d, conics, variances) & jnp.isfinite(det) & jnp.isfinite(1 / (det * det))

@@ -55,7 +55,8 @@ def rasterization(
     quats: Float[Array, "*batch n 4"],
     scales: Float[Array, "*batch n 3"],
     opacities: Float[Array, "*batch n"],
-    colors: Float[Array, "*batch_and_cameras n channels"] | Float[Array, "*batch_and_cameras n bases channels"],
+    colors: Float[Array, "*batch_and_cameras n channels"]
+    | Float[Array, "*batch_and_cameras n bases channels"],
     viewmats: Float[Array, "*batch c 4 4"],
     Ks: Float[Array, "*batch c 3 3"],
     width: int,

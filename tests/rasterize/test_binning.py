@@ -1,4 +1,4 @@
-"""Tile lists against brute force: no pair that a pixel could see is missing, and all are in order of depth."""
+"""Tile lists against brute force: no pair that a pixel sees is missing, and all are in order of depth."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def binned(means, quats, scales, opacities):
 
 def seen_pairs(projected) -> set[tuple[int, int]]:
     """(tile, Gaussian) with a pixel at which alpha reaches 1/255 by more than rounding."""
-    means, conics, opacities = (np.float64(a) for a in projected[:2] + (projected.opacities,))
+    means, conics, opacities = (np.float64(a) for a in (*projected[:2], projected.opacities))
     x, y = np.meshgrid(np.arange(PLAN.width) + 0.5, np.arange(PLAN.height) + 0.5)
     tile = (y // TILE * PLAN.tiles_x + x // TILE).astype(int)
     pairs = set()

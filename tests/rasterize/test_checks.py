@@ -76,7 +76,9 @@ def test_plan_answers_like_the_call():
 
 
 def test_more_views_than_indices_reach_are_refused():
-    with pytest.raises(ValueError, match="2 views of 5 Gaussians and 1073741824 pairs each are more than 32-bit"):
+    with pytest.raises(
+        ValueError, match="2 views of 5 Gaussians and 1073741824 pairs each are more than 32-bit"
+    ):
         rasterization(**GOOD, width=20, height=10, plan=Plan(20, 10, 2**30))
 
 

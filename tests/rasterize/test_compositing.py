@@ -35,7 +35,9 @@ def plain_loop(splats: Splats, pixels, alpha_max=0.99):
         for i in range(len(opacities)):
             dx, dy = x - means[i, 0], y - means[i, 1]
             a, b, c = conics[i]
-            alpha = min(alpha_max, opacities[i] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
+            alpha = min(
+                alpha_max, opacities[i] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+            )
             if alpha < 1 / 255:
                 continue
             if left[p] * (1 - alpha) <= 1e-4:

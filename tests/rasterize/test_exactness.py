@@ -1,4 +1,4 @@
-"""Images and all gradients against the float64 reference. `python -m benchmarks.exactness` runs 52 such scenes."""
+"""Images and all gradients against the float64 reference; `benchmarks.exactness` runs 52 such scenes."""
 
 import pytest
 
@@ -18,7 +18,7 @@ def check(seed: int) -> None:
             assert error <= limit, f"{name} in {dtype}: {error:.1e}"
 
 
-# RGB+ED, antialiased, SH 1 and features; ED, antialiased, 7 channels and features; RGB+D, classic, 12 channels.
+# RGB+ED, antialiased, SH 1, features; ED, classic, 7 channels, features; RGB+D, classic, 12 channels.
 @pytest.mark.parametrize("seed", [29, 42, 3])
 def test_images_and_gradients_equal_the_reference(seed):
     check(seed)

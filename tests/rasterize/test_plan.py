@@ -51,7 +51,10 @@ def test_a_plan_grows_and_never_shrinks():
 @pytest.mark.parametrize(
     ("option", "says"),
     [
-        ({"render_mode": "RGBD"}, "render_mode must be one of 'RGB', 'D', 'ED', 'RGB\\+D', 'RGB\\+ED'; got 'RGBD'"),
+        (
+            {"render_mode": "RGBD"},
+            "render_mode must be one of 'RGB', 'D', 'ED', 'RGB\\+D', 'RGB\\+ED'; got 'RGBD'",
+        ),
         ({"rasterize_mode": "exact"}, "rasterize_mode must be one of 'classic', 'antialiased'"),
         ({"derivative": "both"}, "derivative must be one of 'reverse', 'forward'"),
         ({"sh_degree": 4}, "sh_degree must be one of None, 0, 1, 2, 3; got 4"),
@@ -79,7 +82,9 @@ def test_options_come_from_the_plan_and_may_be_repeated_but_not_contradicted(sma
     np.testing.assert_array_equal(colors, again)
     with pytest.raises(ValueError, match=r"render_mode='RGB' contradicts the plan.*render_mode='RGB\+ED'"):
         draw(scene, this, plan=p, render_mode="RGB")
-    with pytest.raises(ValueError, match="sh_degree=0 contradicts the plan, which was made with sh_degree=None"):
+    with pytest.raises(
+        ValueError, match="sh_degree=0 contradicts the plan, which was made with sh_degree=None"
+    ):
         draw(scene, this, plan=p, sh_degree=0)
     with pytest.raises(ValueError, match="width=34 contradicts the plan"):
         draw(scene, dataclasses.replace(this, width=34), plan=p)
@@ -97,7 +102,9 @@ def test_a_plan_travels_through_jit_vmap_and_scan(small, geometry):
     np.testing.assert_array_equal(jax.jit(image)(batch), want)
     stacked = {"scene": jax.tree.map(lambda a: a[None], scene), "plan": p}
     np.testing.assert_allclose(jax.vmap(image)(stacked)[0], want, atol=1e-6)
-    carried, _ = jax.lax.scan(lambda c, _: ((c[0], image({"scene": scene, "plan": c[0]})), None), (p, want), None, 2)
+    carried, _ = jax.lax.scan(
+        lambda c, _: ((c[0], image({"scene": scene, "plan": c[0]})), None), (p, want), None, 2
+    )
     np.testing.assert_array_equal(carried[1], want)
 
 

@@ -1,4 +1,4 @@
-"""Values that cannot be drawn, in each input in turn: neighbours do not notice, and nothing turns non-finite."""
+"""Values that cannot be drawn, in each input: neighbours do not notice, and nothing turns non-finite."""
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +53,13 @@ def assert_finite(tree):
     + [(name, 1e38, 1) for name in ("quats", "scales", "colors", "features")]
     + [("quats", 0.0, 1), ("quats", TINY, 1), ("quats", 1e-7, 1), ("scales", 1e12, 1)]
     # Refused for where they are, or for being too faint: not counted.
-    + [("means", 1e38, 0), ("means", -1e38, 0), ("opacities", 0.0, 0), ("opacities", TINY, 0), ("opacities", -1.0, 0)],
+    + [
+        ("means", 1e38, 0),
+        ("means", -1e38, 0),
+        ("opacities", 0.0, 0),
+        ("opacities", TINY, 0),
+        ("opacities", -1.0, 0),
+    ],
 )
 @pytest.mark.parametrize("whole_row", [True, False])
 def test_a_poisoned_gaussian_is_as_if_it_were_absent(scene, weights, name, value, culled, whole_row):
@@ -61,6 +67,8 @@ def test_a_poisoned_gaussian_is_as_if_it_were_absent(scene, weights, name, value
     at = (k,) if whole_row or scene[name].ndim == 1 else (k, ..., 1)
     if name == "quats" and abs(value) < 1 and not whole_row:
         pytest.skip("one small component leaves a rotation")
+    if name == "scales" and value == 1e12 and not whole_row:
+        pytest.skip("an endless needle can be drawn")
     got, gradient, meta = run(scene | {name: scene[name].at[at].set(value)}, weights)
     want, clean, _ = run(scene | {"opacities": scene["opacities"].at[k].set(0.0)}, weights)
     if culled:
@@ -113,12 +121,14 @@ def test_at_and_behind_the_near_plane_nothing_is_drawn(scene, weights, depth):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda s: place(s, 0, 0.0101),  # a hair in front of the near plane, and the camera inside the Gaussian
+        # A hair in front of the near plane, with the camera inside the Gaussian.
+        lambda s: place(s, 0, 0.0101),
         lambda s: place(s, 0, 0.0101, sideways=1e30),
         lambda s: place(s, 0, 1e6),
         lambda s: s | {"scales": s["scales"].at[:5].set(0.0)},
         lambda s: s | {"scales": s["scales"].at[:5].set(1e-12)},
         lambda s: s | {"scales": s["scales"].at[0].set(1e6)},
+        lambda s: s | {"scales": s["scales"].at[:, 1].set(1e12)},
         lambda s: s | {"scales": s["scales"].at[:, 1:].mul(1e-8)},
         lambda s: s | {"opacities": jnp.ones_like(s["opacities"])},
         lambda s: s | {"means": s["means"].at[:].set(s["means"][0])},

@@ -1,4 +1,4 @@
-"""What the public function draws: conventions, modes, backgrounds, roi, and the smallest and emptiest of scenes."""
+"""What the public function draws: conventions, modes, backgrounds, roi, the smallest and emptiest scenes."""
 
 from functools import partial
 
@@ -7,14 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.scenes import cast
 from gsjax.rasterize.plan import TILE, Plan
 from gsjax.rasterize.rasterization import plan, rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
 IDENTITY = jnp.eye(4)[None]
 K = jnp.array([[[10.0, 0.0, 8.0], [0.0, 10.0, 8.0], [0.0, 0.0, 1.0]]])
-draw16 = jax.jit(partial(rasterization, viewmats=IDENTITY, Ks=K, width=16, height=16, plan=Plan(16, 16, 4096)))
+draw16 = jax.jit(
+    partial(rasterization, viewmats=IDENTITY, Ks=K, width=16, height=16, plan=Plan(16, 16, 4096))
+)
 
 
 def one(mean, scale=(0.05, 0.05, 0.05), quat=(1.0, 0.0, 0.0, 0.0), opacity=0.9, color=(1.0, 1.0, 1.0)):
@@ -28,7 +29,7 @@ def both(a, b):
 
 def test_pixel_centres_stand_at_half_x_right_y_down():
     # u = 10 * 0.25 + 8 = 10.5, v = 10 * -0.35 + 8 = 4.5: the centre of column 10, row 4.
-    colors, alphas, meta = draw16(**one((0.25, -0.35, 1.0)))
+    _, alphas, meta = draw16(**one((0.25, -0.35, 1.0)))
     alpha = np.asarray(alphas[0, :, :, 0])
     assert np.unravel_index(alpha.argmax(), alpha.shape) == (4, 10)
     np.testing.assert_allclose(alpha[4, 9], alpha[4, 11], rtol=1e-5)
@@ -40,13 +41,17 @@ def test_pixel_centres_stand_at_half_x_right_y_down():
 def test_quaternions_are_wxyz():
     # A needle along x, turned by 90 degrees about the viewing axis, stands upright.
     half = np.sqrt(0.5)
-    alpha = np.asarray(draw16(**one((0.0, 0.0, 1.0), (0.4, 0.02, 0.02), (half, 0.0, 0.0, half)))[1][0, ..., 0])
+    alpha = np.asarray(
+        draw16(**one((0.0, 0.0, 1.0), (0.4, 0.02, 0.02), (half, 0.0, 0.0, half)))[1][0, ..., 0]
+    )
     rows, columns = (alpha > 0.1).any(1).sum(), (alpha > 0.1).any(0).sum()
     assert rows >= 4 * columns
 
 
 def test_quaternions_need_not_be_unit():
-    a, b = (draw16(**one((0.1, 0, 1), (0.3, 0.05, 0.1), q)) for q in ((0.3, 0.4, 0.1, -0.2), (30, 40, 10, -20)))
+    a, b = (
+        draw16(**one((0.1, 0, 1), (0.3, 0.05, 0.1), q)) for q in ((0.3, 0.4, 0.1, -0.2), (30, 40, 10, -20))
+    )
     np.testing.assert_allclose(a[0], b[0], atol=1e-6)
 
 
@@ -120,7 +125,9 @@ def test_roi_draws_the_tiles_it_touches_exactly_and_leaves_the_others_to_the_bac
     gradient, (image, meta) = run(scene, weights, roi)
     full_gradient, (full, full_meta) = run(scene, jnp.where(kept[..., None], weights, 0), jnp.ones_like(roi))
     np.testing.assert_array_equal(image[0][kept], full[0][kept])
-    np.testing.assert_array_equal(image[0][~kept], np.broadcast_to(scene["backgrounds"][0], image[0][~kept].shape))
+    np.testing.assert_array_equal(
+        image[0][~kept], np.broadcast_to(scene["backgrounds"][0], image[0][~kept].shape)
+    )
     assert int(meta.pairs[0]) < int(full_meta.pairs[0])
     for name in gradient.keys() - {"backgrounds"}:
         tolerance = 1e-5 * float(jnp.abs(full_gradient[name]).max())
@@ -182,7 +189,9 @@ def test_meta_tells_radii_and_depths_of_what_is_visible(small, geometry):
     visible = np.asarray(meta.radii[0, :, 0] > 0)
     local = scene["means"] @ scene["viewmats"][0, :3, :3].T + scene["viewmats"][0, :3, 3]
     assert 0 < visible.sum() < 40
-    np.testing.assert_allclose(np.asarray(meta.depths[0])[visible], np.asarray(local[:, 2])[visible], rtol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(meta.depths[0])[visible], np.asarray(local[:, 2])[visible], rtol=1e-5
+    )
     assert int(meta.needed[0]) >= int(meta.pairs[0]) > 0
 
 
@@ -196,17 +205,10 @@ def test_the_offset_moves_projected_means_and_reads_their_gradient():
 
 
 def test_tiles_per_batch_is_of_speed_alone(small):
-    this, scene = small()
+    _, scene = small()
     images = [
         rasterization(**scene, width=33, height=17, plan=Plan(33, 17, 4096, tiles_per_batch=size))[0]
         for size in (1, 4, 32)
     ]
     np.testing.assert_allclose(images[1], images[0], atol=1e-6)
     np.testing.assert_allclose(images[2], images[0], atol=1e-6)
-
-
-def test_scenes_of_float64_inputs_are_drawn_in_float32_without_x64(small):
-    this, scene = small()
-    doubled = {k: np.float64(v) for k, v in scene.items()}
-    colors = rasterization(**cast(doubled, np.float32), width=33, height=17)[0]
-    assert colors.dtype == jnp.float32
