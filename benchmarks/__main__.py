@@ -1,8 +1,8 @@
 """Times of the rasterizer on seeded scenes, as ratios to what exp alone would cost.
 
-`python -m benchmarks` (`make bench`) prints one table and writes benchmarks/results/bench.json. A pair is one Gaussian
-on one tile, 256 pixels. The floor is exp over as many float32 values, in a 4 MB block that stays in cache,
-measured in the same run: ratios to it travel between machines better than milliseconds.
+`python -m benchmarks` (`make bench`) prints one table and writes benchmarks/results/bench.json. A pair is one
+Gaussian on one tile, 256 pixels. The floor is exp over as many float32 values, in a 4 MB block that stays in
+cache, measured in the same run: ratios to it travel between machines better than milliseconds.
 """
 
 import json
@@ -113,19 +113,16 @@ def measure(num: int, width: int, height: int, floor_ns: float) -> list[dict]:
 def main() -> None:
     floor_ns = exp_floor_ns()
     print(f"{machine.in_words()}\nexp floor {floor_ns:.3f} ns a value; median and p95 of {REPEATS} runs\n")
-    print(
-        f"{'program':17}{'Gaussians':>10}{'image':>9}{'pairs':>9}{'compile s':>11}{'ms':>9}{'p95':>9}{'/ floor':>9}"
-    )
+    heads = ("Gaussians", "image", "pairs", "compile s", "median ms", "p95 ms", "/ floor")
+    print(f"{'program':17}" + "".join(f"{head:>10}" for head in heads))
     rows = []
     for num in COUNTS:
         for width, height in SIZES:
             for row in measure(num, width, height, floor_ns):
                 rows.append(row)
-                print(
-                    f"{row['program']:17}{num:10}{f'{width}x{height}':>9}{row['pairs']:9}{row['compile_s']:11.1f}"
-                    f"{row['median_ms']:9.1f}{row['p95_ms']:9.1f}{row['ratio_to_floor']:9.1f}",
-                    flush=True,
-                )
+                times = (row[key] for key in ("compile_s", "median_ms", "p95_ms", "ratio_to_floor"))
+                head = f"{row['program']:17}{num:10}{f'{width}x{height}':>10}{row['pairs']:10}"
+                print(head + "".join(f"{t:10.1f}" for t in times), flush=True)
     record = {
         "machine": machine.describe(),
         "exp_floor_ns": round(floor_ns, 4),

@@ -50,7 +50,7 @@ def summary(scenes: list[dict]) -> dict:
         "shortest_longest_list": min(s["longest_list"] for s in scenes),
         "worst": worst,
         "limits": {k: {"images": i, "gradients": g} for k, (i, g) in LIMITS.items()},
-        "passed": doubtful < DOUBTFUL_LIMIT and all(within),
+        "passed": all(s["doubtful_share"] < DOUBTFUL_LIMIT for s in scenes) and all(within),
     }
 
 

@@ -15,7 +15,7 @@ from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
-SIZES = ((48, 40), (64, 48), (57, 35), (33, 65))
+SIZES = ((64, 56), (80, 64), (73, 51), (49, 81))
 # (sh_degree, channels)
 PAINTS = ((None, 1), (None, 3), (None, 7), (None, 12), (0, 3), (1, 3), (2, 3), (3, 3))
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds", "features")
@@ -85,7 +85,7 @@ def make_scene(case: Case) -> Scene:
     y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
     x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     local = np.stack([x, y, np.ones(n)], axis=-1) * depths[:, None]
-    sigma = np.exp(rng.uniform(np.log(0.2), np.log(2.5), (n, 3)))  # pixels
+    sigma = np.exp(rng.uniform(np.log(0.2), np.log(2.2), (n, 3)))  # pixels
     bases = () if case.sh_degree is None else ((case.sh_degree + 1) ** 2,)
     colors = rng.normal(size=(n, *bases, case.channels)) * 0.4 + (0.0 if bases else 0.5)
     scene = {

@@ -63,7 +63,7 @@ def test_too_few_harmonics_are_counted(degree, shape):
 
 
 def test_values_where_harmonics_are_due_are_refused():
-    with pytest.raises(ValueError, match="SH coefficients .* since sh_degree is given"):
+    with pytest.raises(ValueError, match=r"SH coefficients .* since sh_degree is given"):
         rasterization(**GOOD, width=20, height=10, sh_degree=0)
 
 
@@ -77,7 +77,7 @@ def test_plan_answers_like_the_call():
 
 def test_more_views_than_indices_reach_are_refused():
     with pytest.raises(
-        ValueError, match="2 views of 5 Gaussians and 1073741824 pairs each are more than 32-bit"
+        ValueError, match=r"2 views of 5 Gaussians and 1073741824 pairs each are more than 32-bit"
     ):
         rasterization(**GOOD, width=20, height=10, plan=Plan(20, 10, 2**30))
 
