@@ -1,6 +1,7 @@
 """`gsjax info`: what is understood of a recording, before anything is made of it."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -17,7 +18,7 @@ MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
 class Options:
     """What `gsjax info` is told."""
 
-    dataset: tyro.conf.Positional[str]
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording, or a built-in scene such as simulated:tabletop."""
     debug: bool = False
     """Show Python's traceback when something fails."""

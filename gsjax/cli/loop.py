@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
 from gsjax.methods.object_tracker import Pose, TrackedScene, TrackerConfig, first_pose, track
+from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
 """Frames that are read while an update runs."""
@@ -64,11 +65,14 @@ class Tracking:
         return np.stack([pose.quats for pose in self.poses])
 
 
-def follow(scene: TrackedScene, tracked: Sequence, config: TrackerConfig, console: Console) -> Tracking:
+def follow(
+    scene: TrackedScene, first: Frame, tracked: Sequence, config: TrackerConfig, console: Console
+) -> Tracking:
     """Track all frames after the first. Ctrl-C or an error ends the loop; what was tracked until then stays.
 
     Args:
         scene: at the first frame.
+        first: what the tracked cameras saw then.
         tracked: the tracked cameras; only images and depth are loaded.
         config: the tracker's.
         console: for the progress bar.
@@ -86,7 +90,7 @@ def follow(scene: TrackedScene, tracked: Sequence, config: TrackerConfig, consol
     with Progress(*columns, console=console, expand=True) as progress:
         task = progress.add_task("tracking", total=tracked.num_frames, completed=1, rate="compiling")
         try:
-            for update in track(scene, frames, config):
+            for update in track(scene, first, frames, config):
                 tracking.poses.append(jax.device_get(update.pose))
                 tracking.update_s.append(update.seconds)
                 tracking.compile_s += update.compile_seconds

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -26,27 +26,27 @@ from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score
 from gsjax.cli.summary import machine, print_summary, write_run_report
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
+from gsjax.scene.frame import Frame
 
 
 @dataclass(frozen=True)
 class Options:
     """What `gsjax track` is told."""
 
-    dataset: tyro.conf.Positional[str]
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording, or a built-in scene such as simulated:tabletop."""
     out: Path
     """Folder for the run. It must be new, empty, or hold an unfinished run."""
-    cameras: tuple[int, ...] | None = None
+    cameras: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="ID [ID ...]")] = None
     """Ids of the cameras to track with. All that are not held out, unless given."""
-    mask_camera: int | None = None
+    mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
-    eval_cameras: tuple[int, ...] = ()
+    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
     """Ids of cameras that are held out: only judged, after tracking."""
-    frames: str = ":"
-    """Which frames, as Python slices: 0:60, 0:60:2, :30."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
     masks: Literal["auto", "files", "segment"] = "auto"
-    """Where the first mask comes from: the recording's files, or a segmenter that needs no weights. "auto"
-    takes files if there are any, then shapes that the recording brings, then the segmenter."""
+    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     overwrite: bool = False
     """Replace a finished run in the same folder."""
     debug: bool = False
@@ -69,8 +69,9 @@ def run(options: Options) -> int:
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
-        scene, seconds["start"] = _start(recording, mask, options.tracker, console, notes)
-        tracking = follow(scene, recording.tracked, options.tracker, console)
+        first = recording.tracked.frame(0)
+        scene, seconds["start"] = _start(recording, first, mask, options.tracker, console, notes)
+        tracking = follow(scene, first, recording.tracked, options.tracker, console)
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
         _say_if_stopped(tracking, recording, notes)
@@ -86,10 +87,14 @@ def run(options: Options) -> int:
 
 
 def _start(
-    recording: Recording, mask: FirstMask, config: TrackerConfig, console: Console, notes: Notes
+    recording: Recording,
+    frame: Frame,
+    mask: FirstMask,
+    config: TrackerConfig,
+    console: Console,
+    notes: Notes,
 ) -> tuple[TrackedScene, float]:
     """The scene at the first frame, and the seconds that it took."""
-    frame = recording.tracked.frame(0)
     begun = perf_counter()
     with console.status("fitting the scene to the first frame"):
         if mask.labels is not None:

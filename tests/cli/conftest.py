@@ -1,0 +1,63 @@
+"""A tiny recording on disk for tests to corrupt, and a tracker that stands still to test what is around it."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsjax.cli.loop
+import gsjax.cli.track
+from gsjax.cli import main
+from gsjax.data import write_panoptic
+from gsjax.data.simulated import tabletop
+from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+
+
+@pytest.fixture(scope="session")
+def pristine(tmp_path_factory) -> Path:
+    """Four frames of the built-in scene, 80x60, three cameras, as a Panoptic folder."""
+    folder = tmp_path_factory.mktemp("recording") / "table"
+    folder.mkdir()
+    write_panoptic(tabletop(frames=4, width=80, height=60), folder)
+    return folder
+
+
+@pytest.fixture
+def recording(pristine, tmp_path) -> Path:
+    """A copy of it to corrupt."""
+    return Path(shutil.copytree(pristine, tmp_path / "table"))
+
+
+def unfitted(frame, mask, mask_camera, config):
+    """`start_scene` without the optimisation."""
+    start = replace(config.start, iterations=0)
+    return start_scene(frame, mask, mask_camera, replace(config, start=start))
+
+
+def standing_still(scene, first, frames, config):
+    """`track` for objects that never move."""
+    for _ in frames:
+        seen = np.ones(scene.num_objects, bool)
+        yield Tracked(first_pose(scene), None, {"visible": seen}, 0.01, 0.0, None)
+
+
+@pytest.fixture
+def still(monkeypatch):
+    """Tracking is replaced by standing still, which compiles nothing."""
+    monkeypatch.setattr(gsjax.cli.track, "start_scene", unfitted)
+    monkeypatch.setattr(gsjax.cli.loop, "track", standing_still)
+
+
+@pytest.fixture
+def gsjax_track(tmp_path, capfd):
+    """Runs `gsjax track` in this process, into tmp_path/run; returns the exit code and what was said."""
+
+    def call(dataset, *options: str) -> tuple[int, str]:
+        code = main(["track", str(dataset), "--out", str(tmp_path / "run"), *options])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err
+
+    return call

@@ -1,0 +1,217 @@
+"""Bad recordings and bad wishes: each a clear sentence and exit code 2, or a warning and a sound run."""
+
+import json
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+import gsjax.cli.recording
+from gsjax.data import Sequence, open_sequence
+
+
+@pytest.fixture
+def refused(gsjax_track, tmp_path):
+    """Runs `gsjax track`, which must refuse; returns what it said."""
+
+    def call(dataset, *options) -> str:
+        code, said = gsjax_track(dataset, *options)
+        assert code == 2, said
+        assert "error:" in said
+        assert not (tmp_path / "run" / "report.html").exists()
+        return said
+
+    return call
+
+
+@pytest.fixture
+def sound(gsjax_track, tmp_path):
+    """Runs `gsjax track`, which must succeed with finite numbers; returns what it said, and metrics.json."""
+
+    def call(dataset, *options) -> tuple[str, dict]:
+        code, said = gsjax_track(dataset, *options)
+        assert code == 0, said
+        found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+        with np.load(tmp_path / "run" / "trajectory.npz") as saved:
+            assert np.isfinite(saved["means"]).all()
+        assert (tmp_path / "run" / "report.html").exists()
+        return said, found
+
+    return call
+
+
+def change_meta(folder, change) -> None:
+    path = folder / "train_meta.json"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def rewrite(path, change) -> None:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), change(picture))
+
+
+def test_missing_dataset(refused, tmp_path):
+    said = refused(tmp_path / "nowhere")
+    assert "expected a folder with a recording, found nothing there" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_unknown_built_in_scene(refused):
+    assert "no built-in scene 'kitchen'; there are: tabletop" in refused("simulated:kitchen")
+
+
+def test_missing_image(refused, recording):
+    (recording / "ims" / "1" / "000002.png").unlink()
+    assert "000002.png: expected an image of all 3 cameras in frame 2" in refused(recording)
+
+
+def test_missing_first_mask(refused, recording):
+    (recording / "seg" / "1" / "000000.png").unlink()
+    said = refused(recording, "--mask-camera", "1")
+    assert "seg/1/000000.png" in said
+
+
+def test_missing_depth_image(refused, recording):
+    (recording / "depth" / "0" / "000000.png").unlink()
+    assert "depth/0/000000.png" in refused(recording)
+
+
+def test_camera_count_that_differs(refused, recording):
+    change_meta(recording, lambda meta: meta["w2c"][2].pop())
+    assert "expected 3 cameras in w2c, as in frame 0, found 2 in frame 2" in refused(recording)
+
+
+def test_depth_in_the_wrong_unit(refused, recording):
+    change_meta(recording, lambda meta: meta.update(depth_unit_m=1.0))
+    assert "unit is likely wrong" in refused(recording)
+
+
+def test_depth_that_is_all_zero(refused, recording):
+    for path in recording.glob("depth/*/000000.png"):
+        rewrite(path, np.zeros_like)
+    said = refused(recording)
+    assert said.count("warning:") == 1
+    assert "no pixel has a valid depth" in said
+    assert "no valid depth in any camera" in said
+
+
+def test_pose_that_is_no_rotation(refused, recording):
+    def skew(meta):
+        meta["w2c"][1][2][0][0] += 0.3
+
+    change_meta(recording, skew)
+    assert "viewmat of camera 2 in frame 1: R is no rotation" in refused(recording)
+
+
+def test_mask_of_another_size(refused, recording):
+    rewrite(recording / "seg" / "1" / "000000.png", lambda mask: mask[:30])
+    said = refused(recording, "--mask-camera", "1")
+    assert "seg/1/000000.png" in said
+    assert "80x30" in said or "(30, 80)" in said
+
+
+def test_mask_that_is_all_background(refused, recording):
+    rewrite(recording / "seg" / "1" / "000000.png", np.zeros_like)
+    assert "no object to track" in refused(recording, "--mask-camera", "1")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--cameras", "0", "7"), "--cameras: table has no camera 7; it has [0, 1, 2]."),
+        (("--eval-cameras", "9"), "--eval-cameras: table has no camera 9"),
+        (("--cameras", "0", "0"), "camera 0 is named twice"),
+        (("--cameras", "0", "--eval-cameras", "0"), "camera 0 is tracked too"),
+        (("--cameras", "0", "--mask-camera", "2"), "camera 2 is not tracked; the tracked ones are [0]."),
+        (("--eval-cameras", "0", "1", "2"), "no camera is left to track"),
+        (("--frames", "60:90"), "it has frames 0 to 3"),
+        (("--frames", "x"), "--frames: expected START:STOP"),
+    ],
+)
+def test_wishes_that_cannot_be_met(refused, pristine, options, says):
+    assert says in refused(pristine, *options)
+
+
+def test_out_is_a_file(refused, pristine, tmp_path):
+    (tmp_path / "run").touch()
+    assert "expected a folder, found a file" in refused(pristine)
+
+
+def test_out_holds_something_else(refused, pristine, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").touch()
+    assert "found other files" in refused(pristine)
+
+
+def test_out_cannot_be_written(refused, pristine, tmp_path):
+    if os.name != "posix" or os.geteuid() == 0:
+        (tmp_path / "file").touch()  # root may write anywhere, but not below a file
+        parent = tmp_path / "file"
+    else:
+        parent = tmp_path / "locked"
+        parent.mkdir(mode=0o500)
+    assert str(parent) in refused(pristine, "--out", str(parent / "run"))
+
+
+def test_a_bad_frame_in_the_middle_keeps_what_came_before(gsjax_track, recording, tmp_path, still):
+    (recording / "depth" / "0" / "000002.png").write_bytes(b"nonsense")
+    code, said = gsjax_track(recording, "--cameras", "0", "--frames", "0:4")
+    assert code == 2
+    assert "depth/0/000002.png" in said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["frames"]["tracked"] == 2
+    assert "000002.png" in found["stopped"]
+
+
+def test_label_that_no_pixel_has(sound, recording, still):
+    rewrite(recording / "seg" / "1" / "000000.png", lambda mask: np.where(mask == 4, 0, mask))
+    said, found = sound(recording, "--mask-camera", "1")
+    assert "ball (label 4) has no pixel in the first mask of camera 1: it is not tracked" in said
+    assert found["objects"]["ball"]["gaussians"] == 0
+    assert any(note.startswith("ball: not tracked") for note in found["notes"])
+
+
+def test_empty_frame(sound, recording, still):
+    for path in recording.glob("ims/*/000002.png"):
+        rewrite(path, np.zeros_like)
+    said, found = sound(recording)
+    assert said.count("the image is empty") == 1  # one for all cameras and frames
+    assert any("the image is empty" in note and "more like it" in note for note in found["notes"])
+
+
+def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
+    def with_nan(path):
+        found = open_sequence(path)
+
+        def load(t, c):
+            image = found.load_image(t, c) / 255.0
+            image[5:8, 5:8] = np.nan
+            return image
+
+        return Sequence(**{**vars(found), "load_image": load, "float_images": True})
+
+    monkeypatch.setattr(gsjax.cli.recording, "open_sequence", with_nan)
+    said, found = sound(pristine)
+    assert said.count("9 pixels are not finite") == 1
+    assert found["cameras"]["0"]["psnr"] > 10
+
+
+def test_one_frame_only(sound, pristine, tmp_path, still):
+    said, found = sound(pristine, "--frames", "2", "--eval-cameras", "2")
+    assert "1 of 1 frames, no updates" in said
+    assert found["frames"]["first_id"] == found["frames"]["last_id"] == 2
+    assert found["update_hz"] is None
+    with np.load(tmp_path / "run" / "trajectory.npz") as saved:
+        assert saved["means"].shape[0] == 1
+        assert saved["update_s"].tolist() == [0.0]
+
+
+def test_no_depth_and_no_shapes(refused, recording):
+    for path in recording.glob("depth/*/*.png"):
+        path.unlink()
+    for folder in (recording / "depth").iterdir():
+        folder.rmdir()
+    assert "depth" in refused(recording)
