@@ -17,7 +17,7 @@ def as_users_run():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small():
     """make(seed, **case fields) -> (case, scene in float32): 40 Gaussians on 33 x 17 pixels unless told."""
 
@@ -30,7 +30,7 @@ def small():
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def geometry():
     """The arguments of `gsjax.plan` out of a scene."""
     names = (*ARRAYS[:4], "viewmats", "Ks")

@@ -129,7 +129,7 @@ def test_reverse_plans_refuse_jvp_and_linearize_works_on_forward_ones():
         np.testing.assert_allclose(push(jnp.eye(3)[i]), jacobian[..., i], atol=1e-5)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def loss_and_plan(small, geometry):
     this, scene = small(feature_channels=2)
     p = plan(*geometry(scene), this.width, this.height, headroom=3.0)
