@@ -13,7 +13,8 @@ help: ## list the targets
 
 demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 	@rm -rf $(RUN)
-	$(BIN)/gsjax track simulated:tabletop --out $(RUN)
+	$(BIN)/gsjax track simulated:tabletop --out $(RUN) --frames 0:30 \
+	  --cameras 0 1 --mask-camera 1 --eval-cameras 2
 	@echo "The report is at $(RUN)/report.html: open it in a browser."
 
 # Two workers at most: XLA compiles on several threads by itself. A file stays with one worker, so what one

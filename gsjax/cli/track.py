@@ -107,7 +107,8 @@ def _start(
     seconds = perf_counter() - begun
     console.print(
         f"[bold]scene[/]     {scene.gaussians.num:,} Gaussians, {scene.num_moving:,} of them in "
-        f"{scene.num_objects} objects, in {seconds:.1f} s; {_origin(mask)}"
+        f"{scene.num_objects} objects, in {seconds:.1f} s; {_origin(mask)}",
+        soft_wrap=not console.is_terminal,
     )
     return scene, seconds
 

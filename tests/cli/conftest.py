@@ -1,4 +1,4 @@
-"""A tiny recording on disk for tests to corrupt, and a tracker that stands still to test what is around it."""
+"""A tiny recording for tests to corrupt, and a tracker that stands still, to test what is around it."""
 
 import shutil
 from dataclasses import replace

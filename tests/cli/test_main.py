@@ -1,0 +1,101 @@
+"""The front door: help, unknown words, info, and how errors and warnings are said."""
+
+import warnings
+
+import pytest
+from rich.console import Console
+
+from gsjax.cli import COMMANDS, main
+from gsjax.cli.messages import Notes, describe
+from gsjax.data import DataWarning
+
+
+@pytest.fixture
+def say(capfd):
+    def call(*arguments: str) -> tuple[int, str, str]:
+        code = main(arguments)
+        return code, *capfd.readouterr()
+
+    return call
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
+def test_help_names_every_command(say, arguments):
+    code, out, _ = say(*arguments)
+    assert code == 0
+    assert all(f"gsjax {name}" in out for name in COMMANDS)
+
+
+def test_version(say):
+    assert say("--version")[1].startswith("gsjax 0.")
+
+
+def test_unknown_command(say):
+    code, _, err = say("trakc")
+    assert code == 2
+    assert "no command 'trakc'; there are: track, info" in err
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_option_is_explained(say, capfd, command):
+    with pytest.raises(SystemExit) as stopped:
+        say(command, "--help")
+    assert stopped.value.code == 0
+    out = capfd.readouterr().out
+    assert "DATASET" in out
+    if command == "track":
+        assert "--tracker.refine.iterations" in out
+
+
+def test_missing_option_is_named(say, capfd):
+    with pytest.raises(SystemExit) as stopped:
+        say("track", "simulated:tabletop")
+    assert stopped.value.code == 2
+    assert "--out" in capfd.readouterr().err
+
+
+def test_debug_shows_where_it_failed(tmp_path):
+    with pytest.raises(ValueError, match="expected a folder"):
+        main(["info", str(tmp_path / "nowhere"), "--debug"])
+
+
+def test_info_says_what_is_there(say):
+    code, out, _ = say("info", "simulated:tabletop?frames=3&width=80&height=60")
+    assert code == 0
+    for said in (
+        "3: 0, 1, 2 (fixed)",
+        "80 x 60",
+        "3, numbered 0 to 2",
+        "30.0 Hz",
+        "carton (label 2)",
+        "1 robot",
+    ):
+        assert said in out, out
+
+
+def test_info_of_a_bare_recording(say, pristine, tmp_path):
+    for name in ("train_meta.json", "ims"):
+        (tmp_path / name).symlink_to(pristine / name)
+    code, out, _ = say("info", str(tmp_path))
+    assert code == 0
+    for what in ("depth", "masks", "truth", "shapes"):
+        assert [what, "none"] in [line.split() for line in out.splitlines()]
+
+
+def test_errors_of_the_system_read_as_sentences(tmp_path):
+    with pytest.raises(OSError, match="No such file") as caught:
+        (tmp_path / "gone").read_text()
+    assert describe(caught.value) == f"{tmp_path / 'gone'}: no such file or directory"
+    assert describe(ValueError("two\n  lines")) == "two lines"
+    assert describe(ValueError()) == "ValueError"
+
+
+def test_each_kind_of_warning_is_shown_once_and_counted(capfd):
+    with Notes(Console(stderr=True)) as notes:
+        for frame in range(3):
+            warnings.warn(f"frame {frame} is empty", DataWarning, stacklevel=1)
+        warnings.warn("another library's own", DeprecationWarning, stacklevel=1)
+        notes.add("a note")
+    said = capfd.readouterr().err
+    assert said == "warning: frame 0 is empty\n"
+    assert notes.all == ["a note", "Warning: frame 0 is empty (and 2 more like it)"]
