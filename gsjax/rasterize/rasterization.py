@@ -24,9 +24,9 @@ from gsjax.rasterize.projection import Projected, project_gaussians
 class Meta(NamedTuple):
     """What a rasterization has to say besides its images."""
 
-    means2d: Float[Array, "*batch n 2"]  # pixels
+    means2d: Float[Array, "*batch n 2"]  # pixels, where visible
     radii: Int[Array, "*batch n 2"]  # half-widths in pixels, (x, y); 0 where not visible
-    depths: Float[Array, "*batch n"]  # z in the camera's frame
+    depths: Float[Array, "*batch n"]  # z in the camera's frame, where visible
     features: Float[Array, "*batch height width channels"] | None
     pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
     culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area)
