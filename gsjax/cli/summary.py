@@ -175,10 +175,10 @@ def _subtitle(found: dict[str, Any]) -> str:
     text = (
         f"Object-aware tracker; frames {frames['first_id']} to {frames['last_id']} ({frames['tracked']} of "
         f"{frames['asked']} asked for), {image['width']}×{image['height']}; "
-        f"tracked with camera {_listed(found['tracked_cameras'])}"
+        f"tracked with {_cameras(found['tracked_cameras'])}"
     )
     held_out = found["held_out_cameras"]
-    return text + (f", judged by camera {_listed(held_out)} as well" if held_out else "")
+    return text + (f", judged by {_cameras(held_out)} too" if held_out else "")
 
 
 def _headline(found: dict[str, Any]) -> dict[str, Any]:
@@ -221,6 +221,6 @@ def _machine_note(machine: dict[str, Any]) -> str:
     )
 
 
-def _listed(numbers: list[int]) -> str:
-    *front, last = map(str, numbers)
-    return f"{', '.join(front)} and {last}" if front else last
+def _cameras(ids: list[int]) -> str:
+    *front, last = map(str, ids)
+    return f"cameras {', '.join(front)} and {last}" if front else f"camera {last}"
