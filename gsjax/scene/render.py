@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -45,6 +46,7 @@ def render(
     features: Float[Array, "n f"] | None = None,
     backgrounds: Float[Array, "c 3"] | None = None,
     roi: Bool[Array, "c height width"] | None = None,
+    visibility: Float[Array, "c n"] | None = None,
 ) -> Rendered:
     """Colour, expected depth and alpha of a scene in C cameras, differentiable in all of them.
 
@@ -54,27 +56,36 @@ def render(
         plan: from `plan_render`; needed under jit.
         features: values composited beside the colours; the scene's own unless given.
         backgrounds, roi: as for `gsjax.rasterization`.
+        visibility: factor on each opacity in each camera, 0 to 1; 1 unless given.
 
     Raises:
         ValueError: as `gsjax.rasterization`.
     """
+    features = gaussians.features if features is None else features
+    scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, features)
+    per_camera = (cameras.viewmat, cameras.K, backgrounds, roi)
+    if visibility is not None:
+        # Opacities that differ from camera to camera make each camera a scene of its own.
+        scene = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(visibility), *a.shape)), scene)
+        scene = (*scene[:3], scene[3] * visibility, *scene[4:])
+        per_camera = jax.tree.map(lambda a: a[:, None], per_camera)
+    *scene, features = scene
+    viewmats, Ks, backgrounds, roi = per_camera
     images, alphas, meta = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        cameras.viewmat,
-        cameras.K,
+        *scene,
+        viewmats,
+        Ks,
         cameras.width,
         cameras.height,
         plan=plan,
         sh_degree=gaussians.sh_degree,
         render_mode="RGB+ED",
-        features=gaussians.features if features is None else features,
+        features=features,
         backgrounds=backgrounds,
         roi=roi,
     )
+    if visibility is not None:
+        images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))
     return Rendered(images[..., :3], images[..., 3], alphas[..., 0], meta.features, meta)
 
 

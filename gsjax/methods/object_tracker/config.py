@@ -27,12 +27,36 @@ class MatchConfig:
     """Edge of the template, pixels of the (possibly reduced) image."""
     radius: int = 24
     """How far the template is searched to each side, pixels of the reduced image."""
-    min_score: float = 0.5
+    min_score: float = 0.3
     """A correlation below this moves nothing."""
     margin: int = 2
     """Pixels by which the object's mask is grown: an outline against its surroundings is texture too."""
     max_residual: float = 0.03
     """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
+
+
+@dataclass(frozen=True)
+class AlignConfig:
+    """Direct alignment of centres, before anything is rendered."""
+
+    iterations: int = 6
+    """Gauss-Newton iterations a frame; 0 leaves it out."""
+    color_scale: float = 0.1
+    """A colour difference that is large, 0 to 1."""
+    depth_scale: float = 0.01
+    """A depth difference that is large, metres."""
+    centers: int = 512
+    """Gaussians of a group whose centres are aligned."""
+    center_weight: float = 0.2
+    """What a centre counts beside a pixel of the last frame, which looks more like the new one."""
+    pixels: int = 256
+    """Pixels of the last frame that speak for a group in each camera, beside its Gaussians."""
+    max_thickness: float = 0.06
+    """Measured depth further than this from the model's is not of the same object, metres."""
+    turn: float = 0.2
+    """Turn by which the best start is varied about each axis, radians."""
+    max_step: float = 0.1
+    """Longest step of one iteration, metres and radians."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +91,7 @@ class TrackerConfig:
 
     start: StartConfig = field(default_factory=StartConfig)
     match: MatchConfig = field(default_factory=MatchConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""

@@ -13,7 +13,7 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render, render
 
 # Means hardly move: depth has measured them. What is learned is how to blend into the pictures.
-RATES = {"means": 1e-4, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
+RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
 
 

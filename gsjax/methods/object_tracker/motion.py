@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from gsjax.geometry.rotations import multiply_quats
+from gsjax.geometry.rotations import multiply_quats, quats_to_matrices
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.scene.gaussians import Gaussians
 
@@ -41,15 +41,21 @@ def group_means(
     return total / jnp.maximum(count, 1).reshape(-1, *[1] * (values.ndim - 1))
 
 
+def turn_about(
+    means: Float[Array, "m 3"], twists: Float[Array, "k 6"], centers: Float[Array, "k 3"], groups: Int[Array, "m"]
+) -> Float[Array, "m 3"]:
+    """Each group's means after its twist (translation, rotation vector) about its centre."""
+    member = groups - 1
+    matrix = jaxlie.SO3.exp(twists[:, 3:]).as_matrix()[member]
+    center = centers[member]
+    return center + jnp.einsum("mij,mj->mi", matrix, means - center) + twists[member, :3]
+
+
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
     """Each group turned about its centre and shifted, then each Gaussian shifted by its delta."""
-    member = groups - 1
-    turn = jaxlie.SO3.exp(motion.rotations)
-    matrix, quat = turn.as_matrix()[member], turn.wxyz[member]
-    center = centers[member]
-    offset = pose.means - center
-    turned = jnp.einsum("mij,mj->mi", matrix, offset)
-    means = center + turned + motion.translations[member] + motion.delta
+    twists = jnp.concatenate([motion.translations, motion.rotations], axis=-1)
+    quat = jaxlie.SO3.exp(motion.rotations).wxyz[groups - 1]
+    means = turn_about(pose.means, twists, centers, groups) + motion.delta
     return Pose(means, multiply_quats(quat, pose.quats))
 
 
@@ -65,3 +71,18 @@ def place(scene: TrackedScene, pose: Pose) -> Gaussians:
 def first_pose(scene: TrackedScene) -> Pose:
     """Where the moving Gaussians are in the first frame."""
     return Pose(scene.gaussians.means[: scene.num_moving], scene.gaussians.quats[: scene.num_moving])
+
+
+def facing(scene: TrackedScene, pose: Pose, eyes: Float[Array, "c 3"]) -> Float[Array, "c n"]:
+    """How much of each Gaussian's outer side each camera sees, 0 to 1; a surface hides its own inside.
+
+    Without this, the front of a box that has turned away would be compared with its back. It fades from 1 to
+    0 as the angle between normal and ray passes 90 degrees. A constant: no gradient.
+    """
+    normals = jnp.einsum("mij,mj->mi", quats_to_matrices(pose.quats), scene.normals)
+    rays = eyes[:, None] - pose.means
+    cosine = jnp.sum(normals * rays, axis=-1) / jnp.maximum(jnp.linalg.norm(rays, axis=-1), 1e-9)
+    one_sided = jnp.any(scene.normals != 0, axis=-1)
+    share = jnp.where(one_sided, jnp.clip(0.5 + cosine / 0.3, 0.0, 1.0), 1.0)
+    still = jnp.ones((len(eyes), scene.gaussians.num - scene.num_moving), share.dtype)
+    return jax.lax.stop_gradient(jnp.concatenate([share, still], axis=1))

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float
 
-from gsjax.geometry.cameras import project
+from gsjax.geometry.cameras import camera_centers
 from gsjax.losses.photometric import weighted_mean
 from gsjax.methods.object_tracker.config import RefineConfig
-from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
+from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import render
 
@@ -39,7 +39,8 @@ def refine_loss(
     scene, frame = batch.scene, batch.frame
     groups = scene.labels[: scene.num_moving]
     pose = move(batch.pose, motion, batch.centers, groups)
-    rendered = render(place(scene, pose), frame.cameras, batch.plan, roi=batch.roi)
+    visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat))
+    rendered = render(place(scene, pose), frame.cameras, batch.plan, roi=batch.roi, visibility=visibility)
     weights = jax.lax.stop_gradient(rendered.alphas) * batch.roi
     if frame.weights is not None:
         weights = weights * frame.weights
@@ -95,68 +96,3 @@ def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Mo
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
     info = {name: values[-1] for name, values in infos.items()}
     return motion, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}
-
-
-def region_of_interest(positions: list[Float[Array, "m 3"]], frame: Frame) -> Bool[Array, "c height width"]:
-    """Pixels of all tiles that hold or border on a moving Gaussian, in any of the given poses."""
-    width, height = frame.cameras.width, frame.cameras.height
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    points = jnp.concatenate(positions)
-
-    def one(viewmat, K):
-        pixels, depth = project(points, viewmat, K)
-        tile = jnp.floor(pixels / TILE)
-        inside = (depth > 1e-3) & (tile >= -1).all(-1) & (tile[:, 0] <= columns) & (tile[:, 1] <= rows)
-        column, row = jnp.clip(tile, -1, jnp.array([columns, rows])).astype(jnp.int32).T
-        touched = jnp.zeros((rows + 2, columns + 2), bool).at[row + 1, column + 1].max(inside)
-        near = jax.lax.reduce_window(touched, False, jnp.logical_or, (3, 3), (1, 1), "SAME")[1:-1, 1:-1]
-        return jnp.repeat(jnp.repeat(near, TILE, axis=0), TILE, axis=1)[:height, :width]
-
-    return jax.vmap(one)(frame.cameras.viewmat, frame.cameras.K)
-
-
-def point_residuals(
-    colors: Float[Array, "m 3"],
-    means: Float[Array, "m 3"],
-    seen: Float[Array, "c m"],
-    scene: TrackedScene,
-    frame: Frame,
-    config: RefineConfig,
-) -> Float[Array, "k"]:
-    """How badly Gaussians at `means` agree with the pixels they fall on, a group; 0 is perfect, 1 is truncated.
-
-    A cheap stand-in for rendering, to choose between hypotheses: colour and depth at each centre, both
-    truncated, averaged over the Gaussians that were seen. Falling outside the picture counts as a half.
-    """
-    height, width = frame.images.shape[1:3]
-
-    def one(viewmat, K, image, depth, weight):
-        pixels, z = project(means, viewmat, K)
-        inside = (
-            (pixels > 0.5).all(-1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5) & (z > 1e-3)
-        )
-        where = jnp.where(inside[:, None], pixels - 0.5, 0.0)
-        value = _bilinear(image, where)
-        residual = jnp.minimum(jnp.abs(value - colors).mean(-1), config.color_limit) / config.color_limit
-        if depth is not None:
-            column, row = jnp.round(where).astype(jnp.int32).T
-            measured = depth[row, column]
-            gap = jnp.minimum(jnp.abs(measured - z), config.depth_limit) / config.depth_limit
-            residual = jnp.where(measured > 0, 0.5 * (residual + gap), residual)
-        return jnp.where(inside, residual, 0.5) * weight, weight
-
-    depth_axis = None if frame.depths is None else 0
-    views = (frame.cameras.viewmat, frame.cameras.K, frame.images, frame.depths, seen)
-    residual, weight = jax.vmap(one, in_axes=(0, 0, 0, depth_axis, 0))(*views)
-    groups = scene.labels[: scene.num_moving] - 1
-    total = jax.ops.segment_sum(residual.sum(0), groups, scene.num_objects)
-    count = jax.ops.segment_sum(weight.sum(0), groups, scene.num_objects)
-    return total / jnp.maximum(count, 1e-6)
-
-
-def _bilinear(image: Float[Array, "h w 3"], where: Float[Array, "m 2"]) -> Float[Array, "m 3"]:
-    coordinates = [where[:, 1], where[:, 0]]
-    sample = jax.vmap(
-        lambda a: jax.scipy.ndimage.map_coordinates(a, coordinates, order=1, mode="nearest"), -1, -1
-    )
-    return sample(image)

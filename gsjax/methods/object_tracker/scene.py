@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.neighbors import voxel_thin
+from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.object_tracker.config import StartConfig
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
@@ -19,12 +21,14 @@ class TrackedScene(eqx.Module):
 
     Attributes:
         gaussians: the scene at the first frame.
+        normals: outward normals of the moving ones in their own axes; zero where both sides can be seen.
         labels: group of each Gaussian: 0 is the background, 1..K the objects in the order of `label_ids`.
         label_ids: the mask value that each group came from, background first (static).
         num_moving: how many Gaussians, from the front, belong to objects (static).
     """
 
     gaussians: Gaussians
+    normals: Float[Array, "m 3"]
     labels: Int[Array, "n"]
     label_ids: tuple[int, ...] = eqx.field(static=True)
     num_moving: int = eqx.field(static=True)
@@ -41,6 +45,7 @@ class Cloud(NamedTuple):
     colors: Float[np.ndarray, "n 3"]
     labels: Int[np.ndarray, "n"]
     footprints: Float[np.ndarray, "n"]  # width of a pixel at the point, as its camera saw it, metres
+    eyes: Float[np.ndarray, "n 3"]  # where that camera stood
 
 
 def labelled_cloud(
@@ -68,7 +73,9 @@ def labelled_cloud(
     view = (depths[mask_camera], viewmats[mask_camera], Ks[mask_camera])
     labels = lift_labels(points, mask, *view, max_depth_gap=config.depth_gap)
     labels = inherit_labels(points, labels, max_distance=config.label_distance)
-    return Cloud(points, colors, labels, np.concatenate(footprints))
+    counts = [len(footprint) for footprint in footprints]
+    eyes = np.repeat(np.asarray(camera_centers(jnp.asarray(viewmats))), counts, axis=0)
+    return Cloud(points, colors, labels, np.concatenate(footprints), eyes)
 
 
 def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
@@ -85,7 +92,7 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
 
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
     """Thin the cloud, objects finely and the background coarsely, and make each point a disc on its surface."""
-    parts, labels, label_ids = [], [], [0]
+    parts, labels, towards, label_ids = [], [], [], [0]
     for value in [*sorted(set(np.unique(cloud.labels)) - {0}), 0]:
         chosen = cloud.labels == value
         if not chosen.any():
@@ -95,23 +102,41 @@ def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
         if value:
             label_ids.append(int(value))
         parts.append(part)
+        towards.append(cloud.eyes[kept] - cloud.points[kept])
         labels.append(np.full(part.num, len(label_ids) - 1 if value else 0))
-    return assemble(parts, labels, tuple(label_ids))
+    return assemble(parts, labels, tuple(label_ids), towards)
 
 
-def assemble(parts: list[Gaussians], labels: list[np.ndarray], label_ids: tuple[int, ...]) -> TrackedScene:
+def assemble(
+    parts: list[Gaussians],
+    labels: list[np.ndarray],
+    label_ids: tuple[int, ...],
+    towards: list[np.ndarray] | None = None,
+) -> TrackedScene:
     """A scene from Gaussians and their groups, sorted so that what can move comes first.
+
+    Args:
+        parts, labels: Gaussians, and the group (0 to K) of each.
+        label_ids: the mask value of each group.
+        towards: for discs, a direction on the side they were seen from; None: seen from both sides.
 
     Raises:
         ValueError: all of it is background.
     """
     gaussians, group = concatenate(parts), np.concatenate(labels)
-    order = np.argsort(group == 0, kind="stable")
     if len(label_ids) == 1:
         raise ValueError("no object to track: the mask labels nothing, or nothing that has depth")
+    order = np.argsort(group == 0, kind="stable")
+    num_moving = int((group != 0).sum())
+    normals = np.zeros((num_moving, 3), np.float32)
+    if towards is not None:
+        axes = np.asarray(quats_to_matrices(gaussians.quats))[:, :, 2]
+        side = np.sign(np.sum(axes * np.concatenate(towards), axis=1))
+        normals[:, 2] = side[order][:num_moving]
     return TrackedScene(
         gaussians=take(gaussians, order),
+        normals=jnp.asarray(normals),
         labels=jnp.asarray(group[order], jnp.int32),
         label_ids=label_ids,
-        num_moving=int((group != 0).sum()),
+        num_moving=num_moving,
     )

@@ -11,13 +11,12 @@ import numpy as np
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene, labelled_cloud, scene_from_cloud
-from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker
+from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker, plan_tracker
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import plan_render
 
 
 class Tracked(NamedTuple):
@@ -37,7 +36,7 @@ class Tracked(NamedTuple):
     info: dict[str, Any]
     seconds: float
     compile_seconds: float
-    plan: Plan
+    plan: TrackerPlan
 
     def gaussians(self, scene: TrackedScene) -> Gaussians:
         """The whole scene as it stands now."""
@@ -63,11 +62,13 @@ def start_scene(
 
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
-    return object_tracker(config, num_objects, reduction).update(pose, state, batch, step=step, key=None)
+    tracker = object_tracker(config, num_objects, state.frame, reduction)
+    return tracker.update(pose, state, batch, step=step, key=None)
 
 
 def track(
     scene: TrackedScene,
+    first: Frame,
     frames: Iterable[Frame],
     config: TrackerConfig = TrackerConfig(),
     *,
@@ -86,13 +87,13 @@ def track(
         pose, state: where to go on from; the first frame unless given.
     """
     pose = first_pose(scene) if pose is None else pose
-    step = object_tracker(config, scene.num_objects)
+    step = object_tracker(config, scene.num_objects, first)
     state = step.init(pose) if state is None else state
-    plan: Plan | None = None
-    compiled: dict[Plan, Any] = {}
+    plan: TrackerPlan | None = None
+    compiled: dict[TrackerPlan, Any] = {}
     for index, frame in enumerate(frames):
         if plan is None:
-            plan = plan_render(place(scene, pose), frame.cameras, headroom=config.headroom)
+            plan = plan_tracker(scene, pose, frame, config.headroom)
             reduction = _reduction(scene, frame, config)
         jax.block_until_ready(frame)
         seconds = compile_seconds = 0.0
@@ -110,7 +111,7 @@ def track(
             info = result[2]
             if not bool(info["overflow"]):
                 break
-            plan = plan.grown(int(info["needed"]), config.headroom)
+            plan = plan.grown(info["needed"], config.headroom)
         pose, state, info = result
         yield Tracked(pose, state, info, seconds, compile_seconds, plan)
 

@@ -1,0 +1,110 @@
+"""Only what may change is refined: the tiles that moving Gaussians touch, and the background that touches those."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.geometry.cameras import project
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.rasterize.plan import TILE, Plan, rung
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import take
+from gsjax.scene.render import Rendered
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class TrackerPlan:
+    """Static capacities of a tracker's step.
+
+    Attributes:
+        full: for rendering the whole scene.
+        near: for rendering what lies in the region of interest.
+        num_near: background Gaussians that may lie there.
+    """
+
+    full: Plan
+    near: Plan
+    num_near: int
+
+    def grown(self, needed: "Needed", headroom: float) -> "TrackerPlan":
+        """The same with every capacity on the lowest rung that holds what was needed."""
+        return TrackerPlan(
+            self.full.grown(int(needed.full), headroom),
+            self.near.grown(int(needed.near), headroom),
+            max(self.num_near, rung(int(needed.num_near) * headroom)),
+        )
+
+
+class Needed(NamedTuple):
+    """What a step needed of each capacity."""
+
+    full: Int[Array, ""]
+    near: Int[Array, ""]
+    num_near: Int[Array, ""]
+
+    def exceeds(self, plan: TrackerPlan) -> Bool[Array, ""]:
+        """Whether any capacity was too small."""
+        num_near = self.num_near > plan.num_near
+        return (self.full > plan.full.capacity) | (self.near > plan.near.capacity) | num_near
+
+
+def touched_tiles(positions: list[Float[Array, "m 3"]], frame: Frame) -> Bool[Array, "c rows columns"]:
+    """All tiles that hold, or border on, a moving Gaussian in any of the given positions."""
+    columns, rows = -(-frame.cameras.width // TILE), -(-frame.cameras.height // TILE)
+    points = jnp.concatenate(positions)
+
+    def one(viewmat, K):
+        pixels, depth = project(points, viewmat, K)
+        tile = jnp.floor(pixels / TILE)
+        limit = jnp.array([columns, rows])
+        inside = (depth > 1e-3) & (tile >= -1).all(-1) & (tile <= limit).all(-1)
+        column, row = jnp.clip(tile, -1, limit).astype(jnp.int32).T
+        touched = jnp.zeros((rows + 2, columns + 2), bool).at[row + 1, column + 1].max(inside)
+        return jax.lax.reduce_window(touched, False, jnp.logical_or, (3, 3), (1, 1), "SAME")[1:-1, 1:-1]
+
+    return jax.vmap(one)(frame.cameras.viewmat, frame.cameras.K)
+
+
+def tiles_to_pixels(tiles: Bool[Array, "c rows columns"], frame: Frame) -> Bool[Array, "c height width"]:
+    """The pixels of the chosen tiles."""
+    pixels = jnp.repeat(jnp.repeat(tiles, TILE, axis=1), TILE, axis=2)
+    return pixels[:, : frame.cameras.height, : frame.cameras.width]
+
+
+def near_background(
+    scene: TrackedScene, rendered: Rendered, tiles: Bool[Array, "c rows columns"]
+) -> Bool[Array, "background"]:
+    """Which background Gaussians reach a chosen tile in some camera: their box holds one, by summed areas."""
+    rows, columns = tiles.shape[1:]
+    still = scene.num_moving
+
+    def one(mean, radius, tiles):
+        area = jnp.pad(jnp.cumsum(jnp.cumsum(tiles.astype(jnp.int32), axis=0), axis=1), ((1, 0), (1, 0)))
+        limit = jnp.array([columns, rows])
+        low = jnp.clip(jnp.floor((mean - radius) / TILE), 0, limit).astype(jnp.int32)
+        high = jnp.clip(jnp.floor((mean + radius) / TILE) + 1, 0, limit).astype(jnp.int32)
+        high = jnp.maximum(high, low)
+        (x0, y0), (x1, y1) = low.T, high.T
+        count = area[y1, x1] - area[y0, x1] - area[y1, x0] + area[y0, x0]
+        return (count > 0) & (radius > 0).all(-1)
+
+    means, radii = rendered.meta.means2d[:, still:], rendered.meta.radii[:, still:]
+    return jax.vmap(one)(means, radii, tiles).any(0)
+
+
+def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: int) -> TrackedScene:
+    """The moving Gaussians and the chosen background: `num_near` rows, those left over invisible."""
+    rows = jnp.nonzero(near, size=num_near, fill_value=0)[0] + scene.num_moving
+    empty = jnp.arange(num_near) >= near.sum()
+    background = take(scene.gaussians, rows)
+    faint = jnp.where(empty, -30.0, background.logit_opacities)
+    background = eqx.tree_at(lambda g: g.logit_opacities, background, faint)
+    moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
+    gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moving, background)
+    labels = jnp.concatenate([scene.labels[: scene.num_moving], jnp.zeros(num_near, jnp.int32)])
+    return TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
