@@ -111,8 +111,10 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     """Print objects, cameras, the rate and where the report is, to stdout."""
     console = Console(highlight=False)
     console.print()
-    console.print(_grid(tuple(c for c in OBJECT_COLUMNS if c.key != "gaussians"), object_rows(found)))
-    console.print(_grid(CAMERA_COLUMNS, camera_rows(found)))
+    narrow = tuple(column for column in OBJECT_COLUMNS if column.key != "gaussians")
+    for columns, rows in ((narrow, object_rows(found)), (CAMERA_COLUMNS, camera_rows(found))):
+        if rows:
+            console.print(_grid(columns, rows))
     frames, rate = found["frames"], found["update_hz"]
     speed = f"{rate:.2f} Hz ({found['update_ms']['median']:.0f} ms an update)" if rate else "no updates"
     part = "" if found["complete"] else " [bold yellow](partial run)[/]"
@@ -152,8 +154,8 @@ def write_run_report(
         plots=[Media(path, text) for path, text in plots],
         images=[Media(first_mask, caption)] if first_mask else [],
         tables=[
-            _table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
-            _table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
+            *_table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
+            *_table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
             _time_table(found["seconds"]),
         ],
         notes=[*found["notes"], _machine_note(found["machine"])],
@@ -197,16 +199,14 @@ def _headline(found: dict[str, Any]) -> dict[str, Any]:
     return cards | {"Gaussians": found["gaussians"]["all"], "Frames": found["frames"]["tracked"]}
 
 
-def _table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> Table:
+def _table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> list[Table]:
+    """The table with the columns in which something stands; none if there are no rows."""
+    if not rows:
+        return []
     shown = _shown(columns, rows)
-    return Table(
-        title,
-        [c.head for c in shown],
-        [[row[c.key] for c in shown] for row in rows],
-        [c.unit for c in shown],
-        note,
-        [c.decimals for c in shown],
-    )
+    cells = [[row[c.key] for c in shown] for row in rows]
+    heads, units = [c.head for c in shown], [c.unit for c in shown]
+    return [Table(title, heads, cells, units, note, [c.decimals for c in shown])]
 
 
 def _time_table(seconds: dict[str, float]) -> Table:

@@ -1,0 +1,35 @@
+"""The README's programs run as they stand there."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from gsjax.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def programs() -> list[str]:
+    return re.findall(
+        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+
+
+def test_it_fits_one_screen_and_its_picture_is_there():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 80
+    assert len(programs()) == 2
+    for program in programs():
+        compile(program, "README.md", "exec")
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", text):
+        assert 0 < (ROOT / picture).stat().st_size < 400_000
+
+
+@pytest.mark.slow
+def test_its_programs_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    quick = ("--frames", "0", "--tracker.start.iterations", "1")
+    assert main(["track", "simulated:tabletop", "--cameras", "0", "--out", "runs/demo", *quick]) == 0
+    for program in programs():
+        exec(compile(program, "README.md", "exec"), {})
