@@ -9,6 +9,7 @@ from importlib import import_module
 from rich.console import Console
 from rich.text import Text
 
+from gsjax.cli.interrupts import heard_interrupts
 from gsjax.data.errors import DataWarning
 
 # ValueError covers DataError and PlyError, and whatever an argument is checked for.
@@ -37,7 +38,8 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
             config=(tyro.conf.FlagCreatePairsOff,),
         )
         debug = options.debug
-        return chosen.run(options)
+        with heard_interrupts():
+            return chosen.run(options)
     except KeyboardInterrupt:
         say_error("stopped by Ctrl-C before there was anything to keep", word="stopped")
         return 130

@@ -1,0 +1,52 @@
+"""Ctrl-C that is not lost.
+
+Python raises KeyboardInterrupt wherever it happens to be. In a callback of the garbage collector (JAX has
+one) or in a finalizer the exception is printed and dropped, and the program goes on as if nobody had asked.
+"""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+DEAF = frozenset({"_xla_gc_callback", "__del__"})
+"""Functions in which exceptions are dropped."""
+RETRY_S = 0.01
+
+
+def is_deaf(frame: FrameType | None) -> bool:
+    """Whether an exception raised in `frame` would be dropped."""
+    while frame is not None:
+        if frame.f_code.co_name in DEAF:
+            return True
+        frame = frame.f_back
+    return False
+
+
+@contextmanager
+def heard_interrupts() -> Iterator[None]:
+    """While the block runs, Ctrl-C raises KeyboardInterrupt where it will be heard, if a little later.
+
+    Where SIGINT is ignored or handled by somebody else, or there are no timers, nothing changes.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    usual = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not usual or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if is_deaf(frame):
+            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+        else:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGALRM, before)
