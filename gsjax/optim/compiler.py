@@ -1,4 +1,4 @@
-"""Compiler options for the outermost jit of a host loop. Public functions carry none: inside another trace they raise."""
+"""Compiler options, for the outermost jit of a host loop only: inside another trace they raise."""
 
 from functools import cache
 from pathlib import Path

@@ -64,7 +64,7 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 
 
 def per_field_adam(rates: dict[str, Any], default: float = 0.0) -> optax.GradientTransformation:
-    """Adam (eps 1e-15, as 3DGS uses it) with one learning rate a field of a module; fields without one stand still."""
+    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module; the others stand still."""
 
     def label(params):
         def of(path, _):

@@ -1,11 +1,13 @@
-"""The object-aware tracker (papers/000): objects followed at the rate of a camera, from one view's first mask.
+"""The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
-Read the files as the data flows: config, scene, (shapes,) fit, matching, motion, refine, tracker, tracking.
+Read the files as the data flows: config, scene, fit, shapes, motion, matching, align, region, refine,
+tracker, tracking.
 """
 
 from gsjax.methods.object_tracker.config import MatchConfig, RefineConfig, StartConfig, TrackerConfig
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.methods.object_tracker.shapes import scene_from_shapes
 from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker, render_labels
 from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
 
@@ -23,6 +25,7 @@ __all__ = [
     "object_tracker",
     "place",
     "render_labels",
+    "scene_from_shapes",
     "start_scene",
     "track",
 ]

@@ -36,11 +36,12 @@ class Points(NamedTuple):
 
 def join(a: Points, b: Points) -> Points:
     """The points of both."""
-    return Points(*(jnp.concatenate([x, y], axis=-1 if x is a.seen else 0) for x, y in zip(a, b, strict=True)))
+    seen = jnp.concatenate([a.seen, b.seen], axis=-1)
+    return Points(*(jnp.concatenate([x, y]) for x, y in zip(a[:3], b[:3], strict=True)), seen)
 
 
 def sample_groups(points: Points, num_groups: int, per_group: int) -> Points:
-    """Up to `per_group` points of each group, spread over it; a large group needs no more of them than a small one."""
+    """Up to `per_group` points of each group, spread over it: a large group needs no more than a small one."""
     shuffle = 1.0 + jax.random.permutation(jax.random.key(1), points.groups.shape[0]).astype(jnp.float32)
     size = min(per_group, points.groups.shape[0])
 
@@ -53,14 +54,19 @@ def sample_groups(points: Points, num_groups: int, per_group: int) -> Points:
 
 
 def pixels_of_groups(
-    frame: Frame, labels: Int[Array, "c h w"], depths: Float[Array, "c h w"], num_groups: int, config: AlignConfig
+    frame: Frame,
+    labels: Int[Array, "c h w"],
+    depths: Float[Array, "c h w"],
+    num_groups: int,
+    config: AlignConfig,
 ) -> Points:
     """Up to `config.pixels` pixels of each group in each camera, as points.
 
     Args:
-        frame: a frame with depth.
+        frame: what the cameras saw; without depth, the model's depth stands in.
         labels: the group of each pixel, 0 for none.
-        depths: of the model at that pixel. What is measured further from it than a group is thick is something else.
+        depths: of the model at that pixel. What is measured further off
+            than a group is thick is something else.
     """
     height, width = labels.shape[1:]
     grid = pixel_grid(width, height).reshape(-1, 2)
@@ -69,7 +75,7 @@ def pixels_of_groups(
     num_cameras = labels.shape[0]
 
     def one(camera, group):
-        measured = frame.depths[camera].ravel()
+        measured = (depths if frame.depths is None else frame.depths)[camera].ravel()
         near = jnp.abs(measured - depths[camera].ravel()) < config.max_thickness
         chosen = (labels[camera].ravel() == group) & (measured > 0) & near
         priority, rows = jax.lax.top_k(jnp.where(chosen, 1.0 + shuffle, 0.0), config.pixels)
@@ -82,7 +88,10 @@ def pixels_of_groups(
     cameras, groups = jnp.meshgrid(jnp.arange(num_cameras), jnp.arange(1, num_groups + 1), indexing="ij")
     means, colors, groups, seen = jax.vmap(one)(cameras.ravel(), groups.ravel())
     return Points(
-        means.reshape(-1, 3), colors.reshape(-1, 3), groups.ravel(), jnp.moveaxis(seen, 1, 0).reshape(num_cameras, -1)
+        means.reshape(-1, 3),
+        colors.reshape(-1, 3),
+        groups.ravel(),
+        jnp.moveaxis(seen, 1, 0).reshape(num_cameras, -1),
     )
 
 
@@ -135,9 +144,7 @@ def align(
         frame: what the cameras see now.
         widen: factor on the scales of the residuals; wider listens to more of what disagrees.
     """
-    config = replace(
-        config, color_scale=widen * config.color_scale, depth_scale=widen * config.depth_scale
-    )
+    config = replace(config, color_scale=widen * config.color_scale, depth_scale=widen * config.depth_scale)
     member = points.groups - 1
     num_groups = centers.shape[0]
 
@@ -200,7 +207,7 @@ def _compose(change: Float[Array, "k 6"], twists: Float[Array, "k 6"]) -> Float[
 def disagreement(
     points: Points, means: Float[Array, "p 3"], num_groups: int, frame: Frame, config: AlignConfig
 ) -> Float[Array, "k"]:
-    """How badly each group's points agree with the images when they stand at `means`: 0 perfect, 1 not at all."""
+    """How badly each group's points at `means` agree with the images: 0 perfect, 1 not at all."""
 
     def one(mean, color, weight, viewmat, K, image, depth):
         r, counts = _residual(jnp.zeros(6), mean, mean, color, viewmat, K, image, depth, config)

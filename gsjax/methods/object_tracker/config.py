@@ -12,7 +12,7 @@ class StartConfig:
     background_pixels: float = 4.0
     """The same for the background, which is only looked at."""
     label_distance: float = 0.02
-    """A point unseen by the mask's camera takes the label of its nearest labelled point up to here, metres."""
+    """A point unseen by the mask's camera takes its nearest labelled point's label up to here, metres."""
     depth_gap: float = 0.015
     """How far a point's depth may be from the depth image and still be what the image shows, metres."""
     iterations: int = 150
@@ -63,13 +63,13 @@ class AlignConfig:
 class RefineConfig:
     """Photometric refinement of the group displacements D_k and the individual ones delta_i."""
 
-    iterations: int = 20
+    iterations: int = 10
     """Adam iterations a frame."""
-    translation_rate: float = 1.5e-3
+    translation_rate: float = 7e-4
     """Learning rate of D_k's translation, metres."""
-    rotation_rate: float = 2e-2
+    rotation_rate: float = 1e-2
     """Learning rate of D_k's rotation, radians."""
-    delta_rate: float = 1e-4
+    delta_rate: float = 0.0
     """Learning rate of delta_i, metres; 0 keeps groups rigid."""
     delta_weight: float = 20.0
     """Weight of the mean |delta_i|^2 of a group, in units of delta_scale^2."""
@@ -87,7 +87,7 @@ class RefineConfig:
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """The object-aware tracker (papers/000), stage by stage."""
+    """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation), stage by stage."""
 
     start: StartConfig = field(default_factory=StartConfig)
     match: MatchConfig = field(default_factory=MatchConfig)

@@ -1,9 +1,10 @@
-"""Object-centric initialisation: find each object's template in the new image, and lift it to 3D (section II-B).
+"""Object-centric initialisation (section II-B): find each object's template in the image, and lift it to 3D.
 
 The template is the last scene as rendered, masked by the object's visible alpha. The score is the zero-mean
 normalised cross-correlation under that mask, over all shifts at once by FFT:
 
-    score(d) = sum_p m T'(p) I(p+d) / sqrt( sum_p m T'(p)^2  (sum_p m I(p+d)^2 - (sum_p m I(p+d))^2 / sum_p m) )
+    score(d) = sum_p m T'(p) I(p+d) / sqrt(sum_p m T'(p)^2  V(d)),
+    V(d) = sum_p m I(p+d)^2 - (sum_p m I(p+d))^2 / sum_p m,
 
 with T' = T minus its mean under m, sums over channels as well.
 """

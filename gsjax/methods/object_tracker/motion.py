@@ -1,4 +1,4 @@
-"""x_t = D_k x_{t-1} + delta_i: how groups and their members move (papers/000, section II-C)."""
+"""x_t = D_k x_{t-1} + delta_i: how groups and their members move (section II-C)."""
 
 import equinox as eqx
 import jax
@@ -42,7 +42,10 @@ def group_means(
 
 
 def turn_about(
-    means: Float[Array, "m 3"], twists: Float[Array, "k 6"], centers: Float[Array, "k 3"], groups: Int[Array, "m"]
+    means: Float[Array, "m 3"],
+    twists: Float[Array, "k 6"],
+    centers: Float[Array, "k 3"],
+    groups: Int[Array, "m"],
 ) -> Float[Array, "m 3"]:
     """Each group's means after its twist (translation, rotation vector) about its centre."""
     member = groups - 1

@@ -1,4 +1,4 @@
-"""Photometric refinement of D_k and delta_i against the new images (papers/000, section II-C)."""
+"""Photometric refinement of D_k and delta_i against the new images (section II-C)."""
 
 from typing import Any, NamedTuple
 

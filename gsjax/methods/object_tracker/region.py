@@ -1,4 +1,4 @@
-"""Only what may change is refined: the tiles that moving Gaussians touch, and the background that touches those."""
+"""Only what may change is refined: tiles that moving Gaussians touch, and the background that reaches those."""
 
 import dataclasses
 from typing import NamedTuple

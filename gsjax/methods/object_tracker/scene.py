@@ -1,4 +1,4 @@
-"""The first frame: a dense labelled cloud of Gaussians from RGB-D cameras and one mask (papers/000, section II-A)."""
+"""The first frame (section II-A): a dense labelled cloud of Gaussians from RGB-D cameras and one mask."""
 
 from typing import NamedTuple
 
@@ -79,7 +79,7 @@ def labelled_cloud(
 
 
 def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
-    """Rows of the chosen points that are left when each voxel, `pixels` pixels wide, keeps one; octave by octave."""
+    """Rows of the chosen points that are left when each voxel, `pixels` pixels wide, keeps one."""
     rows = np.flatnonzero(chosen)
     octave = np.floor(np.log2(pixels * cloud.footprints[rows]))
     kept = [
@@ -91,7 +91,7 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
 
 
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
-    """Thin the cloud, objects finely and the background coarsely, and make each point a disc on its surface."""
+    """Thin the cloud, objects finely and the background coarsely; each point becomes a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
     for value in [*sorted(set(np.unique(cloud.labels)) - {0}), 0]:
         chosen = cloud.labels == value

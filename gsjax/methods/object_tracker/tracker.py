@@ -1,4 +1,4 @@
-"""The tracker's step: from S_{t-1} and the new images to S_t (papers/000, sections II-B and II-C)."""
+"""The tracker's step: from S_{t-1} and the new images to S_t (sections II-B and II-C of the paper)."""
 
 from typing import Any, NamedTuple
 
@@ -103,10 +103,12 @@ def _choose(residuals: Float[Array, "h k"], motions: Motion, groups: Int[Array, 
 
 def _turned(motion: Motion, angle: float) -> Motion:
     """The motion itself, and the same followed by a turn to either side about each axis: 7 hypotheses."""
-    turns = angle * jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3), -jnp.eye(3)]).astype(motion.rotations.dtype)
+    axes = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3), -jnp.eye(3)])
+    turns = angle * axes.astype(motion.rotations.dtype)
 
     def one(turn):
-        rotation = jaxlie.SO3.exp(jnp.broadcast_to(turn, motion.rotations.shape)) @ jaxlie.SO3.exp(motion.rotations)
+        turn = jnp.broadcast_to(turn, motion.rotations.shape)
+        rotation = jaxlie.SO3.exp(turn) @ jaxlie.SO3.exp(motion.rotations)
         return Motion(motion.translations, rotation.log(), motion.delta)
 
     return jax.vmap(one)(turns)
@@ -117,6 +119,7 @@ def _object_pixels(
 ) -> Points:
     """Pixels of the last frame that show an object, on sides too that the first frame did not see."""
     solid = render_labels(scene, pose, frame, plan.full)
+    assert solid.features is not None
     shown = jnp.where(solid.alphas > 0.5, jnp.argmax(solid.features, axis=-1), 0)
     return pixels_of_groups(frame, shown, solid.depths, scene.num_objects, config.align)
 
@@ -127,9 +130,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
     params: the `Pose` of the moving Gaussians. state: `TrackerState`. batch: `TrackerBatch`.
 
     A frame goes through: render the last scene with its labels; match each object's template in every camera
-    and lift the match to a translation; of standing still, going on as before and the match, take for each
-    object what agrees best with the images; refine D_k and delta_i photometrically; and keep the
-    refinement of an object only where it agrees better still. An object that no camera sees stays where it is.
+    and lift the match to a translation; from standing still, going on as before and the match, align
+    each object with the images and take what agrees best; refine D_k and delta_i photometrically; and keep
+    the refinement of an object only where it agrees better still. What no camera sees stays where it is.
 
     Args:
         config: see `TrackerConfig`.
@@ -147,6 +150,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         centers = group_means(params.means, groups, scene.num_objects)
 
         last = render_labels(scene, params, frame, plan.full, one_sided=True)
+        assert last.features is not None
         seen = seen_from(scene, params, last, frame, config.start.depth_gap)
         visible = group_means(seen.max(0), groups, scene.num_objects) > _MIN_SEEN
         match = match_templates(
@@ -162,7 +166,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         both = Motion(jumped.translations, going.rotations, start_delta)
         points = Points(params.means, _colors(scene), groups, seen)
         points = sample_groups(points, scene.num_objects, config.align.centers)
-        if config.align.pixels and frame.depths is not None:
+        if config.align.pixels:
             points = points._replace(seen=config.align.center_weight * points.seen)
             points = join(points, _object_pixels(scene, params, state.frame, plan, config))
 
@@ -189,8 +193,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         roi = tiles_to_pixels(tiles, frame)
         refine_batch = RefineBatch(around, frame, plan.near, params, centers, roi)
         refined, info = refine(begun, refine_batch, config.refine)
-        # Centres are a coarse judge: they overrule the rendered images only where these went astray.
-        verdict = jnp.stack([judge(refined) - 0.05, judge(begun)])
+        # Points know nothing of outlines, which rendered images do, so these are overruled only where they
+        # went clearly astray; without depth the points hardly know better at all.
+        lead = 0.1 if frame.depths is None else 0.01
+        verdict = jnp.stack([judge(refined) - lead, judge(begun)])
         kept = _choose(verdict, _stack([refined, begun]), groups)
         kept = _mask(kept, visible, groups)
 

@@ -44,7 +44,7 @@ class Tracked(NamedTuple):
 
 
 def start_scene(
-    frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackerConfig = TrackerConfig()
+    frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackerConfig | None = None
 ) -> TrackedScene:
     """A labelled, photometrically optimised scene from the first RGB-D frame and one camera's mask.
 
@@ -56,6 +56,7 @@ def start_scene(
     Raises:
         ValueError: there is no depth, or the mask does not fit the images.
     """
+    config = TrackerConfig() if config is None else config
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
@@ -70,7 +71,7 @@ def track(
     scene: TrackedScene,
     first: Frame,
     frames: Iterable[Frame],
-    config: TrackerConfig = TrackerConfig(),
+    config: TrackerConfig | None = None,
     *,
     pose: Pose | None = None,
     state: TrackerState | None = None,
@@ -82,10 +83,12 @@ def track(
 
     Args:
         scene: from `start_scene` or `scene_from_shapes`.
-        frames: in order of time; all of one size and number of cameras.
+        first: the frame that `scene` or `pose` shows.
+        frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackerConfig`.
         pose, state: where to go on from; the first frame unless given.
     """
+    config = TrackerConfig() if config is None else config
     pose = first_pose(scene) if pose is None else pose
     step = object_tracker(config, scene.num_objects, first)
     state = step.init(pose) if state is None else state
