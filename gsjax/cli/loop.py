@@ -27,6 +27,7 @@ class Tracking:
         poses: of the moving Gaussians in each frame, on the host.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, all together.
+        planning_s: seconds before the first update that went into its plan, and into compiling what plans.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
         plans: how many plans there were; more than one means that it had to plan again.
@@ -38,6 +39,7 @@ class Tracking:
     poses: list[Pose]
     update_s: list[float] = field(default_factory=lambda: [0.0])
     compile_s: float = 0.0
+    planning_s: float = 0.0
     loading_s: float = 0.0
     loop_s: float = 0.0
     plans: int = 0
@@ -94,6 +96,9 @@ def follow(
                 tracking.poses.append(jax.device_get(update.pose))
                 tracking.update_s.append(update.seconds)
                 tracking.compile_s += update.compile_seconds
+                if tracking.num_frames == 2:
+                    known = update.seconds + update.compile_seconds + frames.waited
+                    tracking.planning_s = max(0.0, perf_counter() - begun - known)
                 tracking.visible.append(np.asarray(update.info["visible"]))
                 plans.add(update.plan)
                 progress.update(task, advance=1, rate=_rate(tracking, update.info))

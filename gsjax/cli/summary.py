@@ -47,6 +47,7 @@ CAMERA_COLUMNS = (
 TIMES = (
     ("preparing", "opening the recording, the first mask; drawing it if simulated"),
     ("start", "from the first frame to a fitted scene, compiling included"),
+    ("planning", "loop: planning, before the first update"),
     ("compile", "loop: compiling the update, once a plan"),
     ("updates", "loop: updates, from images in memory to the new state"),
     ("loading", "loop: waiting for images"),

@@ -197,6 +197,7 @@ def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores:
 def _seconds(tracking: Tracking) -> dict[str, float]:
     """Where the time of the loop went."""
     parts = {
+        "planning": tracking.planning_s,
         "compile": tracking.compile_s,
         "updates": sum(tracking.update_s),
         "loading": tracking.loading_s,

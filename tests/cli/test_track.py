@@ -85,7 +85,7 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     for scored in found["cameras"].values():
         assert all(scored[name] is not None for name in ("psnr", "ssim", "depth_error_mm", "psnr_robot"))
     seconds = found["seconds"]
-    parts = sum(seconds[name] for name in ("compile", "updates", "loading", "loop_rest"))
+    parts = sum(seconds[name] for name in ("planning", "compile", "updates", "loading", "loop_rest"))
     assert parts == pytest.approx(seconds["loop_wall"])
     assert seconds["updates"] == pytest.approx(saved["update_s"].sum())
     assert seconds["loop_rest"] < 0.1 * seconds["loop_wall"]
