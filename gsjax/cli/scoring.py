@@ -132,6 +132,7 @@ def metrics(
             "label": label,
             "gaussians": _count_gaussians(tracking, values, label),
             "mask_pixels": _pixels(mask, tracking, values, label),
+            "travelled_mm": _travelled_mm(tracking, values, label),
             **_motion_metrics(motion.get(label)),
         }
         for label, name in names.items()
@@ -190,9 +191,23 @@ def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]
     return means
 
 
-def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) -> int:
+def _members(tracking: Tracking, values: np.ndarray | None, label: int) -> np.ndarray:
+    """Which Gaussians the tracker takes for the object."""
     ids = np.asarray(tracking.scene.label_ids) if values is None else values
-    return int(np.isin(np.asarray(tracking.scene.labels), np.flatnonzero(ids == label)).sum())
+    return np.isin(np.asarray(tracking.scene.labels), np.flatnonzero(ids == label))
+
+
+def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) -> int:
+    return int(_members(tracking, values, label).sum())
+
+
+def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> float | None:
+    """How far the tracker moved the object's centroid from where it was first, at most."""
+    members = _members(tracking, values, label)[: tracking.scene.num_moving]
+    if not members.any():
+        return None
+    centroids = np.stack([pose.means[members].mean(axis=0) for pose in tracking.poses])
+    return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
 
 
 def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:

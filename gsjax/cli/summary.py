@@ -29,6 +29,7 @@ OBJECT_COLUMNS = (
     Column("median", "median_point_error_mm", "mm", 2),
     Column("moved", "moved_mm", "mm", 1),
     Column("turned", "turned_deg", "°", 1),
+    Column("travelled", "travelled_mm", "mm", 1),
     Column("IoU", "iou", "", 3),
     Column("IoU held out", "iou_held_out", "", 3),
     Column("mask", "mask_pixels", "pixels"),
@@ -112,7 +113,9 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     """Print objects, cameras, the rate and where the report is, to stdout."""
     console = Console(highlight=False)
     console.print()
-    narrow = tuple(column for column in OBJECT_COLUMNS if column.key != "gaussians")
+    scored = any(row["moved_mm"] is not None for row in object_rows(found))
+    left_out = {"gaussians", "travelled_mm"} if scored else {"gaussians"}
+    narrow = tuple(column for column in OBJECT_COLUMNS if column.key not in left_out)
     for columns, rows in ((narrow, object_rows(found)), (CAMERA_COLUMNS, camera_rows(found))):
         if rows:
             console.print(_grid(columns, rows))
@@ -165,7 +168,8 @@ def write_run_report(
 
 _OBJECT_NOTE = (
     "Errors are means over frames and Gaussians, against where the true motion would have carried each. IoU "
-    "pools pixels over frames and cameras. Pixels are those of the first mask."
+    "pools pixels over frames and cameras. 'Moved' is the truth's, 'travelled' the tracker's. "
+    "Pixels are those of the first mask."
 )
 _CAMERA_NOTE = (
     "PSNR and SSIM are over whole pictures, black where the scene has nothing; 'drawn' is the part that it "
