@@ -1,0 +1,151 @@
+"""A scene and cameras to images: the same as the public rasterizer called by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.scene.gaussians import gaussians_from_activated
+from gsjax.scene.render import plan_render, render, stack_cameras
+
+WIDTH, HEIGHT = 40, 28
+
+
+def make_scene(seed: int = 0, count: int = 30):
+    rng = np.random.default_rng(seed)
+    return gaussians_from_activated(
+        rng.uniform(-0.3, 0.3, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(0.02, 0.08, (count, 3)),
+        rng.uniform(0.2, 0.9, count),
+        rng.uniform(size=(count, 3)),
+    )
+
+
+def make_cameras(count: int = 2) -> Camera:
+    eyes = np.array([[1.0, 0.2, 0.4], [0.3, -1.0, 0.5], [-0.8, 0.6, 0.3]])[:count]
+    K = jnp.asarray(intrinsics(1.2 * WIDTH, WIDTH, HEIGHT), jnp.float32)
+    views = [jnp.asarray(look_at(eye, np.zeros(3)), jnp.float32) for eye in eyes]
+    return stack_cameras([Camera(view, K, WIDTH, HEIGHT) for view in views])
+
+
+def one_camera(cameras: Camera, c: int) -> Camera:
+    return Camera(cameras.viewmat[c : c + 1], cameras.K[c : c + 1], cameras.width, cameras.height)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return make_cameras()
+
+
+def test_cameras_are_stacked_along_a_first_axis(cameras):
+    assert cameras.viewmat.shape == (2, 4, 4)
+    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
+
+
+def test_it_is_the_rasterizer_on_activated_values(scene, cameras):
+    features = jnp.asarray(np.random.default_rng(1).normal(size=(scene.num, 5)), jnp.float32)
+    backgrounds = jnp.array([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]])
+    plan = plan_render(scene, cameras)
+    ours = render(scene, cameras, plan, features=features, backgrounds=backgrounds)
+    images, alphas, meta = gsjax.rasterization(
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        scene.sh,
+        cameras.viewmat,
+        cameras.K,
+        WIDTH,
+        HEIGHT,
+        sh_degree=0,
+        render_mode="RGB+ED",
+        features=features,
+        backgrounds=backgrounds,
+    )
+    np.testing.assert_allclose(ours.colors, images[..., :3], atol=1e-6)
+    np.testing.assert_allclose(ours.depths, images[..., 3], atol=1e-5)
+    np.testing.assert_allclose(ours.alphas, alphas[..., 0], atol=1e-6)
+    np.testing.assert_allclose(ours.features, meta.features, atol=1e-5)
+    assert ours.features.shape == (2, HEIGHT, WIDTH, 5)
+    assert float(ours.alphas.max()) > 0.5
+
+
+def test_the_scenes_own_features_are_taken_unless_others_are_given(scene, cameras):
+    assert render(scene, cameras).features is None
+    ones = jnp.ones((scene.num, 2))
+    own = eqx.tree_at(lambda g: g.features, scene, ones, is_leaf=lambda x: x is None)
+    drawn = render(own, cameras)
+    np.testing.assert_allclose(drawn.features[..., 0], drawn.alphas, atol=1e-5)
+    twice = render(own, cameras, features=2 * ones)
+    np.testing.assert_allclose(twice.features, 2 * drawn.features, atol=1e-5)
+
+
+def test_visibility_gives_each_camera_opacities_of_its_own(scene, cameras):
+    visibility = jnp.asarray(np.random.default_rng(2).uniform(size=(2, scene.num)), jnp.float32)
+    visibility = visibility.at[0, :10].set(0.0)
+    roi = jnp.ones((2, HEIGHT, WIDTH), bool)
+    backgrounds = jnp.array([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]])
+    plan = plan_render(scene, cameras)
+    together = render(scene, cameras, plan, visibility=visibility, roi=roi, backgrounds=backgrounds)
+    for c in range(2):
+        logits = jax.scipy.special.logit(scene.opacities * visibility[c])
+        own = eqx.tree_at(lambda g: g.logit_opacities, scene, logits)
+        alone = render(own, one_camera(cameras, c), plan, backgrounds=backgrounds[c : c + 1])
+        np.testing.assert_allclose(together.colors[c], alone.colors[0], atol=2e-6)
+        expected = alone.depths[0] * alone.alphas[0]  # not over alpha: rounding grows where that is small
+        np.testing.assert_allclose(together.depths[c] * together.alphas[c], expected, atol=3e-6)
+        np.testing.assert_allclose(together.alphas[c], alone.alphas[0], atol=2e-6)
+
+
+def test_full_visibility_changes_nothing(scene, cameras):
+    plan = plan_render(scene, cameras)
+    plain, factored = render(scene, cameras, plan), render(scene, cameras, plan, visibility=jnp.ones((2, 30)))
+    np.testing.assert_allclose(factored.colors, plain.colors, atol=1e-6)
+    np.testing.assert_array_equal(factored.meta.radii, plain.meta.radii)
+    assert factored.meta.overflow.shape == plain.meta.overflow.shape
+
+
+def test_gradients_reach_the_scene_the_cameras_and_the_visibility(scene, cameras):
+    plan = plan_render(scene, cameras)
+
+    def loss(scene, viewmat, visibility):
+        views = Camera(viewmat, cameras.K, WIDTH, HEIGHT)
+        drawn = render(scene, views, plan, visibility=visibility)
+        return drawn.colors.sum() + 0.1 * drawn.depths.sum()
+
+    visibility = jnp.full((2, scene.num), 0.8)
+    gradients = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(scene, cameras.viewmat, visibility)
+    for gradient in jax.tree.leaves(gradients):
+        assert jnp.isfinite(gradient).all()
+        assert jnp.abs(gradient).max() > 0
+
+
+def test_a_region_of_interest_leaves_the_rest_alone(scene, cameras):
+    roi = jnp.zeros((2, HEIGHT, WIDTH), bool).at[:, :16, :16].set(True)
+    plan = plan_render(scene, cameras)
+    whole, part = render(scene, cameras, plan), render(scene, cameras, plan, roi=roi)
+    np.testing.assert_allclose(part.colors[:, :16, :16], whole.colors[:, :16, :16], atol=1e-6)
+    assert float(jnp.abs(part.alphas[:, 16:, 16:]).max()) == 0
+
+
+def test_a_plan_holds_its_scene_and_takes_options(scene, cameras):
+    plan = plan_render(scene, cameras, headroom=2.0, rasterize_mode="antialiased")
+    assert plan.rasterize_mode == "antialiased"
+    assert plan.render_mode == "RGB+ED"
+    drawn = render(scene, cameras, plan)
+    assert not drawn.meta.overflow.any()
+    assert int(drawn.meta.needed.max()) <= plan.capacity
+
+
+def test_under_a_trace_it_asks_for_a_plan(scene, cameras):
+    with pytest.raises(ValueError, match="plan"):
+        jax.jit(lambda g: render(g, cameras).colors)(scene)
