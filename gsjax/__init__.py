@@ -1,24 +1,55 @@
 """gsjax: moving scenes from 3D Gaussians, in pure JAX.
 
-    rasterize   rasterization, plan, Plan, composite_tile
-    scene       Gaussians, Tags, Camera, Frame, render, plan_render
-    data        open_sequence, Sequence
-    tracking    start_scene, track, object_tracker, TrackerConfig
-    files       read_ply, write_ply
+rasterize   rasterization, plan, Plan, composite_tile
+scene       Gaussians, Tags, Camera, Frame, render, plan_render
+data        open_sequence, Sequence
+tracking    start_scene, scene_from_shapes, track, object_tracker, TrackerConfig
+files       read_ply, write_ply
 """
 
-from gsjax.data import Sequence, open_sequence
-from gsjax.geometry.cameras import Camera
-from gsjax.io.ply import read_ply, write_ply
-from gsjax.methods.object_tracker import TrackerConfig, object_tracker, start_scene, track
-from gsjax.rasterize.compositing import composite_tile
-from gsjax.rasterize.plan import Plan
-from gsjax.rasterize.rasterization import plan, rasterization
-from gsjax.scene.frame import Frame
-from gsjax.scene.gaussians import Gaussians, Tags
-from gsjax.scene.render import plan_render, render
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gsjax.data import Sequence, open_sequence
+    from gsjax.geometry.cameras import Camera
+    from gsjax.io.ply import read_ply, write_ply
+    from gsjax.methods.object_tracker import (
+        TrackerConfig,
+        object_tracker,
+        scene_from_shapes,
+        start_scene,
+        track,
+    )
+    from gsjax.rasterize.compositing import composite_tile
+    from gsjax.rasterize.plan import Plan
+    from gsjax.rasterize.rasterization import plan, rasterization
+    from gsjax.scene.frame import Frame
+    from gsjax.scene.gaussians import Gaussians, Tags
+    from gsjax.scene.render import plan_render, render
 
 __version__ = "0.1.0"
+
+# Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
+_HOMES = {
+    "gsjax.data": ("Sequence", "open_sequence"),
+    "gsjax.geometry.cameras": ("Camera",),
+    "gsjax.io.ply": ("read_ply", "write_ply"),
+    "gsjax.methods.object_tracker": (
+        "TrackerConfig",
+        "object_tracker",
+        "scene_from_shapes",
+        "start_scene",
+        "track",
+    ),
+    "gsjax.rasterize.compositing": ("composite_tile",),
+    "gsjax.rasterize.plan": ("Plan",),
+    "gsjax.rasterize.rasterization": ("plan", "rasterization"),
+    "gsjax.scene.frame": ("Frame",),
+    "gsjax.scene.gaussians": ("Gaussians", "Tags"),
+    "gsjax.scene.render": ("plan_render", "render"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Camera",
@@ -36,7 +67,18 @@ __all__ = [
     "rasterization",
     "read_ply",
     "render",
+    "scene_from_shapes",
     "start_scene",
     "track",
     "write_ply",
 ]
+
+
+def __getattr__(name: str):
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'gsjax' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

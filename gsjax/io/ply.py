@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Int, Integer
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.io.atomic import atomic_write
-from gsjax.scene.gaussians import Gaussians, take, valid_rows
+from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
 
 _REQUIRED = (
     *("x", "y", "z"),
@@ -26,7 +25,7 @@ _REQUIRED = (
     *(f"rot_{i}" for i in range(4)),
 )
 _NORMALS = ("nx", "ny", "nz")
-_REST_COUNTS = tuple(3 * (num_sh_bases(degree) - 1) for degree in range(4))
+_REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 
 
 class PlyError(ValueError):

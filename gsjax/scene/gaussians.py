@@ -16,7 +16,7 @@ from gsjax.geometry.spherical_harmonics import num_sh_bases, rgb_to_sh0
 # Activated values are pulled into this range before their logarithm is taken, so that 0 and 1 stay finite.
 _MIN_SCALE = 1e-12
 _MIN_OPACITY = 1e-6
-_SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
+SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
 
 
 class Gaussians(eqx.Module):
@@ -59,7 +59,7 @@ class Gaussians(eqx.Module):
             value = getattr(self, name)
             if value is not None:
                 _check_array(f"Gaussians.{name}", value, shape)
-        if self.shN is not None and self.shN.shape[1] + 1 not in _SH_SIZES[1:]:
+        if self.shN is not None and self.shN.shape[1] + 1 not in SH_SIZES[1:]:
             raise ValueError(
                 f"Gaussians.shN: got shape {self.shN.shape}, want [N, 3, 3], [N, 8, 3] or [N, 15, 3] "
                 "(degree 1, 2 or 3 without its constant), or None for degree 0"
@@ -83,7 +83,7 @@ class Gaussians(eqx.Module):
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return 0 if self.shN is None else _SH_SIZES.index(self.shN.shape[-2] + 1)
+        return 0 if self.shN is None else SH_SIZES.index(self.shN.shape[-2] + 1)
 
     @property
     def sh(self) -> Float[Array, "N K 3"]:

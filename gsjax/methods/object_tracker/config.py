@@ -45,11 +45,11 @@ class AlignConfig:
     """A colour difference that is large, 0 to 1."""
     depth_scale: float = 0.01
     """A depth difference that is large, metres."""
-    centers: int = 512
+    centers: int = 256
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 0.2
     """What a centre counts beside a pixel of the last frame, which looks more like the new one."""
-    pixels: int = 256
+    pixels: int = 192
     """Pixels of the last frame that speak for a group in each camera, beside its Gaussians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""

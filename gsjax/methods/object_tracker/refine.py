@@ -71,10 +71,9 @@ def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Mo
     def rate(value):
         return optax.adam(lambda i: value * fade(i), b1=0.8, b2=0.95)
 
-    optimizer = optax.multi_transform(
-        {"t": rate(config.translation_rate), "r": rate(config.rotation_rate), "d": rate(config.delta_rate)},
-        Motion("t", "r", "d"),
-    )
+    rates = (config.translation_rate, config.rotation_rate, config.delta_rate)
+    names = jax.tree.unflatten(jax.tree.structure(motion), ["translations", "rotations", "delta"])
+    optimizer = optax.multi_transform(dict(zip(jax.tree.leaves(names), map(rate, rates), strict=True)), names)
 
     def loss(motion):
         fixed = (

@@ -1,4 +1,4 @@
-"""Only what may change is refined: tiles that moving Gaussians touch, and the background that reaches those."""
+"""Only what may change is refined: tiles a moving Gaussian touches, and the background that reaches them."""
 
 import dataclasses
 from typing import NamedTuple

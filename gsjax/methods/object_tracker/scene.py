@@ -91,7 +91,7 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
 
 
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
-    """Thin the cloud, objects finely and the background coarsely; each point becomes a disc on its surface."""
+    """Thin the cloud, objects finely, background coarsely; each point becomes a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
     for value in [*sorted(set(np.unique(cloud.labels)) - {0}), 0]:
         chosen = cloud.labels == value

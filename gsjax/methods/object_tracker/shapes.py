@@ -117,7 +117,7 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
     """
     if shape.plane is None or extent is None:
         raise ValueError(
-            f"the shape {shape.name!r} has no pose; finding one takes a plane to rest on and a background around it"
+            f"the shape {shape.name!r} has no pose; finding one takes a plane to rest on and a background"
         )
     normal = np.asarray(shape.plane[:3], np.float64)
     normal, offset = normal / np.linalg.norm(normal), float(shape.plane[3]) / np.linalg.norm(normal)

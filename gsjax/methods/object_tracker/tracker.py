@@ -184,9 +184,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         # Every start is aligned, widely at first: far off, the wrong one ends in the wrong place. Then turns
         # to all sides are tried from the best, because a knock changes a spin from one frame to the next.
         begun = best_of(aligned(_stack([still, jumped, going, both]), 3.0))
-        begun = best_of(aligned(aligned(_turned(begun, config.align.turn), 3.0), 1.0))
-        begun = best_of(_stack([still, begun]))
+        begun = best_of(aligned(_turned(begun, config.align.turn), 3.0))
+        begun = best_of(_stack([still, begun, align(begun, points, centers, frame, config.align)]))
 
+        if not config.refine.se3:
+            begun = Motion(begun.translations, zero.rotations, begun.delta)
         tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
         near = near_background(scene, last, tiles)
         around = near_scene(scene, near, plan.num_near)
