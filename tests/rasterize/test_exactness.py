@@ -18,13 +18,13 @@ def check(seed: int) -> None:
             assert error <= limit, f"{name} in {dtype}: {error:.1e}"
 
 
-# RGB+ED, antialiased, SH 1, features; ED, classic, 7 channels, features; RGB+D, classic, 12 channels.
-@pytest.mark.parametrize("seed", [29, 42, 3])
+# RGB+ED, antialiased, SH 1, features; ED, classic, 7 channels, features.
+@pytest.mark.parametrize("seed", [29, 42])
 def test_images_and_gradients_equal_the_reference(seed):
     check(seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10, 20))
+@pytest.mark.parametrize("seed", [3, *range(10, 20)])
 def test_images_and_gradients_equal_the_reference_in_more_modes(seed):
     check(seed)
