@@ -168,3 +168,13 @@ def test_a_poor_match_and_one_worse_than_standing_still_move_nothing():
     assert not lift(match, now, CONFIG)[1][0]
     match, now = seen_to_move([MOVE], True)
     assert not lift(match._replace(still=jnp.full((1, 1), 0.95)), now, CONFIG)[1][0]
+
+
+@pytest.mark.parametrize("blind", [0, 1])
+def test_a_camera_that_does_not_see_the_object_does_not_spoil_the_others(blind):
+    match, now = seen_to_move([MOVE, MOVE], True)
+    unseen = {"score": 0.0, "depth": 0.0, "depth_change": 0.0, "measured": False, "origin": 0.0, "shift": 0.0}
+    match = match._replace(**{name: getattr(match, name).at[blind].set(v) for name, v in unseen.items()})
+    move, found = lift(match, now, CONFIG)
+    assert found[0]
+    np.testing.assert_allclose(move[0], MOVE, atol=1e-3)

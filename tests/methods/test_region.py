@@ -1,0 +1,55 @@
+"""What is left out of the refinement would not have changed a pixel of it; capacities climb one ladder."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.methods.object_tracker import first_pose, place
+from gsjax.methods.object_tracker.region import (
+    Needed,
+    TrackerPlan,
+    near_background,
+    near_scene,
+    tiles_to_pixels,
+    touched_tiles,
+)
+from gsjax.rasterize.plan import Plan, rung
+from gsjax.scene.render import plan_render, render
+
+
+def test_the_near_scene_draws_the_region_as_the_whole_scene_does(table, started):
+    _, frames, _ = table()
+    pose, cameras = first_pose(started), frames[0].cameras
+    plan = plan_render(started.gaussians, cameras)
+    member = np.asarray(started.labels[: started.num_moving]) == started.num_objects  # the block alone
+    tiles = touched_tiles([pose.means[member]], frames[0])
+    roi = tiles_to_pixels(tiles, frames[0])
+    whole = render(started.gaussians, cameras, plan)
+    near = near_background(started, whole, tiles)
+    assert 0 < int(near.sum()) < near.shape[0]
+    around = near_scene(started, near, int(near.sum()) + 7)
+    part = render(place(around, pose), cameras, plan, roi=roi)
+    np.testing.assert_allclose(np.where(roi, part.alphas, 0), np.where(roi, whole.alphas, 0), atol=1e-6)
+    gap = np.where(roi[..., None], part.colors - whole.colors, 0)
+    np.testing.assert_allclose(gap, 0, atol=1e-6)
+
+
+def test_touched_tiles_hold_the_points_and_their_neighbours(table):
+    _, frames, _ = table()
+    tiles = touched_tiles([jnp.array([[-0.03, 0.0, 0.04]])], frames[0])  # where all cameras look
+    assert tiles.shape == (2, 5, 6)
+    np.testing.assert_array_equal(tiles.sum((1, 2)), 9)
+    assert tiles[:, 2, 3].all()
+    assert tiles_to_pixels(tiles, frames[0]).shape == (2, 72, 96)
+    behind = jnp.array([[5.0, 0.0, 4.0]])
+    assert not touched_tiles([behind], frames[0]).any()
+
+
+def test_a_plan_grows_to_the_lowest_rungs_that_hold_what_was_needed():
+    plan = TrackerPlan(Plan(96, 72, rung(1)), Plan(96, 72, rung(5000)), rung(1))
+    needed = Needed(jnp.array(7000), jnp.array(100), jnp.array(9000))
+    assert needed.exceeds(plan)
+    grown = plan.grown(needed, 1.5)
+    assert grown == TrackerPlan(Plan(96, 72, rung(10500)), Plan(96, 72, rung(5000)), rung(13500))
+    assert not needed.exceeds(grown)
+    assert grown.grown(needed, 1.5) == grown
+    assert hash(grown) == hash(grown.grown(needed, 1.0))

@@ -1,0 +1,79 @@
+"""The first frame: labels lifted from one view, discs that face their camera, and errors that help."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import camera_centers
+from gsjax.methods.object_tracker import first_pose
+from gsjax.methods.object_tracker.config import StartConfig
+from gsjax.methods.object_tracker.motion import facing
+from gsjax.methods.object_tracker.scene import labelled_cloud, scene_from_cloud
+
+START = StartConfig(iterations=0)
+
+
+@pytest.fixture(scope="module")
+def cloud(table):
+    _, frames, mask = table()
+    return labelled_cloud(frames[0], mask, 0, START)
+
+
+@pytest.fixture(scope="module")
+def scene(cloud):
+    return scene_from_cloud(cloud, START)
+
+
+def test_points_of_the_masks_camera_have_its_labels(table, cloud):
+    _, frames, mask = table()
+    known = np.asarray(frames[0].depths[0]) > 0
+    assert len(cloud.points) == int((np.asarray(frames[0].depths) > 0).sum())
+    np.testing.assert_array_equal(cloud.labels[: known.sum()], mask[known])
+
+
+def test_the_other_cameras_points_inherit_labels(table, cloud):
+    sequence, frames, _ = table()
+    known = np.asarray(frames[0].depths) > 0
+    others, truth = cloud.labels[known[0].sum() :], sequence.mask(0, 1)[known[1]]
+    assert (others == truth).mean() > 0.95
+
+
+def test_what_can_move_comes_first_and_groups_are_the_masks_values(table, scene):
+    _, _, mask = table()
+    labels = np.asarray(scene.labels)
+    assert scene.label_ids == tuple(sorted({0, *np.unique(mask).tolist()}))
+    assert scene.num_objects == len(scene.label_ids) - 1
+    assert (labels[: scene.num_moving] > 0).all()
+    assert (labels[scene.num_moving :] == 0).all()
+
+
+def test_values_of_the_mask_may_have_gaps(table):
+    _, frames, mask = table()
+    sparse = np.where(mask == 5, 40, 0)
+    assert scene_from_cloud(labelled_cloud(frames[0], sparse, 0, START), START).label_ids == (0, 40)
+
+
+def test_normals_point_to_a_camera(table, scene):
+    _, frames, _ = table()
+    share = facing(scene, first_pose(scene), camera_centers(frames[0].cameras.viewmat))
+    assert (np.abs(scene.normals).max(axis=1) == 1).all()
+    assert float(share[:, : scene.num_moving].max(0).min()) >= 0.5 - 1e-3
+
+
+def test_bad_input_says_what_is_wrong(table):
+    _, frames, mask = table()
+    first = frames[0]
+    with pytest.raises(ValueError, match=r"mask has shape .*; the images have"):
+        labelled_cloud(first, mask[:-1], 0, START)
+    with pytest.raises(ValueError, match="no object to track"):
+        scene_from_cloud(labelled_cloud(first, 0 * mask, 0, START), START)
+    blind = eqx.tree_at(lambda f: f.depths, first, None, is_leaf=lambda x: x is None)
+    with pytest.raises(ValueError, match="needs depth"):
+        labelled_cloud(blind, mask, 0, START)
+    empty = eqx.tree_at(lambda f: f.depths, first, jnp.zeros_like(first.depths))
+    with (
+        pytest.warns(UserWarning, match="no pixel is positive"),
+        pytest.raises(ValueError, match="no valid depth in any camera"),
+    ):
+        labelled_cloud(empty, mask, 0, START)
