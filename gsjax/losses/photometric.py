@@ -25,7 +25,7 @@ def l1_loss(
 def truncated_l1(
     values: Float[Array, "*n"], targets: Float[Array, "*n"], weights: Float[Array, "*n"], limit: float
 ) -> Float[Array, ""]:
-    """Weighted mean of min(|difference|, limit): what is further off is of something else, and does not pull."""
+    """Weighted mean of min(|difference|, limit): what is further off is of something else."""
     return weighted_mean(jnp.minimum(jnp.abs(values - targets), limit), weights)
 
 

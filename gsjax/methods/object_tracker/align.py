@@ -41,7 +41,7 @@ def join(a: Points, b: Points) -> Points:
 
 
 def sample_groups(points: Points, num_groups: int, per_group: int) -> Points:
-    """Up to `per_group` points of each group, spread over it: a large group needs no more than a small one."""
+    """Up to `per_group` points of each group, spread over it; a large one needs no more."""
     shuffle = 1.0 + jax.random.permutation(jax.random.key(1), points.groups.shape[0]).astype(jnp.float32)
     size = min(per_group, points.groups.shape[0])
 

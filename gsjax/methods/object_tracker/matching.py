@@ -187,7 +187,7 @@ def lift(match: Match, frame: Frame, config: MatchConfig) -> tuple[Float[Array, 
         before = unproject(origin, depth, viewmat, K)
         center = camera_centers(viewmat)
         on_ray = unproject(origin + shift, depth, viewmat, K) - center
-        ray = on_ray / jnp.linalg.norm(on_ray)
+        ray = on_ray / jnp.maximum(jnp.linalg.norm(on_ray), 1e-9)  # 0 where the object was not seen
         across = jnp.eye(3) - jnp.outer(ray, ray)
         axis = viewmat[2, :3]
         along = jnp.where(measured, 1.0, 0.0)

@@ -91,7 +91,7 @@ def _stack(motions: list[Motion]) -> Motion:
 
 def _choose(residuals: Float[Array, "h k"], motions: Motion, groups: Int[Array, "m"]) -> Motion:
     """For each group the motion of the hypothesis with the least residual; the first wins ties."""
-    best = jnp.argmin(residuals, axis=0)
+    best = jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf), axis=0)
     group = jnp.arange(best.shape[0])
     member = jnp.arange(groups.shape[0])
     return Motion(
