@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from time import perf_counter
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
-from gsjax.methods.object_tracker import Pose, TrackedScene, TrackerConfig, first_pose, track
+from gsjax.methods.object_tracker import EMPTY, Pose, TrackedScene, TrackerConfig, first_pose, track
 from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
@@ -24,7 +25,9 @@ class Tracking:
 
     Attributes:
         scene: at the first frame.
-        poses: of the moving Gaussians in each frame, on the host.
+        final: after the last frame, with what has joined the objects.
+        joined: how many Gaussians had joined by each frame.
+        poses: of the moving Gaussians in each frame, and after the first of those that join; on the host.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
         compile_s: seconds spent compiling, all together.
         planning_s: seconds before the first update that went into its plan, and into compiling what plans.
@@ -37,6 +40,8 @@ class Tracking:
 
     scene: TrackedScene
     poses: list[Pose]
+    final: TrackedScene | None = None
+    joined: list[int] = field(default_factory=lambda: [0])
     update_s: list[float] = field(default_factory=lambda: [0.0])
     compile_s: float = 0.0
     planning_s: float = 0.0
@@ -60,11 +65,28 @@ class Tracking:
     def means(self) -> Float[np.ndarray, "T N 3"]:
         """The centres of all Gaussians over time, metres."""
         still = np.asarray(self.scene.gaussians.means)[self.scene.num_moving :]
-        return np.stack([np.concatenate([pose.means, still]) for pose in self.poses])
+        count = self.scene.num_moving
+        return np.stack([np.concatenate([pose.means[:count], still]) for pose in self.poses])
 
     def quats(self) -> Float[np.ndarray, "T M 4"]:
         """The orientations of the moving Gaussians, which stand first, over time."""
-        return np.stack([pose.quats for pose in self.poses])
+        return np.stack([pose.quats[: self.scene.num_moving] for pose in self.poses])
+
+    def at(self, t: int) -> tuple[TrackedScene, Pose]:
+        """The scene and its pose in frame t, in the same shapes for all t; what joined later is hidden."""
+        if self.final is None:
+            return self.scene, self.poses[t]
+        count, pose = self.scene.num_moving, self.poses[t]
+        slots = self.final.num_moving - len(pose.means)  # the first frame has none
+        if slots:
+            pose = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], slots, axis=0)]), pose)
+        labels = np.asarray(self.final.labels).copy()
+        later = slice(count + self.joined[t], self.final.num_moving)
+        labels[later] = self.final.num_objects + 1
+        logits = np.asarray(self.final.gaussians.logit_opacities).copy()
+        logits[later] = EMPTY
+        scene = eqx.tree_at(lambda s: (s.labels, s.gaussians.logit_opacities), self.final, (labels, logits))
+        return scene, pose
 
 
 def follow(
@@ -94,6 +116,8 @@ def follow(
         try:
             for update in track(scene, first, frames, config):
                 tracking.poses.append(jax.device_get(update.pose))
+                tracking.final = update.scene
+                tracking.joined.append(int(update.info["joined"]))
                 tracking.update_s.append(update.seconds)
                 tracking.compile_s += update.compile_seconds
                 if tracking.num_frames == 2:

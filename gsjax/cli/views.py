@@ -51,7 +51,7 @@ def views(tracking: Tracking, recording: Recording) -> Iterator[list[View]]:
 
     Masks of all frames are opened here, for scoring: call it when tracking has ended.
     """
-    scene, sequence = tracking.scene, recording.judged
+    sequence = recording.judged
     cameras = range(sequence.num_cameras)
 
     def load(t: int):
@@ -59,10 +59,11 @@ def views(tracking: Tracking, recording: Recording) -> Iterator[list[View]]:
 
     plan: Plan | None = None
     for t, (frame, masks) in enumerate(Prefetched(load, range(tracking.num_frames))):
+        scene, pose = tracking.at(t)
         if plan is None:
-            plan = plan_render(place(scene, tracking.poses[0]), frame.cameras)
+            plan = plan_render(place(scene, pose), frame.cameras)
         while True:
-            *drawn, overflow, needed = jax.device_get(_draw()(scene, tracking.poses[t], frame, plan))
+            *drawn, overflow, needed = jax.device_get(_draw()(scene, pose, frame, plan))
             if not overflow:
                 break
             plan = plan.grown(int(needed))

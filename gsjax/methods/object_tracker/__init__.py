@@ -1,10 +1,11 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
 Read the files as the data flows: config, scene, fit, shapes, motion, matching, align, region, refine,
-tracker, tracking.
+tracker, grow, tracking.
 """
 
 from gsjax.methods.object_tracker.config import MatchConfig, RefineConfig, StartConfig, TrackerConfig
+from gsjax.methods.object_tracker.grow import EMPTY
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.shapes import scene_from_shapes
@@ -12,6 +13,7 @@ from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, obj
 from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
 
 __all__ = [
+    "EMPTY",
     "MatchConfig",
     "Pose",
     "RefineConfig",

@@ -86,6 +86,24 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
+class GrowConfig:
+    """Surfaces that come into view join the object that they continue."""
+
+    slots: int = 4096
+    """Gaussians that may join over the whole recording; 0 leaves growing out."""
+    candidates: int = 256
+    """Pixels that are looked at in a frame."""
+    reach: int = 6
+    """How far from an object's outline they may be, pixels."""
+    min_gap: float = 0.008
+    """What is measured this much nearer than the model is not explained by it, metres."""
+    distance: float = 0.012
+    """How near a pixel must be to a Gaussian to continue its object, metres ..."""
+    color: float = 0.15
+    """... and in colour, 0 to 1. Both count together, and the background's Gaussians compete."""
+
+
+@dataclass(frozen=True)
 class TrackerConfig:
     """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation), stage by stage."""
 
@@ -93,5 +111,6 @@ class TrackerConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
+    grow: GrowConfig = field(default_factory=GrowConfig)
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""

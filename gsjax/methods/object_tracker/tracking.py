@@ -6,15 +6,24 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
+from gsjax.methods.object_tracker.grow import empty_slots, grow, with_slots
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
 from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene, labelled_cloud, scene_from_cloud
-from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker, plan_tracker
+from gsjax.methods.object_tracker.tracker import (
+    TrackerBatch,
+    TrackerState,
+    object_tracker,
+    plan_tracker,
+    render_labels,
+)
 from gsjax.optim.compiler import host_options
+from gsjax.optim.step import keep_if
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
@@ -23,6 +32,7 @@ class Tracked(NamedTuple):
     """The scene after one frame.
 
     Attributes:
+        scene: the scene, with slots for what joins objects and what has joined so far.
         pose: where the moving Gaussians are now.
         state: what the tracker carries to the next frame.
         info: losses and matches by name; see `object_tracker`.
@@ -31,6 +41,7 @@ class Tracked(NamedTuple):
         plan: the plan it ran under.
     """
 
+    scene: TrackedScene
     pose: Pose
     state: TrackerState
     info: dict[str, Any]
@@ -38,9 +49,9 @@ class Tracked(NamedTuple):
     compile_seconds: float
     plan: TrackerPlan
 
-    def gaussians(self, scene: TrackedScene) -> Gaussians:
+    def gaussians(self) -> Gaussians:
         """The whole scene as it stands now."""
-        return place(scene, self.pose)
+        return place(self.scene, self.pose)
 
 
 def start_scene(
@@ -64,7 +75,14 @@ def start_scene(
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
     tracker = object_tracker(config, num_objects, state.frame, reduction)
-    return tracker.update(pose, state, batch, step=step, key=None)
+    scene, (pose, state, info) = batch.scene, tracker.update(pose, state, batch, step=step, key=None)
+    info["joined"] = jnp.int32(0)
+    if config.grow.slots and batch.frame.depths is not None:
+        rendered = render_labels(scene, pose, batch.frame, batch.plan.full)
+        grown = grow(scene, pose, rendered, batch.frame, step, config.grow)
+        scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
+        info["joined"] = config.grow.slots - empty_slots(scene).sum()
+    return scene, pose, state, info
 
 
 def track(
@@ -89,6 +107,8 @@ def track(
         pose, state: where to go on from; the first frame unless given.
     """
     config = TrackerConfig() if config is None else config
+    if config.grow.slots and first.depths is not None and not empty_slots(scene).any():
+        scene = with_slots(scene, config.grow.slots)
     pose = first_pose(scene) if pose is None else pose
     step = object_tracker(config, scene.num_objects, first)
     state = step.init(pose) if state is None else state
@@ -111,12 +131,12 @@ def track(
             begun = time.perf_counter()
             result = jax.block_until_ready(compiled[plan](*arguments))
             seconds += time.perf_counter() - begun
-            info = result[2]
+            info = result[3]
             if not bool(info["overflow"]):
                 break
             plan = plan.grown(info["needed"], config.headroom)
-        pose, state, info = result
-        yield Tracked(pose, state, info, seconds, compile_seconds, plan)
+        scene, pose, state, info = result
+        yield Tracked(scene, pose, state, info, seconds, compile_seconds, plan)
 
 
 def _reduction(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> int:

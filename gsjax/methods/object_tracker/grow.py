@@ -1,0 +1,139 @@
+"""Surfaces that the first frame did not see join the object that they continue.
+
+A box that turns shows its back, and a gripper that leaves shows what it hid. A measured pixel that the model
+does not explain, because it lies in front of what is drawn there or because nothing is, is compared with the
+scene's Gaussians in position and colour at once. If the nearest belongs to an object, the pixel becomes a
+Gaussian of that object. Shapes are static: new ones take slots that were laid out empty.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.geometry.cameras import pixel_grid, unproject
+from gsjax.geometry.spherical_harmonics import SH_C0, rgb_to_sh0
+from gsjax.methods.object_tracker.config import GrowConfig
+from gsjax.methods.object_tracker.motion import Pose
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.render import Rendered
+
+EMPTY = -30.0  # logit of an empty slot's opacity
+_BORN = 2.0  # and of a new Gaussian
+
+
+def with_slots(scene: TrackedScene, slots: int) -> TrackedScene:
+    """The scene with `slots` empty places after its moving Gaussians. Their label, K+1, belongs to nobody."""
+    count, moving = scene.gaussians.num, scene.num_moving
+    rows = jnp.concatenate([jnp.arange(moving), jnp.zeros(slots, int), jnp.arange(moving, count)])
+    gaussians = take(scene.gaussians, rows)
+    empty = (jnp.arange(count + slots) >= moving) & (jnp.arange(count + slots) < moving + slots)
+    logits = jnp.where(empty, EMPTY, gaussians.logit_opacities)
+    return TrackedScene(
+        gaussians=eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits),
+        normals=jnp.concatenate([scene.normals, jnp.zeros((slots, 3), scene.normals.dtype)]),
+        labels=jnp.where(empty, scene.num_objects + 1, scene.labels[rows]),
+        label_ids=scene.label_ids,
+        num_moving=moving + slots,
+    )
+
+
+def empty_slots(scene: TrackedScene) -> Bool[Array, "m"]:
+    """Which moving places are still empty."""
+    return scene.labels[: scene.num_moving] > scene.num_objects
+
+
+def unexplained(rendered: Rendered, frame: Frame, config: GrowConfig) -> Bool[Array, "c h w"]:
+    """Pixels measured in front of the model, or where there is none; every second one each way."""
+    assert frame.depths is not None
+    known = frame.depths > 0
+    in_front = (rendered.alphas > 0.5) & (rendered.depths - frame.depths > config.min_gap)
+    height, width = frame.depths.shape[1:]
+    lattice = (jnp.arange(height) % 2 == 0)[:, None] & (jnp.arange(width) % 2 == 0)[None, :]
+    return known & (in_front | (rendered.alphas < 0.5)) & lattice
+
+
+def grow(
+    scene: TrackedScene,
+    pose: Pose,
+    rendered: Rendered,
+    frame: Frame,
+    step: Int[Array, ""],
+    config: GrowConfig,
+) -> tuple[TrackedScene, Pose]:
+    """Fill empty slots with pixels that continue an object.
+
+    Args:
+        scene, pose: with slots (see `with_slots`), as they stand.
+        rendered: both, drawn solid with label shares, in the frame's cameras.
+        frame: what the cameras saw at this pose, with depth.
+        step: any number that differs from frame to frame: it picks which pixels are looked at.
+    """
+    assert frame.depths is not None
+    assert rendered.features is not None
+    height, width = frame.depths.shape[1:]
+    # Only pixels near an object can continue it; other places wait until one comes by.
+    objects = rendered.features[..., 1:].sum(-1)
+    reach = (1, 2 * config.reach + 1, 2 * config.reach + 1)
+    near = jax.lax.reduce_window(objects, -jnp.inf, jax.lax.max, reach, (1, 1, 1), "SAME") > 0.5
+    chosen = (unexplained(rendered, frame, config) & near).ravel()
+    order = jax.random.uniform(jax.random.fold_in(jax.random.key(2), step), chosen.shape)
+    priority, rows = jax.lax.top_k(jnp.where(chosen, 1.0 + order, 0.0), config.candidates)
+
+    camera, pixel = rows // (height * width), rows % (height * width)
+    depth = frame.depths.reshape(-1)[rows]
+    color = frame.images.reshape(-1, 3)[rows]
+    views = (frame.cameras.viewmat[camera], frame.cameras.K[camera])
+    points = jax.vmap(unproject)(pixel_grid(width, height).reshape(-1, 2)[pixel], depth, *views)
+    label, distance = _nearest(points, color, scene, pose, config)
+    wanted = (priority > 0) & (label > 0) & (distance < 1.0)
+
+    # The n-th wanted pixel takes the n-th empty slot.
+    slots = jnp.nonzero(empty_slots(scene), size=config.candidates, fill_value=scene.num_moving)[0]
+    rank = jnp.cumsum(wanted) - 1
+    target = jnp.where(wanted, slots[jnp.maximum(rank, 0)], scene.gaussians.num)
+    target = jnp.where(target < scene.num_moving, target, scene.gaussians.num)  # dropped where none is left
+    scale = 1.1 * depth / frame.cameras.K[camera, 0, 0]  # pixels of the lattice are two apart
+    born = Gaussians(
+        means=points,
+        quats=jnp.zeros((config.candidates, 4), points.dtype).at[:, 0].set(1.0),
+        log_scales=jnp.log(jnp.maximum(scale, 1e-6))[:, None] * jnp.ones(3, points.dtype),
+        logit_opacities=jnp.full(config.candidates, _BORN, points.dtype),
+        sh0=rgb_to_sh0(color)[:, None],
+        shN=None
+        if scene.gaussians.shN is None
+        else jnp.zeros((config.candidates, *scene.gaussians.shN.shape[1:]), points.dtype),
+    )
+    gaussians = jax.tree.map(lambda a, b: a.at[target].set(b, mode="drop"), scene.gaussians, born)
+    labels = scene.labels.at[target].set(label, mode="drop")
+    scene = TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
+    pose = Pose(
+        pose.means.at[target].set(born.means, mode="drop"), pose.quats.at[target].set(born.quats, mode="drop")
+    )
+    return scene, pose
+
+
+def _nearest(
+    points: Float[Array, "p 3"],
+    colors: Float[Array, "p 3"],
+    scene: TrackedScene,
+    pose: Pose,
+    config: GrowConfig,
+) -> tuple[Int[Array, "p"], Float[Array, "p"]]:
+    """Label of the nearest Gaussian in position and colour, and its distance in units of the two reaches."""
+    means = jnp.concatenate([pose.means, scene.gaussians.means[scene.num_moving :]])
+    own = jnp.concatenate(
+        [means / config.distance, (scene.gaussians.sh0[:, 0] * SH_C0 + 0.5) / config.color], axis=1
+    )
+    ask = jnp.concatenate([points / config.distance, colors / config.color], axis=1)
+    taken = (scene.labels <= scene.num_objects).at[: scene.num_moving].min(~empty_slots(scene))
+
+    def one(query):
+        squared = jnp.sum((own - query) ** 2, axis=-1)
+        squared = jnp.where(taken, squared, jnp.inf)
+        best = jnp.argmin(squared)
+        return scene.labels[best], jnp.sqrt(squared[best])
+
+    return jax.lax.map(one, ask, batch_size=32)
