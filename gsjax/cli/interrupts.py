@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-DEAF = frozenset({"_xla_gc_callback", "__del__"})
-"""Functions in which exceptions are dropped."""
+DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__"})
+"""Functions in which exceptions are dropped: callbacks of the garbage collector, and finalizers."""
 RETRY_S = 0.01
 
 

@@ -136,8 +136,7 @@ def write_plots(
 
 def _centroids(tracking: Tracking, names: dict[int, str], colors: np.ndarray) -> dict[str, np.ndarray]:
     """Where the centroid of each object's Gaussians went, [T,3]."""
-    groups = np.asarray(tracking.scene.labels[: tracking.scene.num_moving])
-    means = np.stack([pose.means for pose in tracking.poses])
+    groups, means = np.asarray(tracking.scene.labels), tracking.means()
     paths = {}
     for label, name in names.items():
         members = np.isin(groups, np.flatnonzero(colors == label))

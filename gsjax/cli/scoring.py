@@ -203,10 +203,10 @@ def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) 
 
 def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> float | None:
     """How far the tracker moved the object's centroid from where it was first, at most."""
-    members = _members(tracking, values, label)[: tracking.scene.num_moving]
+    members = _members(tracking, values, label)
     if not members.any():
         return None
-    centroids = np.stack([pose.means[members].mean(axis=0) for pose in tracking.poses])
+    centroids = tracking.means()[:, members].mean(axis=1)
     return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
 
 

@@ -11,6 +11,10 @@ class StartConfig:
     """Width of the voxels that keep one point of an object each, in pixels of the camera that saw it."""
     background_pixels: float = 4.0
     """The same for the background, which is only looked at."""
+    max_extent: float = 0.35
+    """Objects longer than this are seldom rigid (a robot arm): they are followed in parts, metres."""
+    part_size: float = 0.15
+    """About how large those parts are, metres."""
     label_distance: float = 0.02
     """A point unseen by the mask's camera takes its nearest labelled point's label up to here, metres."""
     depth_gap: float = 0.015

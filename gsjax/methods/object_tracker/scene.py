@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.cluster.vq import kmeans2
 
 from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.neighbors import voxel_thin
@@ -23,7 +24,8 @@ class TrackedScene(eqx.Module):
         gaussians: the scene at the first frame.
         normals: outward normals of the moving ones in their own axes; zero where both sides can be seen.
         labels: group of each Gaussian: 0 is the background, 1..K the objects in the order of `label_ids`.
-        label_ids: the mask value that each group came from, background first (static).
+        label_ids: the mask value that each group came from, background first (static). Parts of one
+            large object are groups of their own with the same value.
         num_moving: how many Gaussians, from the front, belong to objects (static).
     """
 
@@ -90,13 +92,32 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
     return np.concatenate(kept)
 
 
+def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
+    """(mask value, its points) of every body that moves as one; the background comes last.
+
+    What is too large to be rigid is cut by k-means into parts, which keep the mask value they came from.
+    """
+    bodies = []
+    for value in sorted(set(np.unique(cloud.labels).tolist()) - {0}):
+        rows = np.flatnonzero(cloud.labels == value)
+        points = cloud.points[rows]
+        extent = float(np.ptp(points, axis=0).max())
+        parts = np.zeros(len(rows), int)
+        if extent > config.max_extent:
+            count = int(np.ceil(extent / config.part_size))
+            _, parts = kmeans2(points, count, minit="++", seed=0)
+        for part in np.unique(parts):
+            chosen = np.zeros(len(cloud.points), bool)
+            chosen[rows[parts == part]] = True
+            bodies.append((value, chosen))
+    background = cloud.labels == 0
+    return [*bodies, (0, background)] if background.any() else bodies
+
+
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
     """Thin the cloud, objects finely, background coarsely; each point becomes a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
-    for value in [*sorted(set(np.unique(cloud.labels)) - {0}), 0]:
-        chosen = cloud.labels == value
-        if not chosen.any():
-            continue
+    for value, chosen in _bodies(cloud, config):
         kept = _thin(cloud, chosen, config.object_pixels if value else config.background_pixels)
         part = gaussians_from_points(cloud.points[kept], cloud.colors[kept], normals="pca")
         if value:
