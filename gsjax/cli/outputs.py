@@ -26,15 +26,18 @@ MIN_VIDEO_HZ = 1.0
 
 def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
     """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped."""
+    # Parts of one object are one label in the files.
+    label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
+    labels = label_of[np.asarray(tracking.scene.labels)].astype(np.int32)
     folder.write_trajectory(
         means=tracking.means().astype(np.float32),
         quats=tracking.quats().astype(np.float32),
-        labels=np.asarray(tracking.scene.labels, np.int32),
-        label_ids=np.asarray(tracking.scene.label_ids, np.int32),
+        labels=labels,
+        label_ids=label_ids.astype(np.int32),
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
-    write_ply(folder.scene, tracking.scene.gaussians, labels=np.asarray(tracking.scene.labels))
+    write_ply(folder.scene, tracking.scene.gaussians, labels=labels)
 
 
 def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -> Path | None:

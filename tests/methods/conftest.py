@@ -47,7 +47,8 @@ def centroid_errors():
 
     def errors(sequence, scene, pose, t: int) -> dict[str, float]:
         labels = np.asarray(scene.labels[: scene.num_moving])
-        start, now = np.asarray(scene.gaussians.means[: scene.num_moving]), np.asarray(pose.means)
+        start = np.asarray(scene.gaussians.means[: scene.num_moving])
+        now = np.asarray(pose.means[: scene.num_moving])  # without what has joined since
         result = {}
         for k, (name, value) in enumerate(zip(sequence.truth.names, sequence.truth.label_ids, strict=True)):
             member = labels == scene.label_ids.index(int(value))

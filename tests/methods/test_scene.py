@@ -42,7 +42,8 @@ def test_the_other_cameras_points_inherit_labels(table, cloud):
 def test_what_can_move_comes_first_and_groups_are_the_masks_values(table, scene):
     _, _, mask = table()
     labels = np.asarray(scene.labels)
-    assert scene.label_ids == tuple(sorted({0, *np.unique(mask).tolist()}))
+    assert set(scene.label_ids) == {0, *np.unique(mask).tolist()}
+    assert scene.label_ids == tuple(sorted(scene.label_ids))
     assert scene.num_objects == len(scene.label_ids) - 1
     assert (labels[: scene.num_moving] > 0).all()
     assert (labels[scene.num_moving :] == 0).all()

@@ -32,7 +32,8 @@ def test_objects_are_followed(table, started, tracked, centroid_errors):
 
 def test_labels_keep_the_masks_values(table, started):
     _, _, mask = table()
-    assert started.label_ids == (0, 1, 2, 3, 4, 5)
+    assert started.label_ids[0] == 0
+    assert started.label_ids[-4:] == (2, 3, 4, 5)  # the robot, 1, is too long to be rigid: it comes in parts
     assert set(started.label_ids) == set(np.unique(mask).tolist())
     labels = np.asarray(started.labels)
     assert (labels[: started.num_moving] > 0).all()
@@ -42,13 +43,13 @@ def test_labels_keep_the_masks_values(table, started):
 def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, started, tracked, quick):
     _, frames, _ = table()
     half = tracked[0]
-    rest = track(started, frames[1], frames[2:], quick, pose=half.pose, state=half.state)
+    rest = track(half.scene, frames[1], frames[2:], quick, pose=half.pose, state=half.state)
     for again, before in zip(rest, tracked[1:], strict=True):
         np.testing.assert_allclose(again.pose.means, before.pose.means, atol=1e-5)
 
 
 def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick, monkeypatch):
-    """Every capacity too small for the scene, in the step alone and then under `track`."""
+    """One capacity too small for the scene, in the step alone and then under `track`."""
     _, frames, _ = table()
     plan = plan_tracker(started, first_pose(started), frames[1], quick.headroom)
     small = replace(plan, num_near=16)
@@ -103,7 +104,7 @@ def test_a_still_scene_stays_still(table, quick):
     _, frames, mask = table(still=True)
     scene = start_scene(frames[0], mask, 0, quick)
     *_, last = track(scene, frames[0], frames[1:], quick)
-    drift = np.linalg.norm(np.asarray(last.pose.means - first_pose(scene).means), axis=-1)
+    drift = np.linalg.norm(np.asarray(last.pose.means[: scene.num_moving] - first_pose(scene).means), axis=-1)
     assert drift.mean() < 1e-3
 
 

@@ -43,6 +43,7 @@ class TrackerState(NamedTuple):
 
     motion: Motion  # of the last frame: where delta starts, and the constant-velocity hypothesis
     frame: Frame  # the last frame, whose pixels show what the first one did not
+    count: Int[Array, ""]  # frames so far
 
 
 class TrackerBatch(NamedTuple):
@@ -142,7 +143,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
 
     def init(params: Pose) -> TrackerState:
         nowhere = jnp.zeros((num_objects, 3), params.means.dtype)
-        return TrackerState(Motion(nowhere, nowhere, jnp.zeros_like(params.means)), first_frame)
+        return TrackerState(Motion(nowhere, nowhere, jnp.zeros_like(params.means)), first_frame, jnp.int32(0))
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan = batch
@@ -206,7 +207,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         needed = Needed(last.meta.needed.max(), info["needed"], near.sum())
         overflow = needed.exceeds(plan)
         sound = all_finite(pose) & ~overflow
-        new_state = TrackerState(kept, frame)
+        new_state = TrackerState(kept, frame, state.count + 1)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,

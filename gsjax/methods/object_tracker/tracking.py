@@ -79,7 +79,7 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
     info["joined"] = jnp.int32(0)
     if config.grow.slots and batch.frame.depths is not None:
         rendered = render_labels(scene, pose, batch.frame, batch.plan.full)
-        grown = grow(scene, pose, rendered, batch.frame, step, config.grow)
+        grown = grow(scene, pose, rendered, batch.frame, state.count, config.grow)
         scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
         info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
@@ -104,7 +104,7 @@ def track(
         first: the frame that `scene` or `pose` shows.
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackerConfig`.
-        pose, state: where to go on from; the first frame unless given.
+        pose, state: where to go on from, with the same `Tracked`'s scene; the first frame unless given.
     """
     config = TrackerConfig() if config is None else config
     if config.grow.slots and first.depths is not None and not empty_slots(scene).any():
