@@ -6,19 +6,21 @@ one) or in a finalizer the exception is printed and dropped, and the program goe
 
 import signal
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__"})
-"""Functions in which exceptions are dropped: callbacks of the garbage collector, and finalizers."""
+"""Functions in which exceptions are dropped: callbacks of the garbage collector, and finalizers. Callbacks of
+weak references are a third kind, known by their file."""
 RETRY_S = 0.01
 
 
 def is_deaf(frame: FrameType | None) -> bool:
     """Whether an exception raised in `frame` would be dropped."""
     while frame is not None:
-        if frame.f_code.co_name in DEAF:
+        if frame.f_code.co_name in DEAF or frame.f_code.co_filename == weakref.__file__:
             return True
         frame = frame.f_back
     return False
