@@ -165,7 +165,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         jumped = Motion(jnp.where(found[:, None], jump, 0.0), zero.rotations, start_delta)
         going = state.motion
         both = Motion(jumped.translations, going.rotations, start_delta)
-        points = Points(params.means, _colors(scene), groups, seen)
+        # Only Gaussians that a mask has named speak for the pose; what joined may be a neighbour's.
+        named = jnp.any(scene.normals != 0, axis=-1) | ~jnp.any(scene.normals != 0)
+        points = Points(params.means, _colors(scene), groups, seen * named)
         points = sample_groups(points, scene.num_objects, config.align.centers)
         if config.align.pixels:
             points = points._replace(seen=config.align.center_weight * points.seen)
