@@ -138,6 +138,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
     Args:
         config: see `TrackerConfig`.
         num_objects: groups that can move, K.
+        first_frame: the frame that the first pose shows; `init` puts it into the state.
         reduction: factor by which images shrink for template matching (objects larger than the template).
     """
 
