@@ -1,20 +1,17 @@
-"""A first scene from RGB-D: points, Gaussians on them, labels lifted from one mask. All on the host."""
+"""A first scene from RGB-D: points, and Gaussians on them. All on the host."""
 
 import warnings
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, Integer, Num
+from jaxtyping import Float, Num
 from scipy.spatial import cKDTree
 
-from gsjax.geometry.cameras import project, unproject
-from gsjax.geometry.neighbors import nearest, neighbor_spacing, voxel_thin
+from gsjax.geometry.cameras import unproject
+from gsjax.geometry.neighbors import neighbor_spacing, voxel_thin
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
-UNKNOWN_LABEL = -1
-BACKGROUND_LABEL = 0
 # A room is metres across: a median depth beyond this is almost surely a millimetre count read as metres.
 _SUSPICIOUS_DEPTH = 100.0
 
@@ -42,14 +39,14 @@ def points_from_rgbd(
         ValueError: image and depth differ in size, or depth holds integers (its unit is then unknown).
     """
     image, depth = np.asarray(image), np.asarray(depth)
-    _check_depth(depth)
+    check_depth(depth)
     if image.shape != (*depth.shape, 3):
         raise ValueError(f"image: got shape {image.shape}, want {(*depth.shape, 3)} to match depth")
     if stride < 1:
         raise ValueError(f"stride: got {stride}, want 1 or more")
     rows, columns = np.mgrid[0 : depth.shape[0] : stride, 0 : depth.shape[1] : stride]
     sampled = depth[rows, columns]
-    valid = _valid_depth(sampled)
+    valid = valid_depth(sampled)
     if not valid.any():
         warnings.warn("depth: no pixel is positive and finite, so this picture gives no points", stacklevel=2)
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
@@ -60,7 +57,7 @@ def points_from_rgbd(
         )
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64)
     safe = np.where(valid, sampled, 1.0).astype(np.float64)
-    points = _on_host(unproject, pixels, safe, viewmat, K)
+    points = on_host(unproject, pixels, safe, viewmat, K)
     colors = image[rows, columns][valid]
     colors = colors / 255.0 if np.issubdtype(colors.dtype, np.integer) else colors
     return points[valid].astype(np.float32), np.clip(np.nan_to_num(colors), 0, 1).astype(np.float32)
@@ -149,88 +146,17 @@ def gaussians_from_points(
     return gaussians_from_activated(points, quats, scales, np.full(len(points), opacity), colors)
 
 
-def lift_labels(
-    points: Float[np.ndarray, "N 3"],
-    mask: Integer[np.ndarray, "mask_H mask_W"],
-    depth: Num[np.ndarray, "H W"],
-    viewmat: Float[np.ndarray, "4 4"],
-    K: Float[np.ndarray, "3 3"],
-    *,
-    max_depth_gap: float = 0.015,
-    expected_labels: Sequence[int] = (),
-) -> Int[np.ndarray, "N"]:
-    """Labels of the points that one view sees, from its mask; -1 for the others.
-
-    A point is seen where its projection falls in the picture and its z is within `max_depth_gap` metres of
-    the depth there, so what stands in front gives its label to nothing behind it.
-
-    Args:
-        mask: integer labels, 0 the background.
-        expected_labels: labels that must be in the mask; one that no pixel has gives a warning.
-
-    Raises:
-        ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.
-    """
-    mask, depth, points = np.asarray(mask), np.asarray(depth), np.asarray(points, np.float64)
-    _check_depth(depth)
-    if mask.shape != depth.shape:
-        raise ValueError(f"mask: got shape {mask.shape}, want {depth.shape} to match depth")
-    if not _valid_depth(depth).any():
-        raise ValueError("depth: no pixel is positive and finite, so no label can be lifted from this view")
-    height, width = depth.shape
-    pixels, z = _on_host(project, points, viewmat, K)
-    columns, rows = np.floor(pixels.clip(-1, max(width, height))).astype(int).T
-    inside = (z > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
-    there = depth[rows, columns]
-    seen = inside & _valid_depth(there) & (np.abs(there - z) <= max_depth_gap)
-    # Widened before: -1 among the bytes of a mask file would become 255.
-    labels = np.where(seen, mask[rows, columns].astype(np.int32), UNKNOWN_LABEL)
-    _warn_of_lost_labels(mask, labels, expected_labels)
-    return labels
-
-
-def inherit_labels(
-    points: Float[np.ndarray, "N 3"], labels: Integer[np.ndarray, "labels"], *, max_distance: float = 0.03
-) -> Int[np.ndarray, "N"]:
-    """Labels in which each unknown (-1) point has that of the nearest known one within `max_distance` metres.
-
-    What is further away becomes background, 0: without a limit labels bleed into what the view could not see.
-    """
-    points, labels = np.asarray(points, np.float64), np.asarray(labels)
-    if labels.shape != points.shape[:1]:
-        raise ValueError(f"labels: got shape {labels.shape}, want [{len(points)}] to match points")
-    known = np.flatnonzero(labels != UNKNOWN_LABEL)
-    unknown = np.flatnonzero(labels == UNKNOWN_LABEL)
-    index, _ = nearest(points[unknown], points[known], max_distance)
-    inherited = labels.astype(np.int32)
-    inherited[unknown] = BACKGROUND_LABEL
-    inherited[unknown[index >= 0]] = labels[known[index[index >= 0]]]
-    return inherited
-
-
-def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray, expected: Sequence[int]) -> None:
-    """Warn of labels that no pixel has and of labels that have pixels but reached no point."""
-    present = set(np.unique(mask).tolist())
-    absent = sorted(set(expected) - present)
-    if absent:
-        warnings.warn(f"mask: no pixel has label {absent}; it holds {sorted(present)}", stacklevel=3)
-    lost = sorted(present - {BACKGROUND_LABEL} - set(np.unique(labels).tolist()))
-    if lost:
-        warnings.warn(f"mask: label {lost} reached no point (no depth there, or no points)", stacklevel=3)
-
-
-def _check_depth(depth: np.ndarray) -> None:
+def check_depth(depth: np.ndarray) -> None:
     if depth.ndim != 2:
         raise ValueError(f"depth: got shape {depth.shape}, want [H, W]")
     if not np.issubdtype(depth.dtype, np.floating):
         raise ValueError(f"depth: got dtype {depth.dtype}, want metres as floats (times the file's unit)")
 
 
-def _valid_depth(depth: np.ndarray) -> np.ndarray:
+def valid_depth(depth: np.ndarray) -> np.ndarray:
     return np.isfinite(depth) & (depth > 0)
 
 
-def _on_host(function, *arrays):
+def on_host(function, *arrays):
     """`function` of geometry.cameras on numpy arrays, its results as numpy arrays in JAX's precision."""
     return jax.tree.map(np.asarray, function(*(jnp.asarray(array, float) for array in arrays)))

@@ -1,6 +1,4 @@
-"""First scenes: points from depth, their sizes and normals, labels lifted from one view and inherited."""
-
-import warnings
+"""First scenes: points from depth, their sizes and normals, ."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +9,6 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.scene.initialize import (
     estimate_normals,
     gaussians_from_points,
-    inherit_labels,
-    lift_labels,
     points_from_rgbd,
     quats_from_normals,
     spacing_scales,
@@ -144,71 +140,3 @@ def test_what_makes_no_cloud_is_refused(change, message):
     arguments = {"points": np.random.default_rng(0).normal(size=(4, 3)), "colors": np.ones((4, 3))} | change
     with pytest.raises(ValueError, match=message):
         gaussians_from_points(arguments.pop("points"), arguments.pop("colors"), **arguments)
-
-
-def box_before_wall():
-    """A view in which label 1, at 1 m, stands before a wall at 2 m."""
-    depth, mask = np.full((HEIGHT, WIDTH), 2.0), np.zeros((HEIGHT, WIDTH), np.int32)
-    depth[8:16, 10:20], mask[8:16, 10:20] = 1.0, 1
-    return depth, mask
-
-
-def test_labels_are_lifted_only_where_the_depth_agrees():
-    depth, mask = box_before_wall()
-    points = np.array(
-        [
-            [0.0, 0.0, 1.0],  # on the box
-            [0.0, 0.0, 1.01],  # a hair behind its surface
-            [0.0, 0.0, 1.05],  # inside the box
-            [0.0, 0.0, 2.0],  # on the wall, behind the box
-            [0.7, 0.0, 2.0],  # on the wall, in sight
-            [9.0, 0.0, 2.0],  # outside the picture
-            [0.0, 0.0, -1.0],  # behind the camera
-        ]
-    )
-    for dtype in (np.int32, np.uint8, np.int64):
-        labels = lift_labels(points, mask.astype(dtype), depth, np.eye(4), K)
-        np.testing.assert_array_equal(labels, [1, 1, -1, -1, 0, -1, -1])
-        assert labels.dtype == np.int32
-
-
-def test_labels_do_not_bleed_across_an_occlusion_edge():
-    depth, mask = box_before_wall()
-    points, _ = points_from_rgbd(np.zeros((HEIGHT, WIDTH, 3)), depth, np.eye(4), K)
-    np.testing.assert_array_equal(lift_labels(points, mask, depth, np.eye(4), K), mask.ravel())
-    # The same surfaces as another camera would have sampled them: the wall takes nothing from the box.
-    shifted = points + np.array([0.013, 0.017, 0.0])
-    labels = lift_labels(shifted, mask, depth, np.eye(4), K)
-    assert not (labels[points[:, 2] > 1.5] == 1).any()
-    assert (labels == 1).any()
-
-
-def test_invalid_depth_lifts_nothing():
-    depth, mask = box_before_wall()
-    depth[8:16, 10:20] = 0.0
-    with pytest.warns(UserWarning, match=r"label \[1\] reached no point"):
-        labels = lift_labels(np.array([[0.0, 0, 1.0]]), mask, depth, np.eye(4), K)
-    np.testing.assert_array_equal(labels, [-1])
-    with pytest.raises(ValueError, match="no label can be lifted"):
-        lift_labels(np.array([[0.0, 0, 1.0]]), mask, 0 * depth, np.eye(4), K)
-
-
-def test_a_mask_of_another_size_and_a_label_without_pixels_are_told():
-    depth, mask = box_before_wall()
-    points = np.array([[0.0, 0.0, 1.0]])
-    with pytest.raises(ValueError, match=r"mask: got shape \(23, 32\), want \(24, 32\)"):
-        lift_labels(points, mask[1:], depth, np.eye(4), K)
-    with pytest.warns(UserWarning, match=r"no pixel has label \[7\]; it holds \[0, 1\]"):
-        lift_labels(points, mask, depth, np.eye(4), K, expected_labels=[1, 7])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        lift_labels(points, mask, depth, np.eye(4), K, expected_labels=[1])
-
-
-def test_unknown_points_inherit_up_to_a_distance():
-    points = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.02, 0, 0], [1.0, 0, 0], [0.5, 0, 0]])
-    labels = np.array([3, -1, -1, 0, -1])
-    np.testing.assert_array_equal(inherit_labels(points, labels, max_distance=0.03), [3, 3, 3, 0, 0])
-    np.testing.assert_array_equal(inherit_labels(points, np.full(5, -1)), 0)
-    with pytest.raises(ValueError, match=r"labels: got shape \(4,\), want \[5\]"):
-        inherit_labels(points, labels[:4])

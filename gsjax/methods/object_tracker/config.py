@@ -15,8 +15,10 @@ class StartConfig:
     """Objects longer than this are seldom rigid (a robot arm): they are followed in parts, metres."""
     part_size: float = 0.15
     """About how large those parts are, metres."""
-    label_distance: float = 0.02
-    """A point unseen by the mask's camera takes its nearest labelled point's label up to here, metres."""
+    label_distance: float = 0.15
+    """A point unseen by the mask's camera takes the nearest label along the surface up to here, metres."""
+    label_step: float = 0.02
+    """Points further apart than this are on no common surface, metres."""
     depth_gap: float = 0.015
     """How far a point's depth may be from the depth image and still be what the image shows, metres."""
     iterations: int = 150

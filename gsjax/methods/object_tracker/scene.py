@@ -14,7 +14,8 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.object_tracker.config import StartConfig
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
-from gsjax.scene.initialize import gaussians_from_points, inherit_labels, lift_labels, points_from_rgbd
+from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd
+from gsjax.scene.labels import inherit_labels, lift_labels
 
 
 class TrackedScene(eqx.Module):
@@ -74,9 +75,12 @@ def labelled_cloud(
         raise ValueError("the first frame has no valid depth in any camera: depth images are all zero")
     view = (depths[mask_camera], viewmats[mask_camera], Ks[mask_camera])
     labels = lift_labels(points, mask, *view, max_depth_gap=config.depth_gap)
-    labels = inherit_labels(points, labels, max_distance=config.label_distance)
     counts = [len(footprint) for footprint in footprints]
     eyes = np.repeat(np.asarray(camera_centers(jnp.asarray(viewmats))), counts, axis=0)
+    normals = estimate_normals(points)
+    normals *= np.sign(np.sum(normals * (eyes - points), axis=1, keepdims=True))
+    reach = {"max_distance": config.label_distance, "max_step": config.label_step}
+    labels = inherit_labels(points, labels, normals, **reach)
     return Cloud(points, colors, labels, np.concatenate(footprints), eyes)
 
 

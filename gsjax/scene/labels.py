@@ -1,0 +1,152 @@
+"""Which object each point of a first scene belongs to, from one view's mask. All on the host."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int, Integer, Num
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from gsjax.geometry.cameras import project
+from gsjax.scene.initialize import check_depth, on_host, valid_depth
+
+UNKNOWN_LABEL = -1
+BACKGROUND_LABEL = 0
+_NEIGHBORS = 8
+# A crease of 90 degrees, where a box stands on a table, is as far as 16 cm along the surface.
+_METRES_PER_CONCAVE_RADIAN = 0.1
+
+
+def lift_labels(
+    points: Float[np.ndarray, "N 3"],
+    mask: Integer[np.ndarray, "mask_H mask_W"],
+    depth: Num[np.ndarray, "H W"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+    *,
+    max_depth_gap: float = 0.015,
+    expected_labels: Sequence[int] = (),
+) -> Int[np.ndarray, "N"]:
+    """Labels of the points that one view sees, from its mask; -1 for the others.
+
+    A point is seen where its projection falls in the picture and its z is within `max_depth_gap` metres of
+    the depth there, so what stands in front gives its label to nothing behind it.
+
+    Args:
+        mask: integer labels, 0 the background.
+        expected_labels: labels that must be in the mask; one that no pixel has gives a warning.
+
+    Raises:
+        ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.
+    """
+    mask, depth, points = np.asarray(mask), np.asarray(depth), np.asarray(points, np.float64)
+    check_depth(depth)
+    if mask.shape != depth.shape:
+        raise ValueError(f"mask: got shape {mask.shape}, want {depth.shape} to match depth")
+    if not valid_depth(depth).any():
+        raise ValueError("depth: no pixel is positive and finite, so no label can be lifted from this view")
+    height, width = depth.shape
+    pixels, z = on_host(project, points, viewmat, K)
+    columns, rows = np.floor(pixels.clip(-1, max(width, height))).astype(int).T
+    inside = (z > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
+    there = depth[rows, columns]
+    seen = inside & valid_depth(there) & (np.abs(there - z) <= max_depth_gap)
+    # Widened before: -1 among the bytes of a mask file would become 255.
+    labels = np.where(seen, mask[rows, columns].astype(np.int32), UNKNOWN_LABEL)
+    _warn_of_lost_labels(mask, labels, expected_labels)
+    return labels
+
+
+def inherit_labels(
+    points: Float[np.ndarray, "N 3"],
+    labels: Integer[np.ndarray, "labels"],
+    normals: Float[np.ndarray, "normals 3"],
+    *,
+    max_distance: float = 0.15,
+    max_step: float = 0.02,
+) -> Int[np.ndarray, "N"]:
+    """Labels in which each unknown (-1) point has that of the known one nearest to it along the surface.
+
+    Paths run from neighbour to neighbour, and turning into a concave crease counts as a long way: objects
+    are mostly convex, and what meets in a crease mostly touches (the criterion of Stein et al., "Object
+    Partitioning using Local Convexity", CVPR 2014). So the far side of a box takes the box's label over its
+    edge, not the table's it stands on. What no path reaches becomes background, 0: without a limit, labels
+    bleed into what the view could not see.
+
+    Args:
+        points: metres.
+        labels: of each, -1 where unknown.
+        normals: unit and outward: each towards the camera that saw its point.
+        max_distance: longest path, metres.
+        max_step: points further apart than this are on no common surface, metres.
+
+    Raises:
+        ValueError: labels or normals are not one a point.
+    """
+    points, labels, normals = np.asarray(points, np.float64), np.asarray(labels), np.asarray(normals)
+    if labels.shape != points.shape[:1]:
+        raise ValueError(f"labels: got shape {labels.shape}, want [{len(points)}] to match points")
+    if normals.shape != points.shape:
+        raise ValueError(f"normals: got shape {normals.shape}, want {points.shape} to match points")
+    known = labels != UNKNOWN_LABEL
+    inherited = np.where(known, labels, BACKGROUND_LABEL).astype(np.int32)
+    begins, ends = _neighbor_pairs(points, max_step)
+    # Known points matter where they border on unknown ones only; the graph is cut down to those.
+    border = np.unique(
+        np.concatenate([begins[known[begins] & ~known[ends]], ends[known[ends] & ~known[begins]]])
+    )
+    if len(border) == 0:
+        return inherited
+    nodes = np.union1d(np.flatnonzero(~known), border)
+    place = np.full(len(points), -1)
+    place[nodes] = np.arange(len(nodes))
+    inner = (place[begins] >= 0) & (place[ends] >= 0)
+    begins, ends = begins[inner], ends[inner]
+    lengths = _path_lengths(points, normals, begins, ends)
+    graph = csr_matrix((lengths, (place[begins], place[ends])), shape=(len(nodes),) * 2)
+    distance, _, source = dijkstra(
+        graph,
+        directed=False,
+        indices=place[border],
+        min_only=True,
+        return_predecessors=True,
+        limit=max_distance,
+    )
+    reached = np.isfinite(distance) & ~known[nodes]
+    inherited[nodes[reached]] = labels[nodes[source[reached]]]
+    return inherited
+
+
+def _neighbor_pairs(points: np.ndarray, max_step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of each point and of its nearest others, a pair a row."""
+    if len(points) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    count = min(_NEIGHBORS + 1, len(points))
+    distances, indices = cKDTree(points).query(points, k=count, distance_upper_bound=max_step)
+    near = np.isfinite(distances) & (indices != np.arange(len(points))[:, None])
+    rows, columns = np.nonzero(near)
+    return rows, indices[rows, columns]
+
+
+def _path_lengths(points, normals, begins, ends) -> np.ndarray:
+    """Length of each step, and what it turns if it turns inwards: normals then lean towards each other."""
+    along = points[begins] - points[ends]
+    before, after = normals[begins], normals[ends]
+    turn = np.arccos(np.clip(np.sum(before * after, axis=1), -1, 1))
+    concave = np.sum((before - after) * along, axis=1) < 0
+    length = np.linalg.norm(along, axis=1) + _METRES_PER_CONCAVE_RADIAN * turn * concave
+    return np.maximum(length, 1e-9)  # a sparse graph takes 0 for "no edge"
+
+
+def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray, expected: Sequence[int]) -> None:
+    """Warn of labels that no pixel has and of labels that have pixels but reached no point."""
+    present = set(np.unique(mask).tolist())
+    absent = sorted(set(expected) - present)
+    if absent:
+        warnings.warn(f"mask: no pixel has label {absent}; it holds {sorted(present)}", stacklevel=3)
+    lost = sorted(present - {BACKGROUND_LABEL} - set(np.unique(labels).tolist()))
+    if lost:
+        warnings.warn(f"mask: label {lost} reached no point (no depth there, or no points)", stacklevel=3)
