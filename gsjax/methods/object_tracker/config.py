@@ -48,7 +48,7 @@ class AlignConfig:
     iterations: int = 6
     """Gauss-Newton iterations a frame; 0 leaves it out."""
     color_scale: float = 0.1
-    """A colour difference that is large, 0 to 1."""
+    """A colour difference that is large, about 0 to 1; see `tones`."""
     depth_scale: float = 0.01
     """A depth difference that is large, metres."""
     centers: int = 256
@@ -59,8 +59,16 @@ class AlignConfig:
     """Pixels of the last frame that speak for a group in each camera, beside its Gaussians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
-    turn: float = 0.2
-    """Turn by which the best start is varied about each axis, radians."""
+    shading: float = 0.3
+    """What brightness counts beside chroma: 1 as much, 0 nothing. What turns is lit differently."""
+    widen: float = 2.0
+    """Factor on both scales while the start may be far off."""
+    reach: float = 0.045
+    """How far a group is looked for by shifting it as it is, metres ..."""
+    spacing: float = 0.015
+    """... in steps of this length, metres."""
+    turns: tuple[float, ...] = (0.2, 0.6)
+    """Turns by which the best start is varied, to either side about each principal axis, radians."""
     max_step: float = 0.1
     """Longest step of one iteration, metres and radians."""
 

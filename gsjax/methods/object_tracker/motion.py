@@ -22,13 +22,11 @@ class Motion(eqx.Module):
     """One frame's motion: a twist a group, about the group's centroid, and a displacement a Gaussian.
 
     Attributes:
-        translations: of each group, metres.
-        rotations: of each group, axis times angle, radians.
+        twists: of each group: translation, metres, and axis times angle, radians.
         delta: of each Gaussian, metres.
     """
 
-    translations: Float[Array, "k 3"]
-    rotations: Float[Array, "k 3"]
+    twists: Float[Array, "k 6"]
     delta: Float[Array, "m 3"]
 
 
@@ -41,25 +39,14 @@ def group_means(
     return total / jnp.maximum(count, 1).reshape(-1, *[1] * (values.ndim - 1))
 
 
-def turn_about(
-    means: Float[Array, "m 3"],
-    twists: Float[Array, "k 6"],
-    centers: Float[Array, "k 3"],
-    groups: Int[Array, "m"],
-) -> Float[Array, "m 3"]:
-    """Each group's means after its twist (translation, rotation vector) about its centre."""
-    member = groups - 1
-    matrix = jaxlie.SO3.exp(twists[:, 3:]).as_matrix()[member]
-    center = centers[member]
-    return center + jnp.einsum("mij,mj->mi", matrix, means - center) + twists[member, :3]
-
-
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
     """Each group turned about its centre and shifted, then each Gaussian shifted by its delta."""
-    twists = jnp.concatenate([motion.translations, motion.rotations], axis=-1)
-    quat = jaxlie.SO3.exp(motion.rotations).wxyz[groups - 1]
-    means = turn_about(pose.means, twists, centers, groups) + motion.delta
-    return Pose(means, multiply_quats(quat, pose.quats))
+    rotation = jaxlie.SO3.exp(motion.twists[:, 3:])
+    member = groups - 1
+    center = centers[member]
+    turned = jnp.einsum("mij,mj->mi", rotation.as_matrix()[member], pose.means - center)
+    means = center + turned + motion.twists[member, :3] + motion.delta
+    return Pose(means, multiply_quats(rotation.wxyz[member], pose.quats))
 
 
 def place(scene: TrackedScene, pose: Pose) -> Gaussians:

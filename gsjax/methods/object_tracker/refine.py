@@ -66,22 +66,19 @@ def refine_loss(
 
 def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Motion, dict[str, Any]]:
     """Adam from `motion`, with rates that fall to a tenth over the iterations."""
-    fade = optax.exponential_decay(1.0, config.iterations, 0.1)
-
-    def rate(value):
-        return optax.adam(lambda i: value * fade(i), b1=0.8, b2=0.95)
-
-    rates = (config.translation_rate, config.rotation_rate, config.delta_rate)
-    names = jax.tree.unflatten(jax.tree.structure(motion), ["translations", "rotations", "delta"])
-    optimizer = optax.multi_transform(dict(zip(jax.tree.leaves(names), map(rate, rates), strict=True)), names)
+    turning = config.rotation_rate if config.se3 else 0.0
+    rates = Motion(
+        jnp.array([config.translation_rate] * 3 + [turning] * 3),
+        jnp.array(config.delta_rate),
+    )
+    optimizer = optax.chain(
+        optax.scale_by_adam(b1=0.8, b2=0.95),
+        optax.scale_by_schedule(optax.exponential_decay(-1.0, config.iterations, 0.1)),
+        optax.stateless(lambda updates, _: jax.tree.map(jnp.multiply, updates, rates)),
+    )
 
     def loss(motion):
-        fixed = (
-            motion
-            if config.se3
-            else Motion(motion.translations, jnp.zeros_like(motion.rotations), motion.delta)
-        )
-        return refine_loss(fixed, batch, step=0, key=None, config=config)
+        return refine_loss(motion, batch, step=0, key=None, config=config)
 
     def iterate(carry, _):
         motion, state = carry

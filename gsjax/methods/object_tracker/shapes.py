@@ -170,7 +170,7 @@ def _cost(poses, means, colors, frame):
             pixels, z = project(moved, viewmat, K)
             size = jnp.array([image.shape[1], image.shape[0]])
             inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-            gap = jnp.abs(bilinear(image, pixels) - colors).mean(-1)
+            gap = jnp.abs(bilinear(image, pixels)[0] - colors).mean(-1)
             return jnp.where(inside, jnp.minimum(gap, _COLOR_LIMIT), _COLOR_LIMIT).mean()
 
         return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images).mean()
@@ -196,7 +196,7 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
         pixels, z = project(scene.gaussians.means, viewmat, K)
         size = jnp.array([image.shape[1], image.shape[0]])
         inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-        return bilinear(image, pixels), inside, bilinear(near[..., None], pixels)[..., 0] > 0.1
+        return bilinear(image, pixels)[0], inside, bilinear(near[..., None], pixels)[0][..., 0] > 0.1
 
     return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images, near)
 
@@ -239,7 +239,7 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> Tracke
     roi = tiles_to_pixels(touched_tiles([pose.means], frame), frame)
     groups = scene.labels[: scene.num_moving]
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
-    still = Motion(jnp.zeros_like(centers), jnp.zeros_like(centers), jnp.zeros_like(pose.means))
+    still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
     motion = _refine_rigidly(still, RefineBatch(scene, frame, plan, pose, centers, roi), config.refine)
     moved = move(pose, motion, centers, groups)
     count = scene.num_moving

@@ -4,22 +4,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers, project
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.object_tracker.align import (
-    Points,
-    align,
-    disagreement,
-    join,
-    pixels_of_groups,
-    sample_groups,
-)
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.matching import lift, match_templates
-from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place, turn_about
+from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
+from gsjax.methods.object_tracker.points import Points, join, pixels_of_groups, sample_groups
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import (
     Needed,
@@ -30,6 +22,7 @@ from gsjax.methods.object_tracker.region import (
     touched_tiles,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.methods.object_tracker.search import judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.frame import Frame
@@ -85,44 +78,28 @@ def seen_from(
     return jax.vmap(one)(frame.cameras.viewmat, frame.cameras.K, rendered.depths, rendered.features)
 
 
-def _stack(motions: list[Motion]) -> Motion:
-    """Hypotheses along a first axis."""
-    return jax.tree.map(lambda *a: jnp.stack(a), *motions)
-
-
-def _choose(residuals: Float[Array, "h k"], motions: Motion, groups: Int[Array, "m"]) -> Motion:
-    """For each group the motion of the hypothesis with the least residual; the first wins ties."""
-    best = jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf), axis=0)
-    group = jnp.arange(best.shape[0])
-    member = jnp.arange(groups.shape[0])
-    return Motion(
-        translations=motions.translations[best, group],
-        rotations=motions.rotations[best, group],
-        delta=motions.delta[best[groups - 1], member],
-    )
-
-
-def _turned(motion: Motion, angle: float) -> Motion:
-    """The motion itself, and the same followed by a turn to either side about each axis: 7 hypotheses."""
-    axes = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3), -jnp.eye(3)])
-    turns = angle * axes.astype(motion.rotations.dtype)
-
-    def one(turn):
-        turn = jnp.broadcast_to(turn, motion.rotations.shape)
-        rotation = jaxlie.SO3.exp(turn) @ jaxlie.SO3.exp(motion.rotations)
-        return Motion(motion.translations, rotation.log(), motion.delta)
-
-    return jax.vmap(one)(turns)
-
-
-def _object_pixels(
-    scene: TrackedScene, pose: Pose, frame: Frame, plan: TrackerPlan, config: TrackerConfig
+def _points(
+    scene: TrackedScene,
+    pose: Pose,
+    seen: Float[Array, "c m"],
+    last: Frame,
+    plan: TrackerPlan,
+    config: TrackerConfig,
 ) -> Points:
-    """Pixels of the last frame that show an object, on sides too that the first frame did not see."""
-    solid = render_labels(scene, pose, frame, plan.full)
+    """What speaks for each group's pose: Gaussians that a camera sees, and pixels of the last frame, which
+    know the sides too that the first frame did not see."""
+    groups = scene.labels[: scene.num_moving]
+    # Only Gaussians that a mask has named: what joined an object later may be a neighbour's.
+    named = jnp.any(scene.normals != 0, axis=-1) | ~jnp.any(scene.normals != 0)
+    count = config.align.centers
+    points = sample_groups(pose.means, _colors(scene), seen * named, groups, scene.num_objects, count)
+    if not config.align.pixels:
+        return points
+    solid = render_labels(scene, pose, last, plan.full)
     assert solid.features is not None
     shown = jnp.where(solid.alphas > 0.5, jnp.argmax(solid.features, axis=-1), 0)
-    return pixels_of_groups(frame, shown, solid.depths, scene.num_objects, config.align)
+    pixels = pixels_of_groups(last, shown, solid.depths, scene.num_objects, config.align)
+    return join(points._replace(seen=config.align.center_weight * points.seen), pixels)
 
 
 def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, reduction: int = 1) -> Step:
@@ -143,8 +120,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
     """
 
     def init(params: Pose) -> TrackerState:
-        nowhere = jnp.zeros((num_objects, 3), params.means.dtype)
-        return TrackerState(Motion(nowhere, nowhere, jnp.zeros_like(params.means)), first_frame, jnp.int32(0))
+        nowhere = Motion(jnp.zeros((num_objects, 6), params.means.dtype), jnp.zeros_like(params.means))
+        return TrackerState(nowhere, first_frame, jnp.int32(0))
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan = batch
@@ -160,39 +137,15 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         )
         jump, found = lift(match, frame, config.match)
 
-        zero = jax.tree.map(jnp.zeros_like, state.motion)
-        start_delta = state.motion.delta
-        still = Motion(zero.translations, zero.rotations, start_delta)
-        jumped = Motion(jnp.where(found[:, None], jump, 0.0), zero.rotations, start_delta)
-        going = state.motion
-        both = Motion(jumped.translations, going.rotations, start_delta)
-        # Only Gaussians that a mask has named speak for the pose; what joined may be a neighbour's.
-        named = jnp.any(scene.normals != 0, axis=-1) | ~jnp.any(scene.normals != 0)
-        points = Points(params.means, _colors(scene), groups, seen * named)
-        points = sample_groups(points, scene.num_objects, config.align.centers)
-        if config.align.pixels:
-            points = points._replace(seen=config.align.center_weight * points.seen)
-            points = join(points, _object_pixels(scene, params, state.frame, plan, config))
-
-        def judge(motion):
-            twists = jnp.concatenate([motion.translations, motion.rotations], axis=-1)
-            means = turn_about(points.means, twists, centers, points.groups)
-            return disagreement(points, means, scene.num_objects, frame, config.align)
-
-        def best_of(motions):
-            return _choose(jax.lax.map(judge, motions), motions, groups)
-
-        def aligned(motions, widen):
-            return jax.lax.map(lambda m: align(m, points, centers, frame, config.align, widen), motions)
-
-        # Every start is aligned, widely at first: far off, the wrong one ends in the wrong place. Then turns
-        # to all sides are tried from the best, because a knock changes a spin from one frame to the next.
-        begun = best_of(aligned(_stack([still, jumped, going, both]), 3.0))
-        begun = best_of(aligned(_turned(begun, config.align.turn), 3.0))
-        begun = best_of(_stack([still, begun, align(begun, points, centers, frame, config.align)]))
-
+        points = _points(scene, params, seen, state.frame, plan, config)
+        still = jnp.zeros_like(state.motion.twists)
+        jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
+        going = state.motion.twists
+        starts = jnp.stack([still, jumped, going, going.at[:, :3].set(jumped[:, :3])])
+        aligned = search(starts, points, centers, frame, config.align)
         if not config.refine.se3:
-            begun = Motion(begun.translations, zero.rotations, begun.delta)
+            aligned = aligned.at[:, 3:].set(0.0)
+        begun = Motion(aligned, state.motion.delta)
         tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
         near = near_background(scene, last, tiles)
         around = near_scene(scene, near, plan.num_near)
@@ -202,9 +155,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         # Points know nothing of outlines, which rendered images do, so these are overruled only where they
         # went clearly astray; without depth the points hardly know better at all.
         lead = 0.1 if frame.depths is None else 0.01
-        verdict = jnp.stack([judge(refined) - lead, judge(begun)])
-        kept = _choose(verdict, _stack([refined, begun]), groups)
-        kept = _mask(kept, visible, groups)
+        of_refined, of_begun = (
+            judge(m.twists, points, centers, frame, config.align) for m in (refined, begun)
+        )
+        better = of_refined - lead <= of_begun
+        nowhere = jax.tree.map(jnp.zeros_like, begun)
+        kept = _select(visible, _select(better, refined, begun, groups), nowhere, groups)
 
         pose = move(params, kept, centers, groups)
         needed = Needed(last.meta.needed.max(), info["needed"], near.sum())
@@ -219,7 +175,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
             "score": match.score,
             "found": found,
             "visible": visible,
-            "residual": judge(kept),
+            "residual": jnp.where(better, of_refined, of_begun),
             "motion": kept,
         }
         return pose, new_state, info
@@ -227,12 +183,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
     return Step(init, update)
 
 
-def _mask(motion: Motion, chosen: Bool[Array, "k"], groups) -> Motion:
-    """No motion for the groups that are not chosen."""
+def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "m"]) -> Motion:
+    """The motion `a` of the chosen groups, and `b` of the others."""
     return Motion(
-        jnp.where(chosen[:, None], motion.translations, 0.0),
-        jnp.where(chosen[:, None], motion.rotations, 0.0),
-        jnp.where(chosen[groups - 1][:, None], motion.delta, 0.0),
+        jnp.where(chosen[:, None], a.twists, b.twists),
+        jnp.where(chosen[groups - 1][:, None], a.delta, b.delta),
     )
 
 
