@@ -16,7 +16,6 @@ from gsjax.methods.object_tracker.motion import (
     group_means,
     move,
     place,
-    turn_about,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.scene.gaussians import gaussians_from_activated
@@ -35,7 +34,7 @@ def pose():
 @pytest.fixture
 def motion():
     rng = np.random.default_rng(2)
-    parts = (rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), 0.01 * rng.normal(size=(COUNT, 3)))
+    parts = (rng.normal(size=(2, 6)), 0.01 * rng.normal(size=(COUNT, 3)))
     return Motion(*(jnp.asarray(a, jnp.float32) for a in parts))
 
 
@@ -51,8 +50,8 @@ def test_move_is_scipys_rotation_about_the_centre_then_the_shifts(pose, motion):
     centers = group_means(pose.means, jnp.asarray(GROUPS), 2)
     moved = move(pose, motion, centers, jnp.asarray(GROUPS))
     for i, k in enumerate(GROUPS - 1):
-        turn = Rotation.from_rotvec(motion.rotations[k])
-        shift = centers[k] + motion.translations[k] + motion.delta[i]
+        turn = Rotation.from_rotvec(motion.twists[k, 3:])
+        shift = centers[k] + motion.twists[k, :3] + motion.delta[i]
         expected = turn.apply(pose.means[i] - centers[k]) + shift
         np.testing.assert_allclose(moved.means[i], expected, atol=1e-5)
 
@@ -60,8 +59,8 @@ def test_move_is_scipys_rotation_about_the_centre_then_the_shifts(pose, motion):
 def test_turning_about_the_centroid_keeps_it(pose, motion):
     groups = jnp.asarray(GROUPS)
     centers = group_means(pose.means, groups, 2)
-    twists = jnp.concatenate([jnp.zeros((2, 3)), motion.rotations], axis=1)
-    turned = turn_about(pose.means, twists, centers, groups)
+    turning = Motion(motion.twists.at[:, :3].set(0.0), jnp.zeros_like(motion.delta))
+    turned = move(pose, turning, centers, groups).means
     np.testing.assert_allclose(group_means(turned, groups, 2), centers, atol=1e-5)
     assert float(jnp.abs(turned - pose.means).max()) > 0.1
 
@@ -74,13 +73,13 @@ def test_orientations_follow_so_covariances_turn_with_their_group(pose, motion):
         axes = np.asarray(quats_to_matrices(quats))
         return axes @ shape @ axes.transpose(0, 2, 1)
 
-    turns = Rotation.from_rotvec(np.asarray(motion.rotations)[GROUPS - 1]).as_matrix()
+    turns = Rotation.from_rotvec(np.asarray(motion.twists)[GROUPS - 1, 3:]).as_matrix()
     expected = turns @ covariances(pose.quats) @ turns.transpose(0, 2, 1)
     np.testing.assert_allclose(covariances(moved.quats), expected, atol=1e-6)
 
 
 def test_no_motion_has_a_gradient_without_nan(pose):
-    still = Motion(jnp.zeros((2, 3)), jnp.zeros((2, 3)), jnp.zeros((COUNT, 3)))
+    still = Motion(jnp.zeros((2, 6)), jnp.zeros((COUNT, 3)))
     groups, centers = jnp.asarray(GROUPS), jnp.zeros((2, 3))
     moved = move(pose, still, centers, groups)
     np.testing.assert_allclose(moved.means, pose.means, atol=1e-6)
