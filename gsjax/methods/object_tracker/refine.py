@@ -67,14 +67,15 @@ def refine_loss(
 def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Motion, dict[str, Any]]:
     """Adam from `motion`, with rates that fall to a tenth over the iterations."""
     turning = config.rotation_rate if config.se3 else 0.0
-    rates = Motion(
-        jnp.array([config.translation_rate] * 3 + [turning] * 3),
-        jnp.array(config.delta_rate),
-    )
+    rates = jnp.array([config.translation_rate] * 3 + [turning] * 3)
+
+    def scaled(updates: Motion, _) -> Motion:
+        return Motion(rates * updates.twists, config.delta_rate * updates.delta)
+
     optimizer = optax.chain(
         optax.scale_by_adam(b1=0.8, b2=0.95),
         optax.scale_by_schedule(optax.exponential_decay(-1.0, config.iterations, 0.1)),
-        optax.stateless(lambda updates, _: jax.tree.map(jnp.multiply, updates, rates)),
+        optax.stateless(scaled),
     )
 
     def loss(motion):

@@ -85,21 +85,22 @@ def _points(
     last: Frame,
     plan: TrackerPlan,
     config: TrackerConfig,
-) -> Points:
+) -> tuple[Points, Int[Array, ""]]:
     """What speaks for each group's pose: Gaussians that a camera sees, and pixels of the last frame, which
-    know the sides too that the first frame did not see."""
+    know the sides too that the first frame did not see. Also the capacity that finding these needed."""
     groups = scene.labels[: scene.num_moving]
     # Only Gaussians that a mask has named: what joined an object later may be a neighbour's.
     named = jnp.any(scene.normals != 0, axis=-1) | ~jnp.any(scene.normals != 0)
     count = config.align.centers
     points = sample_groups(pose.means, _colors(scene), seen * named, groups, scene.num_objects, count)
     if not config.align.pixels:
-        return points
+        return points, jnp.int32(0)
     solid = render_labels(scene, pose, last, plan.full)
     assert solid.features is not None
     shown = jnp.where(solid.alphas > 0.5, jnp.argmax(solid.features, axis=-1), 0)
     pixels = pixels_of_groups(last, shown, solid.depths, scene.num_objects, config.align)
-    return join(points._replace(seen=config.align.center_weight * points.seen), pixels)
+    points = points._replace(seen=config.align.center_weight * points.seen)
+    return join(points, pixels), solid.meta.needed.max()
 
 
 def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, reduction: int = 1) -> Step:
@@ -137,7 +138,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         )
         jump, found = lift(match, frame, config.match)
 
-        points = _points(scene, params, seen, state.frame, plan, config)
+        points, solid_needed = _points(scene, params, seen, state.frame, plan, config)
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
@@ -163,7 +164,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         kept = _select(visible, _select(better, refined, begun, groups), nowhere, groups)
 
         pose = move(params, kept, centers, groups)
-        needed = Needed(last.meta.needed.max(), info["needed"], near.sum())
+        full = jnp.maximum(last.meta.needed.max(), solid_needed)
+        needed = Needed(full, info["needed"], near.sum())
         overflow = needed.exceeds(plan)
         sound = all_finite(pose) & ~overflow
         new_state = TrackerState(kept, frame, state.count + 1)

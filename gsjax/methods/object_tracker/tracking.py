@@ -75,13 +75,19 @@ def start_scene(
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
     tracker = object_tracker(config, num_objects, state.frame, reduction)
-    scene, (pose, state, info) = batch.scene, tracker.update(pose, state, batch, step=step, key=None)
+    scene, frame, plan = batch
+    moved, new_state, info = tracker.update(pose, state, batch, step=step, key=None)
     info["joined"] = jnp.int32(0)
-    if config.grow.slots and batch.frame.depths is not None:
-        rendered = render_labels(scene, pose, batch.frame, batch.plan.full)
-        grown = grow(scene, pose, rendered, batch.frame, state.count, config.grow)
-        scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
-        info["joined"] = config.grow.slots - empty_slots(scene).sum()
+    if not config.grow.slots or frame.depths is None:
+        return scene, moved, new_state, info
+    rendered = render_labels(scene, moved, frame, plan.full)
+    full = jnp.maximum(info["needed"].full, rendered.meta.needed.max())
+    overflow = info["overflow"] | rendered.meta.overflow.any()
+    grown = grow(scene, moved, rendered, frame, new_state.count, config.grow)
+    info |= {"needed": info["needed"]._replace(full=full), "overflow": overflow}
+    info["skipped"] |= overflow
+    scene, pose, state = keep_if(~info["skipped"], (*grown, new_state), (scene, pose, state))
+    info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
 
 

@@ -1,0 +1,107 @@
+"""Surfaces that come into view join the object they continue, and nothing else does."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.methods.object_tracker import first_pose, render_labels
+from gsjax.methods.object_tracker.config import GrowConfig
+from gsjax.methods.object_tracker.grow import EMPTY, empty_slots, grow, unexplained, with_slots
+from gsjax.methods.object_tracker.motion import place
+from gsjax.metrics.tracking import true_labels
+from gsjax.scene.render import plan_render, render
+
+CARTON = 2
+CONFIG = GrowConfig(candidates=64, distance=0.03)  # a pixel of this small table is a centimetre wide
+
+
+@pytest.fixture(scope="module")
+def plan(table, started):
+    return plan_render(started.gaussians, table()[1][0].cameras, headroom=2.0)
+
+
+@pytest.fixture(scope="module")
+def torn(started):
+    """The scene without the half of the carton that lies to one side: never seen, as it were."""
+    member = np.asarray(started.labels) == started.label_ids.index(CARTON)
+    x = np.asarray(started.gaussians.means[:, 0])
+    gone = member & (x > np.median(x[member]))
+    logits = jnp.where(gone, EMPTY, started.gaussians.logit_opacities)
+    far = jnp.where(gone[:, None], 100.0, started.gaussians.means)
+    return eqx.tree_at(lambda s: (s.gaussians.logit_opacities, s.gaussians.means), started, (logits, far))
+
+
+def grown(scene, frame, plan, steps=1, config=CONFIG):
+    pose = first_pose(scene)
+
+    @jax.jit
+    def once(scene, pose, step):
+        rendered = render_labels(scene, pose, frame, plan)
+        return grow(scene, pose, rendered, frame, step, config)
+
+    for step in range(steps):
+        scene, pose = once(scene, pose, step)
+    return scene, pose
+
+
+def test_slots_draw_nothing_and_belong_to_nobody(table, started, plan):
+    frame = table()[1][0]
+    slotted = with_slots(started, 32)
+    assert slotted.num_moving == started.num_moving + 32
+    assert int(empty_slots(slotted).sum()) == 32
+    assert not empty_slots(started).any()
+    before = render(started.gaussians, frame.cameras, plan)
+    after = render(slotted.gaussians, frame.cameras, plan)
+    np.testing.assert_allclose(after.colors, before.colors, atol=1e-6)
+    labels = np.asarray(render_labels(slotted, first_pose(slotted), frame, plan).features)
+    assert labels.shape[-1] == started.num_objects + 1
+
+
+def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
+    sequence, frames, _ = table()
+    scene, pose = grown(with_slots(torn, 256), frames[0], plan, steps=6)
+    new = slice(torn.num_moving, scene.num_moving)
+    joined = ~np.asarray(empty_slots(scene))[new]
+    values = np.asarray(scene.label_ids)[np.asarray(scene.labels)[new][joined]]
+    assert (values == CARTON).sum() >= 8  # one pixel in four is looked at
+    where = np.asarray(pose.means)[new][joined]
+    masks, depths = [[np.asarray(a(0, c)) for c in range(2)] for a in (sequence.mask, sequence.depth)]
+    truth = true_labels(where, masks, depths, sequence.viewmats[0], sequence.Ks[0])
+    assert (truth[values == CARTON] == CARTON).mean() > 0.9
+    # They stand where they were seen, in its colour, and are drawn with the object's label.
+    drawn = np.asarray(render_labels(scene, pose, frames[0], plan).features)
+    share = drawn[..., scene.label_ids.index(CARTON)] > 0.5
+    torn_share = np.asarray(render_labels(torn, first_pose(torn), frames[0], plan).features)
+    assert share.sum() > (torn_share[..., torn.label_ids.index(CARTON)] > 0.5).sum() + 30
+
+
+def test_a_scene_that_explains_all_grows_little(table, started, plan):
+    frame = table()[1][0]
+    scene, _ = grown(with_slots(started, 256), frame, plan)
+    rendered = render(place(started, first_pose(started)), frame.cameras, plan)
+    assert np.asarray(unexplained(rendered, frame, CONFIG)).mean() < 0.02
+    assert 256 - int(empty_slots(scene).sum()) <= 32
+
+
+def test_full_slots_overwrite_nothing(table, torn, plan):
+    frame = table()[1][0]
+    few = with_slots(torn, 3)
+    scene, pose = grown(few, frame, plan, steps=3)
+    assert not np.asarray(empty_slots(scene)).any()
+    kept = np.r_[0 : torn.num_moving, few.num_moving : few.gaussians.num]
+    np.testing.assert_array_equal(scene.gaussians.means[kept], few.gaussians.means[kept])
+    np.testing.assert_array_equal(scene.labels[kept], few.labels[kept])
+    again, _ = grown(scene, frame, plan)
+    np.testing.assert_array_equal(again.gaussians.means, scene.gaussians.means)
+    assert jnp.isfinite(pose.means).all()
+
+
+def test_reach_and_distance_of_nothing_grow_nothing(table, torn, plan):
+    frame = table()[1][0]
+    for config in (replace(CONFIG, distance=1e-6), replace(CONFIG, min_gap=10.0)):
+        scene, _ = grown(with_slots(torn, 64), frame, plan, config=config)
+        assert int(empty_slots(scene).sum()) >= 60
