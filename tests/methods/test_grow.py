@@ -70,7 +70,7 @@ def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
     assert (values == CARTON).sum() >= 8  # one pixel in four is looked at
     where = np.asarray(pose.means)[new][joined]
     masks, depths = [[np.asarray(a(0, c)) for c in range(2)] for a in (sequence.mask, sequence.depth)]
-    truth = true_labels(where, masks, depths, sequence.viewmats[0], sequence.Ks[0])
+    truth = true_labels(where, masks, depths, list(sequence.viewmats[0]), list(sequence.Ks[0]))
     assert (truth[values == CARTON] == CARTON).mean() > 0.9
     # They stand where they were seen, in its colour, and are drawn with the object's label.
     drawn = np.asarray(render_labels(scene, pose, frames[0], plan).features)
