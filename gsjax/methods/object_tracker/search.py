@@ -83,7 +83,8 @@ def search(
 ) -> Float[Array, "k 6"]:
     """The twist of each group that agrees best with the images; no worse than the first start.
 
-    Every start is aligned, and so is the best shift of a coarse grid, for what has no texture to match.
+    Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
+    match.
     Then turns to all sides are tried from the best, because a knock changes a spin from one frame to the
     next, and a round thing may roll without its shape changing.
 
@@ -101,7 +102,8 @@ def search(
     def aligned(twists):
         return jax.lax.map(lambda t: align(t, points, centers, frame, widened(config)), twists)
 
-    shifted = _shifted(points, centers, frame, config)
-    best = best_of(aligned(jnp.concatenate([starts, shifted[None]])))
+    if frame.depths is not None:  # by colour alone, a plain thing would slide about within its outline
+        starts = jnp.concatenate([starts, _shifted(points, centers, frame, config)[None]])
+    best = best_of(aligned(starts))
     best = best_of(aligned(turned(best, principal_axes(points, centers), config.turns)))
     return best_of(jnp.stack([starts[0], best, align(best, points, centers, frame, config)]))
