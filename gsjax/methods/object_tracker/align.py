@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from gsjax.geometry.cameras import world_to_camera
+from gsjax.geometry.cameras import project
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.points import Points, carry
 from gsjax.scene.frame import Frame
@@ -64,14 +64,12 @@ def _residuals(points: Points, frame: Frame, config: AlignConfig) -> Residuals:
     height, width = frame.images.shape[1:3]
 
     def one(viewmat, K, image, depth):
-        local = world_to_camera(points.means, viewmat)
-        z = jnp.maximum(local[:, 2], 1e-6)
-        pixels = (local @ K.T)[:, :2] / z[:, None]
+        pixels, z = project(points.means, viewmat, K)
         # d pixel / d point = (K - pixel e_z^T) / z, turned into the world's axes.
         axis = viewmat[2, :3]
-        moves = (K[:2] @ viewmat[:3, :3] - pixels[:, :, None] * axis) / z[:, None, None]
+        moves = (K[:2] @ viewmat[:3, :3] - pixels[:, :, None] * axis) / jnp.maximum(z, 1e-6)[:, None, None]
         inside = (pixels > 0.5).all(-1) & (pixels < jnp.array([width, height]) - 0.5).all(-1)
-        inside &= local[:, 2] > 1e-3
+        inside &= z > 1e-3
         colors, slopes = bilinear(image, pixels)
         values = (colors - tones(points.colors, config.shading)) / config.color_scale
         gradients = slopes @ moves / config.color_scale
