@@ -13,7 +13,7 @@ STACK = ("geometry", "rasterize", "scene", "losses", "optim", "methods")  # each
 BESIDE = {
     "perception": {"geometry"},
     "metrics": {"geometry"},
-    "data": {"geometry", "scene"},
+    "data": {"geometry", "scene", "io"},
     "io": {"scene"},
     "viz": {"scene"},
 }

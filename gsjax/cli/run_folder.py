@@ -14,13 +14,14 @@ from gsjax.io.atomic import atomic_write, write_json, write_npz
 _FILES = ("config.yml", "metrics.json", "trajectory.npz", "scene.ply", "report.html")
 _FOLDERS = ("renders", "plots")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
+_SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
 class RunFolder:
     """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
 
         RUN/
-          config.yml              the settings, written first
+          config.yml              the settings, written first; its first line marks the folder as a run's
           metrics.json            every score; what could not be computed is null
           trajectory.npz          means [T,N,3], labels [N], label_ids [K+1], times [T], update_s [T]
           scene.ply               the Gaussians of the first frame, with their labels
@@ -38,7 +39,8 @@ class RunFolder:
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
-            overwrite: clear an earlier run although it is finished. Files that no run writes are kept.
+            overwrite: clear an earlier run although it is finished. What a run does not write beside it is
+                kept; renders/ and plots/ are cleared whole.
 
         Raises:
             FileExistsError: a finished run is there and `overwrite` is off.
@@ -53,11 +55,12 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def _claim(self, overwrite: bool) -> None:
-        # config.yml is written first, so a folder without it is none of ours: delete nothing there.
-        if not (self.path / "config.yml").is_file():
+        # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
+        config = self.path / "config.yml"
+        if not config.is_file() or not config.read_bytes().startswith(_SIGNATURE.encode()):
             raise FileExistsError(
-                f"{self.path}: expected a new folder, an empty one or one of a run (with config.yml), "
-                "found other files; name another folder"
+                f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
+                f"with {_SIGNATURE!r}), found other files; name another folder"
             )
         if self.finished and not overwrite:
             raise FileExistsError(
@@ -104,7 +107,7 @@ class RunFolder:
         """
         text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
         with atomic_write(self.path / "config.yml") as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(f"{_SIGNATURE}\n{text}", encoding="utf-8")
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Writes metrics.json; numbers that are not finite become null."""

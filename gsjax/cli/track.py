@@ -75,15 +75,17 @@ def run(options: Options) -> int:
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
         _say_if_stopped(tracking, recording, notes)
-        found, report = _judge(folder, tracking, recording, mask, seconds, notes, console)
+        found, report, failed = _judge(folder, tracking, recording, mask, seconds, notes, console)
         seconds["total"] = perf_counter() - begun
         found |= {"seconds": seconds, "notes": notes.all}
         folder.write_metrics(found)
         write_run_report(folder, found, **report)
     print_summary(folder, found)
-    if tracking.stopped is None or isinstance(tracking.stopped, KeyboardInterrupt):
-        return 0 if tracking.stopped is None else 130
-    raise tracking.stopped
+    if isinstance(tracking.stopped, KeyboardInterrupt):
+        return 130
+    if error := tracking.stopped or failed:
+        raise error
+    return 0
 
 
 def _start(
@@ -129,17 +131,18 @@ def _judge(
     seconds: dict[str, float],
     notes: Notes,
     console: Console,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Render and score what was tracked. Ctrl-C ends it; what was scored until then counts.
+) -> tuple[dict[str, Any], dict[str, Any], Exception | None]:
+    """Render and score what was tracked. Ctrl-C or an error ends it; what was scored until then counts.
 
     Returns:
-        What metrics.json holds but for seconds and notes, and what the report shows beside it.
+        What metrics.json holds but for seconds and notes, what the report shows beside it, and what ended
+        the scoring early, or None.
     """
     begun = perf_counter()
     values = group_values(tracking, mask, recording)
     colors = np.asarray(tracking.scene.label_ids) if values is None else values
     truth = recording.tracked.truth
-    scores = Scores(values, None if truth is None else truth.robot)
+    scores, failed = Scores(values, None if truth is None else truth.robot), None
     try:
         with Film(folder, recording, tracking.num_frames, colors) as film, console.status("") as status:
             for frame in views(tracking, recording):
@@ -147,8 +150,10 @@ def _judge(
                 for view in frame:
                     scores.add(view)
                     film.add(view)
-    except KeyboardInterrupt:
-        notes.warn(f"scoring was stopped by Ctrl-C after {scores.num_frames} of {tracking.num_frames} frames")
+    except (KeyboardInterrupt, Exception) as error:
+        scored = f"{scores.num_frames} of {tracking.num_frames} frames"
+        notes.warn(f"scoring was stopped after {scored} by {_reason(error)}")
+        failed = error if isinstance(error, Exception) else None
     motion = score_motion(tracking, recording)
     names = object_names(tracking, recording, mask, values)
     seconds["evaluation"] = perf_counter() - begun
@@ -159,7 +164,7 @@ def _judge(
         "plots": write_plots(folder, tracking, recording, scores, motion, names, colors),
         "first_mask": write_first_mask(folder, recording, mask),
     }
-    return found, report
+    return found, report, failed
 
 
 def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """Single files: JSON, images, depth and masks, each checked as it is read."""
 
 import json
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,24 @@ def read_json(path: Path) -> Any:
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file by name; that of an .npy file stands under "". Nothing is unpickled.
+
+    Raises:
+        DataError: the file is missing, cut off, or holds no plain arrays.
+    """
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return {"": loaded}
+        with loaded:
+            return dict(loaded)
+    except FileNotFoundError:
+        raise DataError(path, "arrays", "no such file", "Check the folder; was it copied whole?") from None
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
 
 
 def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -10,7 +10,6 @@ truth.npz, meta.json   simulated scenes: T_wo [T,K,4,4] with meta's objects (lab
                        T_wp [T,K,4,4] with meta's parts (labels 1..)
 """
 
-import json
 import re
 import warnings
 from pathlib import Path
@@ -20,8 +19,9 @@ import cv2
 import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.files import read_depth, read_image, read_json, read_mask
+from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
 from gsjax.data.sequence import Sequence, Truth
+from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 DEFAULT_RATE_HZ = 30.0
 DEFAULT_DEPTH_UNIT_M = 0.001
@@ -88,25 +88,36 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
     Args:
         sequence: what to save; every frame of it is loaded.
         path: a folder; it is made, and files of the same names in it are replaced.
-        depth_unit_m: metres of one step of depth; 65534 steps are the farthest that can be saved.
+        depth_unit_m: metres of one step of depth; 65534 steps are the farthest that can be saved. What is
+            farther becomes invalid, with a DataWarning that counts it.
 
     Raises:
-        ValueError: the truth has other labels.
+        ValueError: the truth has other labels, or a mask has labels beyond 0 to 65535.
     """
     root = Path(path)
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
         raise ValueError(f"write_panoptic needs objects labelled 2, 3, ..., got {truth.label_ids.tolist()}")
     names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
+    too_far = 0
     for t, frame in enumerate(names):
         for c, name in enumerate(frame):
             _write_image(root / "ims" / name, cv2.cvtColor(sequence.image(t, c), cv2.COLOR_RGB2BGR))
             depth, mask = sequence.depth(t, c), sequence.mask(t, c)
             if depth is not None:
                 steps = np.round(depth / depth_unit_m)
-                _write_image(root / "depth" / name, np.where(steps < 65535, steps, 0).astype(np.uint16))
+                fits = steps < SATURATED_DEPTH
+                too_far += np.sum(~fits)
+                _write_image(root / "depth" / name, np.where(fits, steps, 0).astype(np.uint16))
             if mask is not None:
-                _write_image(root / "seg" / name, mask.astype(np.uint8))
+                if mask.min() < 0 or mask.max() > 65535:
+                    found = f"{mask.min()} to {mask.max()} in frame {t}"
+                    raise ValueError(f"write_panoptic saves labels from 0 to 65535, got {found}")
+                _write_image(root / "seg" / name, mask.astype(np.uint8 if mask.max() < 256 else np.uint16))
+    if too_far:
+        farthest = (SATURATED_DEPTH - 1) * depth_unit_m
+        message = f"{root}: {too_far} pixels farther than {farthest:.4g} m have lost their depth"
+        warnings.warn(f"{message}; a larger depth_unit_m keeps them", DataWarning, stacklevel=2)
     meta = {
         "w": sequence.width,
         "h": sequence.height,
@@ -117,11 +128,10 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
         "time": sequence.times.tolist(),
         "depth_unit_m": depth_unit_m,
     }
-    (root / META_NAMES[0]).write_text(json.dumps(meta))
     if truth is not None:
-        np.savez_compressed(root / "truth.npz", T_wo=truth.poses)
-        described = {"objects": list(truth.names), "seg": "0 scene, 1 robot, 2+i objects[i]"}
-        (root / "meta.json").write_text(json.dumps(described, indent=1))
+        write_npz(root / "truth.npz", {"T_wo": truth.poses})
+        write_json(root / "meta.json", {"objects": truth.names, "seg": "0 scene, 1 robot, 2+i objects[i]"})
+    write_json(root / META_NAMES[0], meta)  # last: a folder that has it is whole
 
 
 def _read_metas(root: Path) -> dict[str, Any]:
@@ -147,10 +157,23 @@ def _read_metas(root: Path) -> dict[str, Any]:
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
-    meta = read_json(path)
+    try:
+        return _checked(path, read_json(path))
+    except (TypeError, KeyError, OverflowError) as error:  # a number where a list belongs, and the like
+        found = f"something else ({error})"
+        raise DataError(path, "lists and numbers as this layout has them", found, _ADVICE_META) from None
+
+
+def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
     missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
     if missing:
         raise DataError(path, "the keys w, h, k, w2c, fn, cam_id", f"no {', '.join(missing)}", _ADVICE_META)
+    for key in ("w", "h"):
+        if not isinstance(meta[key], int) or meta[key] < 1:
+            raise DataError(path, f"a whole number of pixels as {key}", repr(meta[key]), _ADVICE_META)
+    unit = meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M)
+    if not isinstance(unit, (int, float)) or not 0 < unit < np.inf:
+        raise DataError(path, "metres, more than 0, as depth_unit_m", repr(unit), _ADVICE_META)
     frames, cameras = len(meta["fn"]), len(meta["cam_id"][0]) if meta["cam_id"] else 0
     if frames == 0 or cameras == 0:
         raise DataError(path, "at least one frame and one camera", f"{frames} and {cameras}", _ADVICE_META)
@@ -202,17 +225,15 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
     if not (path.exists() and (root / "meta.json").exists()):
         return None
     described = read_json(root / "meta.json")
-    with np.load(path) as arrays:
-        for key, names_key, first_label, robot in (("T_wo", "objects", 2, 1), ("T_wp", "parts", 1, None)):
-            if key in arrays and names_key in described:
-                names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
-                if poses.shape != (frames, len(names), 4, 4):
-                    expected = (
-                        f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
-                    )
-                    raise DataError(path, expected, f"{poses.shape}", "Make the truth again.")
-                labels = np.arange(first_label, first_label + len(names))
-                return Truth(names=names, label_ids=labels, poses=poses[present], robot=robot)
+    arrays = read_arrays(path)
+    for key, names_key, first_label, robot in (("T_wo", "objects", 2, 1), ("T_wp", "parts", 1, None)):
+        if key in arrays and names_key in described:
+            names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
+            if poses.shape != (frames, len(names), 4, 4):
+                expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
+                raise DataError(path, expected, f"{poses.shape}", "Make the truth again.")
+            labels = np.arange(first_label, first_label + len(names))
+            return Truth(names=names, label_ids=labels, poses=poses[present], robot=robot)
     return None
 
 
@@ -242,6 +263,8 @@ def _frame_number(name: str, fallback: int) -> int:
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), image):
-        raise DataError(path, "a place to write an image", "no way to write there", "Choose another folder.")
+    with atomic_write(path) as temporary:
+        if not cv2.imwrite(str(temporary), image):
+            raise DataError(
+                path, "a place to write an image", "no way to write there", "Choose another folder."
+            )

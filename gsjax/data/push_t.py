@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.errors import DataError
-from gsjax.data.files import read_json
+from gsjax.data.files import read_arrays, read_json
 from gsjax.data.sequence import PointModel, Sequence
 from gsjax.data.video import Video
 from gsjax.geometry.cameras import viewmat_from_opengl
@@ -103,7 +103,7 @@ def _read_models(root: Path) -> tuple[PointModel, ...]:
     )
     models = []
     if ground.exists() and plane is not None:
-        models.append(_ground_model(np.load(ground), plane))
+        models.append(_ground_model(read_arrays(ground)[""], plane))
     if block.exists():
         models.append(_block_model(block, plane))
     return tuple(models)

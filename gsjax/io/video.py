@@ -45,7 +45,7 @@ class VideoWriter:
 
         Raises:
             ValueError: the frame is no [H, W, 3] picture or not of the size of the first.
-            RuntimeError: ffmpeg failed; the message holds its own.
+            OSError: ffmpeg failed; the message holds its own.
         """
         pixels = _to_bytes(np.asarray(frame))
         height, width = pixels.shape[:2]
@@ -95,16 +95,16 @@ class _Encoder:
         )
 
     def write(self, data: bytes) -> None:
-        """Feed it; RuntimeError with its own words if it has stopped."""
+        """Feed it; OSError with its own words if it has stopped."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(data)
         except BrokenPipeError as error:
             self._process.wait()
-            raise RuntimeError(f"ffmpeg stopped: {self._said()}") from error
+            raise OSError(f"ffmpeg stopped: {self._said()}") from error
 
     def finish(self) -> None:
-        """End the file and the process; RuntimeError with its own words if it failed."""
+        """End the file and the process; OSError with its own words if it failed."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -112,7 +112,7 @@ class _Encoder:
         message = self._said()
         self._messages.close()
         if failed:
-            raise RuntimeError(f"ffmpeg could not write the video: {message}")
+            raise OSError(f"ffmpeg could not write the video: {message}")
 
     def _said(self) -> str:
         self._messages.seek(0)

@@ -64,9 +64,18 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 
 
 def per_field_adam(rates: dict[str, Any], default: float = 0.0) -> optax.GradientTransformation:
-    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module; the others stand still."""
+    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module; the others stand still.
+
+    Raises:
+        ValueError: from the optimizer's init, where a rate is for a field that the module lacks.
+    """
 
     def label(params):
+        fields = params._fields if isinstance(params, tuple) else tuple(vars(params))
+        unknown = [name for name in rates if name not in fields]
+        if unknown:
+            raise ValueError(f"rates: {type(params).__name__} has no field {unknown[0]!r}; it has {fields}")
+
         def of(path, _):
             name = getattr(path[0], "name", str(path[0]))
             return name if name in rates else "rest"

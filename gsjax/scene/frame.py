@@ -1,7 +1,8 @@
 """What a set of cameras sees at one moment, as arrays."""
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 
@@ -13,10 +14,19 @@ class Frame(eqx.Module):
         images: RGB, 0 to 1.
         depths: metres, 0 where unknown; None without depth cameras.
         cameras: C cameras (viewmat [C,4,4], K [C,3,3]), which may move from frame to frame.
-        weights: how much each pixel counts, 0 to 1; None counts all.
     """
 
     images: Float[Array, "c height width 3"]
     depths: Float[Array, "c height width"] | None
     cameras: Camera
-    weights: Float[Array, "c height width"] | None = None
+
+
+def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
+    """The frame with pixels that are not finite made black and without depth, as `Sequence` reads them, and
+    their number. Such a pixel would otherwise turn every sum that it enters into NaN."""
+    broken = ~jnp.isfinite(frame.images).all(-1)
+    if frame.depths is not None:
+        broken |= ~jnp.isfinite(frame.depths)
+    images = jnp.where(broken[..., None], 0.0, frame.images)
+    depths = None if frame.depths is None else jnp.where(broken, 0.0, frame.depths)
+    return Frame(images, depths, frame.cameras), broken.sum()

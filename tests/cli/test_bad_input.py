@@ -215,3 +215,54 @@ def test_no_depth_and_no_shapes(refused, recording):
     for folder in (recording / "depth").iterdir():
         folder.rmdir()
     assert "depth" in refused(recording)
+
+
+@pytest.mark.parametrize("frame", [0, 2])
+def test_a_bad_held_out_image_keeps_the_run_and_its_report(gsjax_track, recording, tmp_path, still, frame):
+    (recording / "ims" / "2" / f"{frame:06d}.png").write_bytes(b"nonsense")
+    code, said = gsjax_track(recording, "--cameras", "0", "1", "--eval-cameras", "2")
+    assert code == 2
+    assert f"2/{frame:06d}.png: expected an image" in said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (found["complete"], found["frames"]["tracked"], found["frames"]["scored"]) == (False, 4, frame)
+    assert f"2/{frame:06d}.png" in " ".join(found["notes"])
+    assert "partial run" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_a_truth_that_is_cut_off(refused, recording):
+    path = recording / "truth.npz"
+    path.write_bytes(path.read_bytes()[:200])
+    assert "truth.npz: expected plain arrays" in refused(recording)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("fn", 3, "expected lists and numbers as this layout has them"),
+        ("cam_id", [5], "expected lists and numbers as this layout has them"),
+        ("w", "80", "expected a whole number of pixels as w, found '80'"),
+        ("depth_unit_m", 0, "expected metres, more than 0, as depth_unit_m, found 0"),
+    ],
+)
+def test_a_meta_of_other_types(refused, recording, key, value, says):
+    change_meta(recording, lambda meta: meta.update({key: value}))
+    said = refused(recording)
+    assert "train_meta.json" in said
+    assert says in said
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("headroom", "0.5", "TrackerConfig.headroom: expected 1 or more, found 0.5"),
+        ("start.part-size", "0", "StartConfig.part_size: expected more than 0, found 0"),
+        ("refine.iterations", "0", "RefineConfig.iterations: expected 1 or more, found 0"),
+        ("align.spacing", "nan", "AlignConfig.spacing: expected more than 0, found nan"),
+    ],
+)
+def test_settings_without_a_meaning(gsjax_track, pristine, capfd, option, value, says):
+    with pytest.raises(SystemExit) as left:
+        gsjax_track(pristine, f"--tracker.{option}", value)
+    assert left.value.code == 2
+    said = capfd.readouterr().err
+    assert says in " ".join(said.replace("│", " ").split())

@@ -111,3 +111,14 @@ def test_file_in_place_of_a_folder(tmp_path):
 
 def test_empty_folder_is_taken(tmp_path):
     assert RunFolder(tmp_path).path == tmp_path
+
+
+def test_a_config_of_another_program_makes_no_run(tmp_path):
+    (tmp_path / "plots").mkdir()
+    mine = {"config.yml": "theme: dark\n", "scene.ply": "ply\n", "plots/thesis.png": "x"}
+    for name, text in mine.items():
+        (tmp_path / name).write_text(text)
+    for overwrite in (False, True):
+        with pytest.raises(FileExistsError, match="found other files"):
+            RunFolder(tmp_path, overwrite=overwrite)
+    assert {name: (tmp_path / name).read_text() for name in mine} == mine

@@ -73,7 +73,10 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
     found = json.loads((run / "metrics.json").read_text())
     assert found["complete"] is True
     assert list(found["objects"]) == ["robot", "carton", "can", "ball", "block"]
-    assert found["objects"]["carton"]["centroid_error_mm"] < 50
+    # The can, which is all that moves in these frames, is ahead of one that was left behind.
+    can = found["objects"]["can"]
+    assert can["moved_mm"] > 15
+    assert can["centroid_error_mm"] < 0.5 * can["moved_mm"]
     assert found["objects"]["robot"]["centroid_error_mm"] is None
     assert 0 < found["iou"]["robot"] <= 1
     assert 0 < found["iou_held_out"]["robot"] <= 1

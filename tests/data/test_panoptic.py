@@ -338,3 +338,26 @@ def test_frames_without_a_number_are_counted(folder):
             (folder.root / f"ims/{c}/{t:06d}.jpg").rename(folder.root / f"ims/{c}/frame_{'abc'[t]}.jpg")
     folder.meta["fn"] = [[f"{c}/frame_{letter}.jpg" for c in (0, 1)] for letter in "abc"]
     assert folder.read().frame_ids == (0, 1, 2)
+
+
+def _labelled(mask_value, depth=1.0):
+    """A sequence whose masks and depths are all of one value."""
+    sequence = replace(tabletop(frames=1, width=WIDTH, height=HEIGHT), truth=None)
+    shape = (HEIGHT, WIDTH)
+    return replace(
+        sequence,
+        load_mask=lambda t, c: np.full(shape, mask_value, np.int32),
+        load_depth=lambda t, c: np.full(shape, depth, np.float32),
+    )
+
+
+def test_large_labels_survive_the_disk_and_negative_ones_are_refused(tmp_path):
+    write_panoptic(_labelled(300), tmp_path / "large")
+    assert (read_panoptic(tmp_path / "large").mask(0, 0) == 300).all()
+    with pytest.raises(ValueError, match="labels from 0 to 65535, got -1"):
+        write_panoptic(_labelled(-1), tmp_path / "negative")
+
+
+def test_depth_too_far_to_be_saved_is_counted(tmp_path):
+    with pytest.warns(DataWarning, match=rf"{3 * WIDTH * HEIGHT} pixels farther than 6.553 m"):
+        write_panoptic(_labelled(1, depth=8.0), tmp_path)

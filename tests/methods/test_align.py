@@ -15,7 +15,15 @@ from gsjax.methods.object_tracker.align import (
     tones,
 )
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, carry, join, pixels_of_groups, sample_groups
+from gsjax.methods.object_tracker.points import (
+    Points,
+    carry,
+    carry_keyframe,
+    first_keyframe,
+    join,
+    pixels_of_groups,
+    renewed,
+)
 from gsjax.methods.object_tracker.search import ball, principal_axes, search, turned
 
 CONFIG = AlignConfig(iterations=12)
@@ -108,17 +116,27 @@ def test_only_pixels_of_the_group_are_picked(moved, table):
         assert {tuple(row) for row in np.asarray(points.colors[0])[chosen]} <= {tuple(row) for row in colors}
 
 
-def test_samples_are_capped_and_never_strangers():
-    groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
-    means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
-    few = sample_groups(means, means, jnp.ones((2, 40)), groups, 4, 8)
-    assert few.means.shape == (4, 8, 3)
-    real = np.asarray(few.seen[:, 0]) > 0
-    np.testing.assert_array_equal(real.sum(1), [8, 3, 0, 7])
-    np.testing.assert_array_equal(few.means[real, 0], np.nonzero(real)[0] + 1)
-    both = join(few, few)
-    assert both.seen.shape == (4, 2, 16)
-    assert both.means.shape == (4, 16, 3)
+def test_join_holds_the_points_of_both(moved):
+    points = moved[0]
+    both = join(points, points._replace(means=points.means + 1))
+    count = points.means.shape[1]
+    assert both.seen.shape == (1, 2, 2 * count)
+    np.testing.assert_array_equal(both.means[:, :count] + 1, both.means[:, count:])
+
+
+def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
+    def pixels(value):
+        return Points(jnp.full((2, 3, 3), value), jnp.full((2, 3, 3), value), jnp.ones((2, 1, 3)))
+
+    keyframe, centers = first_keyframe(pixels(1.0)), jnp.ones((2, 3))
+    twists = jnp.zeros((2, 6)).at[:, 0].set(0.1).at[0, 5].set(0.3)  # the first group turns by 0.3
+    for turn, expected in ((0.3, [1.0, 1.0]), (0.6, [2.0, 1.0])):
+        keyframe = renewed(carry_keyframe(keyframe, twists, centers), pixels(2.0), 0.5)
+        np.testing.assert_allclose(keyframe.points.colors[:, 0, 0], expected, err_msg=str(turn))
+    # Not renewed, so carried twice; renewed, so new, and unturned.
+    np.testing.assert_allclose(keyframe.points.means[1, 0], [1.2, 1.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(keyframe.points.means[0, 0], [2.0, 2.0, 2.0])
+    np.testing.assert_allclose(keyframe.turned, [[1, 0, 0, 0], [1, 0, 0, 0]], atol=1e-6)
 
 
 def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():

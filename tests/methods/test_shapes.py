@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -90,6 +91,20 @@ def test_a_pose_is_found_on_the_plane(frame):
     distance, turn = miss(pose)
     assert distance < 12e-3  # what lies inside the block's outline costs nothing: rendering does the rest
     assert turn < 6
+
+
+def test_the_plane_may_lie_any_way_in_the_world(frame):
+    """The same in a world whose ground is a wall, and slanted."""
+    world = np.eye(4)
+    world[:3, :3] = Rotation.from_euler("yx", [80, 25], degrees=True).as_matrix()
+    cameras = eqx.tree_at(
+        lambda c: c.viewmat, frame.cameras, frame.cameras.viewmat @ jnp.asarray(world.T, jnp.float32)
+    )
+    turned = Frame(frame.images, None, cameras)
+    model = block(plane=np.array([*world[:3, 2], 0.0]))
+    pose = find_pose(model, turned, ground().means @ world[:3, :3].T)
+    distance, _ = miss(world.T @ pose)
+    assert distance < 12e-3
 
 
 def test_a_scene_from_shapes_is_posed_coloured_and_labelled(frame):

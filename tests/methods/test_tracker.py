@@ -8,8 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.object_tracker import first_pose, start_scene, track, tracking
+from gsjax.methods.object_tracker import (
+    MatchConfig,
+    TrackedScene,
+    TrackerConfig,
+    first_pose,
+    start_scene,
+    track,
+    tracking,
+)
+from gsjax.methods.object_tracker.grow import with_slots
 from gsjax.methods.object_tracker.tracker import TrackerBatch, object_tracker, plan_tracker
+from gsjax.optim.step import Step
+from gsjax.scene.gaussians import take
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +38,21 @@ def test_objects_are_followed(table, started, tracked, centroid_errors):
         assert not result.info["skipped"]
     assert tracked[0].compile_seconds > 0
     assert tracked[-1].compile_seconds == 0
+
+
+def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_errors):
+    """Frames in which the gripper carries the carton while the can rolls and the ball flies."""
+    sequence, frames, _ = table(11)
+    start = 7
+    late = sequence.select(slice(start, None))
+    scene = start_scene(frames[start], late.mask(0, 0), 0, quick)
+    *_, last = track(scene, frames[start], frames[start + 1 :], quick)
+    moved = centroid_errors(late, scene, first_pose(scene), late.num_frames - 1)
+    errors = centroid_errors(late, scene, last.pose, late.num_frames - 1)
+    movers = [name for name, metres in moved.items() if metres > 15e-3]
+    assert movers, moved
+    for name in movers:
+        assert errors[name] < 0.25 * moved[name], (name, errors, moved)
 
 
 def test_labels_keep_the_masks_values(table, started):
@@ -50,19 +76,20 @@ def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, start
 def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick, monkeypatch):
     """Capacities too small for the scene, in the step alone and then under `track`."""
     _, frames, _ = table()
-    plan = plan_tracker(started, first_pose(started), frames[1], quick.headroom)
+    scene = with_slots(started, quick.grow.slots)  # as track would
+    pose = first_pose(scene)
+    plan = plan_tracker(scene, pose, frames[0], quick.headroom)
     small = replace(plan, num_near=16, full=replace(plan.full, capacity=4096))
-    step = object_tracker(quick, started.num_objects, frames[0])
-    pose = first_pose(started)
-    state = step.init(pose)
-    batch = TrackerBatch(started, frames[1], small)
+    step = object_tracker(quick, scene.num_objects, TrackerBatch(scene, frames[0], plan))
+    state = jax.jit(step.init)(pose)
+    batch = TrackerBatch(scene, frames[1], small)
     new, new_state, info = jax.jit(lambda p, s, b: step.update(p, s, b, step=0, key=None))(pose, state, batch)
     assert info["overflow"]
     assert info["skipped"]
     jax.tree.map(np.testing.assert_array_equal, (new, new_state), (pose, state))
 
     monkeypatch.setattr(tracking, "plan_tracker", lambda *_: small)
-    (result,) = track(started, frames[0], frames[1:2], quick)
+    (result,) = track(scene, frames[0], frames[1:2], quick, pose=pose, state=state)
     assert result.plan.num_near >= int(info["needed"].num_near) > 16
     assert result.plan.full.capacity >= int(info["needed"].full) > 4096
     assert not result.info["overflow"]
@@ -80,7 +107,7 @@ def test_an_update_is_traced_once(table, started, quick, monkeypatch):
             traces.append(1)
             return step.update(*args, **kwargs)
 
-        return step._replace(update=update)
+        return Step(step.init, update)
 
     monkeypatch.setattr(tracking, "object_tracker", counted)
     config = replace(quick, headroom=1.51)  # not one that another test has compiled
@@ -88,16 +115,62 @@ def test_an_update_is_traced_once(table, started, quick, monkeypatch):
     assert len(traces) == 1
 
 
-def test_pixels_that_are_not_numbers_leave_the_state_finite(table, started, quick):
+@pytest.mark.parametrize("what", ["images", "depths"])
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+def test_a_few_broken_pixels_are_counted_and_change_little(table, started, tracked, quick, what, value):
     _, frames, _ = table()
-    images = frames[1].images.at[0, 30:34, 40:50].set(jnp.nan)
-    broken = eqx.tree_at(lambda f: f.images, frames[1], images)
-    results = list(track(started, frames[0], [broken, frames[2]], quick))
-    for result in results:
-        assert jnp.isfinite(result.pose.means).all()
-        assert jnp.isfinite(result.pose.quats).all()
-        for leaf in jax.tree.leaves(result.state.motion):
-            assert jnp.isfinite(leaf).all()
+    pixels = getattr(frames[1], what).at[0, 30:34, 40:50].set(value)
+    broken = eqx.tree_at(lambda f: getattr(f, what), frames[1], pixels)
+    (result,) = track(started, frames[0], [broken], quick)
+    assert result.info["broken_pixels"] == 40
+    assert not result.info["skipped"]
+    jax.tree.map(lambda a: np.testing.assert_array_equal(jnp.isfinite(a), True), (result.pose, result.state))
+    moved = np.linalg.norm(np.asarray(result.pose.means - tracked[0].pose.means), axis=-1)
+    assert np.median(moved[: started.num_moving]) < 1e-3
+
+
+def test_the_first_frame_may_have_broken_pixels(table, quick):
+    _, frames, mask = table()
+    depths = frames[0].depths.at[0, 3, 4].set(jnp.inf).at[1, 5, 6].set(jnp.nan)
+    broken = eqx.tree_at(lambda f: f.depths, frames[0], depths)
+    with pytest.warns(UserWarning, match="2 pixels that are not finite"):
+        scene = start_scene(broken, mask, 0, quick)
+    assert jnp.isfinite(scene.gaussians.means).all()
+
+
+def test_going_on_works_when_every_slot_is_taken(table, started, quick):
+    _, frames, _ = table()
+    config = replace(quick, grow=replace(quick.grow, slots=2))
+    *_, full = track(started, frames[0], frames[1:3], config)
+    assert full.info["joined"] == 2
+    (rest,) = track(full.scene, frames[2], frames[3:], config, pose=full.pose, state=full.state)
+    assert len(rest.pose.means) == len(full.pose.means)
+
+
+def test_a_frame_of_another_size_is_named(table, started, quick):
+    _, frames, _ = table()
+    small = jax.tree.map(lambda a: a, frames[1])
+    small = eqx.tree_at(lambda f: (f.images, f.depths), small, (small.images[:, :60], small.depths[:, :60]))
+    with pytest.raises(ValueError, match=r"number 1 after the first has images of shape \(2, 60, 96, 3\)"):
+        list(track(started, frames[0], [small], quick))
+
+
+@pytest.mark.parametrize("slots", [0, 64])
+def test_one_object_larger_than_its_template_is_reduced(started, table, slots):
+    _, frames, _ = table()
+    carton = started.label_ids.index(2)
+    labels = jnp.where(started.labels == carton, 1, 0)
+    order = jnp.argsort(labels == 0, stable=True)
+    alone = TrackedScene(
+        take(started.gaussians, order),
+        started.normals[: int(labels.sum())],
+        labels[order],
+        (0, 2),
+        int(labels.sum()),
+    )
+    scene = with_slots(alone, slots) if slots else alone
+    config = replace(TrackerConfig(), match=MatchConfig(patch=8))
+    assert tracking._reduction(scene, frames[0], config) == tracking._reduction(alone, frames[0], config) > 1
 
 
 @pytest.mark.slow

@@ -153,6 +153,11 @@ def test_each_field_moves_at_its_own_rate_and_the_rest_at_the_default(params):
     np.testing.assert_allclose(jnp.abs(new.b - params.b), 0.02, rtol=1e-3)
 
 
+def test_a_rate_for_a_field_that_is_not_there_is_refused(params):
+    with pytest.raises(ValueError, match="has no field 'means'"):
+        per_field_adam({"means": 0.1}).init(params)
+
+
 def test_all_finite_looks_into_every_leaf_and_keep_if_chooses_whole_trees():
     sound = {"a": jnp.ones(3), "b": jnp.zeros(())}
     assert all_finite(sound)

@@ -190,3 +190,9 @@ def test_replanning_on_a_known_rung_compiles_nothing_and_a_call_is_traced_once(s
     assert len(traced) == 1
     jax.block_until_ready(frame(scene, plans[0]))
     assert compiled == []
+
+
+@pytest.mark.parametrize("headroom", [0.5, 0.0, float("nan")])
+def test_headroom_below_one_is_refused_because_replanning_would_never_end(headroom):
+    with pytest.raises(ValueError, match="headroom must be 1 or more"):
+        Plan(width=8, height=8, capacity=4096).grown(10_000, headroom)

@@ -1,8 +1,7 @@
 """Direct alignment of each group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
 
-What aligns is a set of points with colours: the Gaussians' centres, which remember the first frame, and
-pixels of the last frame that show the group, which know the sides that the first frame did not see. Each
-point has a colour and a depth to agree with at the pixel it falls on:
+What aligns is a set of points with colours: pixels of earlier frames that showed the group (see `points`).
+Each has a colour and a depth to agree with at the pixel it falls on:
 
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
@@ -140,6 +139,8 @@ def align(
         frame: what the cameras see now.
     """
 
+    longest = jnp.array([config.max_step] * 3 + [config.max_turn] * 3)
+
     def fit(twists) -> _Fit:
         over_groups = jax.vmap(_normal_equations, in_axes=(0, 0, None, None))
         moved = carry(points, twists, centers)
@@ -152,10 +153,11 @@ def align(
         best = jax.tree.map(lambda a, b: _where(better, a, b), new, best)
         damping = jnp.clip(jnp.where(better, damping * 0.3, damping * 10.0), 1e-4, 1e4)
         diagonal = jnp.einsum("kii->ki", best.hessian)
-        floor = jnp.array([1.0] * 3 + [1e-2] * 3)  # directions that no pixel speaks of stand still
+        # Directions that no pixel speaks of stand still.
+        floor = jnp.array([1.0] * 3 + [1e-2 if config.max_turn else 1e12] * 3)
         damped = best.hessian + (damping[:, None] * diagonal + floor)[:, :, None] * jnp.eye(6)
         change = -jnp.linalg.solve(damped, best.gradient[..., None])[..., 0]
-        trial = compose(jnp.clip(change, -config.max_step, config.max_step), best.twists)
+        trial = compose(jnp.clip(change, -longest, longest), best.twists)
         return (best, trial, damping), None
 
     count = len(twists)

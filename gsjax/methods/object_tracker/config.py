@@ -1,6 +1,19 @@
 """Every number of the object-aware tracker, with its unit and what it trades."""
 
 from dataclasses import dataclass, field
+from typing import Any
+
+
+def _check(
+    config: Any, *, above_zero: tuple[str, ...] = (), at_least: dict[str, float] | None = None
+) -> None:
+    """Raises ValueError where a setting has no meaning; NaN never has."""
+    rules = [(name, "more than 0", getattr(config, name) > 0) for name in above_zero]
+    rules += [(n, f"{low} or more", getattr(config, n) >= low) for n, low in (at_least or {}).items()]
+    for name, expected, holds in rules:
+        if not holds:
+            found = getattr(config, name)
+            raise ValueError(f"{type(config).__name__}.{name}: expected {expected}, found {found}")
 
 
 @dataclass(frozen=True)
@@ -24,6 +37,12 @@ class StartConfig:
     iterations: int = 150
     """Photometric optimisation steps on the first frame."""
 
+    def __post_init__(self):
+        sizes = ("object_pixels", "background_pixels", "max_extent", "part_size")
+        _check(
+            self, above_zero=(*sizes, "label_distance", "label_step", "depth_gap"), at_least={"iterations": 0}
+        )
+
 
 @dataclass(frozen=True)
 class MatchConfig:
@@ -40,10 +59,13 @@ class MatchConfig:
     max_residual: float = 0.03
     """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
 
+    def __post_init__(self):
+        _check(self, above_zero=("max_residual",), at_least={"patch": 8, "radius": 1, "margin": 0})
+
 
 @dataclass(frozen=True)
 class AlignConfig:
-    """Direct alignment of centres, before anything is rendered."""
+    """Direct alignment of pixels, before anything is rendered."""
 
     iterations: int = 6
     """Gauss-Newton iterations a frame; 0 leaves it out."""
@@ -51,12 +73,10 @@ class AlignConfig:
     """A colour difference that is large, about 0 to 1; see `tones`."""
     depth_scale: float = 0.01
     """A depth difference that is large, metres."""
-    centers: int = 256
-    """Gaussians of a group whose centres are aligned."""
-    center_weight: float = 0.2
-    """What a centre counts beside a pixel of the last frame, which looks more like the new one."""
     pixels: int = 192
-    """Pixels of the last frame that speak for a group in each camera, beside its Gaussians."""
+    """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
+    keyframe_turn: float = 0.5
+    """Beyond this turn since then, the keyframe is replaced by the last frame, radians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
     shading: float = 0.3
@@ -70,7 +90,17 @@ class AlignConfig:
     turns: tuple[float, ...] = (0.2, 0.6)
     """Turns by which the best start is varied, to either side about each principal axis, radians."""
     max_step: float = 0.1
-    """Longest step of one iteration, metres and radians."""
+    """Longest step of one iteration, metres."""
+    max_turn: float = 0.1
+    """Longest turn of one iteration, radians; 0, with refine.rotation_rate 0, is the paper's translation."""
+
+    def __post_init__(self):
+        scales = ("color_scale", "depth_scale", "max_thickness", "widen", "spacing", "max_step")
+        _check(
+            self,
+            above_zero=scales,
+            at_least={"iterations": 0, "pixels": 1, "reach": 0, "keyframe_turn": 0, "max_turn": 0},
+        )
 
 
 @dataclass(frozen=True)
@@ -95,8 +125,11 @@ class RefineConfig:
     """Depth differences beyond this are of something else, metres."""
     color_limit: float = 0.3
     """Colour differences beyond this are of something else, 0 to 1."""
-    se3: bool = True
-    """D_k rotates as well; False is the paper's translation."""
+
+    def __post_init__(self):
+        rates = {"translation_rate": 0, "rotation_rate": 0, "delta_rate": 0, "delta_weight": 0}
+        limits = ("delta_scale", "depth_limit", "color_limit")
+        _check(self, above_zero=limits, at_least={"iterations": 1, "depth_weight": 0, **rates})
 
 
 @dataclass(frozen=True)
@@ -116,6 +149,9 @@ class GrowConfig:
     color: float = 0.15
     """... and in colour, 0 to 1. Both count together, and the background's Gaussians compete."""
 
+    def __post_init__(self):
+        _check(self, above_zero=("distance", "color"), at_least={"slots": 0, "candidates": 1, "reach": 0})
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
@@ -128,3 +164,6 @@ class TrackerConfig:
     grow: GrowConfig = field(default_factory=GrowConfig)
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""
+
+    def __post_init__(self):
+        _check(self, at_least={"headroom": 1})

@@ -1,6 +1,7 @@
 """Photometric optimisation of the first frame's Gaussians, before anything moves."""
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 
 from gsjax.losses.photometric import photometric_loss, truncated_l1
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render, render
@@ -40,27 +42,32 @@ def fit_scene(
 
     Returns:
         The scene, and the info of the last step.
+
+    Raises:
+        ValueError: no step had a finite loss.
     """
-    step = gradient_step(fit_loss, per_field_adam(RATES))
-    gaussians, done, info = scene.gaussians, 0, {}
-    state = step.init(gaussians)
+    gaussians, info, skipped = scene.gaussians, {}, 0
+    state = _STEP.init(gaussians)
     plan = plan_render(gaussians, frame.cameras, headroom=headroom)
-    while done < iterations:
-        count = min(50, iterations - done)
-        new, new_state, infos = _run(step, gaussians, state, (frame, plan), count)
-        if infos["overflow"].any():
-            plan = plan.grown(int(infos["needed"].max()), headroom)
-            continue
-        gaussians, state, done = new, new_state, done + count
-        info = jax.tree.map(lambda a: a[-1], infos)
+    for i in range(iterations):
+        while True:
+            new, new_state, info = _advance()(gaussians, state, (frame, plan), i)
+            if not info["overflow"].any():
+                break
+            plan = plan.grown(int(info["needed"].max()), headroom)
+        gaussians, state, skipped = new, new_state, skipped + int(info["skipped"])
+    if iterations and skipped == iterations:
+        raise ValueError("the first frame could not be fitted: its loss is not finite, whatever the step")
     return eqx.tree_at(lambda s: s.gaussians, scene, gaussians), info
 
 
-@partial(jax.jit, static_argnames=("step", "count"))
-def _run(step, params, state, batch, count):
-    def body(carry, i):
-        params, state, info = step.update(*carry, batch, step=i, key=None)
-        return (params, state), info
+_STEP = gradient_step(fit_loss, per_field_adam(RATES))
 
-    (params, state), infos = jax.lax.scan(body, (params, state), jnp.arange(count))
-    return params, state, infos
+
+@cache
+def _advance() -> Callable:
+    """The jitted step; made late, because its options ask which machine this is."""
+    return jax.jit(
+        lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
+        compiler_options=host_options(),
+    )

@@ -24,7 +24,6 @@ class Match(NamedTuple):
     """Where one object's template was found in one camera."""
 
     score: Float[Array, "*ck"]  # correlation at the peak, -1 to 1; 0 where nothing was visible
-    still: Float[Array, "*ck"]  # correlation of not moving
     shift: Float[Array, "*ck 2"]  # pixels
     origin: Float[Array, "*ck 2"]  # centre of the visible mask, pixels
     depth: Float[Array, "*ck"]  # rendered depth of the visible surface, metres
@@ -127,13 +126,13 @@ def _match_one(color, image, weight, full_weight, depth, measured_depth, config:
 
     margin = patch + radius  # room for a template centred on any pixel, and its search
 
-    def crop(a, size, before):
-        padded = jnp.pad(a, [(margin, margin)] * 2 + [(0, 0)] * (a.ndim - 2), mode="edge")
+    def crop(a, size, before, mode="edge"):
+        padded = jnp.pad(a, [(margin, margin)] * 2 + [(0, 0)] * (a.ndim - 2), mode=mode)
         begin = (corner[1] - before + margin, corner[0] - before + margin) + (0,) * (a.ndim - 2)
         return jax.lax.dynamic_slice(padded, begin, (size, size, *a.shape[2:]))
 
-    inside = crop(jnp.ones_like(weight), patch, 0)
-    mask = crop(jnp.pad(weight, 0), patch, 0)
+    inside = crop(jnp.ones_like(weight), patch, 0, "constant")
+    mask = crop(weight, patch, 0, "constant")
     grown = jax.lax.reduce_window(mask, -jnp.inf, jax.lax.max, (2 * config.margin + 1,) * 2, (1, 1), "SAME")
     scores = correlate(crop(color, patch, 0), grown * inside, crop(image, patch + 2 * radius, radius))
     place, score = _peak(scores)
@@ -147,7 +146,6 @@ def _match_one(color, image, weight, full_weight, depth, measured_depth, config:
     enough = known & (seen.sum() >= 8)
     return Match(
         score=jnp.where(enough, score, 0.0),
-        still=scores[radius, radius],
         shift=shift,
         origin=center * reduction,
         depth=surface,
@@ -181,7 +179,7 @@ def lift(match: Match, frame: Frame, config: MatchConfig) -> tuple[Float[Array, 
     camera with depth, or two without, fix the translation; one without moves the object across its image.
     """
     viewmats, Ks = frame.cameras.viewmat, frame.cameras.K
-    usable = (match.score >= config.min_score) & (match.score >= match.still)
+    usable = match.score >= config.min_score
 
     def equations(viewmat, K, origin, shift, depth, change, measured, weight):
         before = unproject(origin, depth, viewmat, K)

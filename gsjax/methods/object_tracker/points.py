@@ -1,4 +1,9 @@
-"""What is aligned of each group: coloured points, as many for each, that cameras may look for."""
+"""What is aligned of each group: coloured points, as many for each, that cameras may look for.
+
+They are pixels: of the last frame, which look most like the new one, and of a keyframe, carried along since
+then. The last frame alone would drift, and what once slid off its object would take its neighbours' pixels
+for its own; the keyframe remembers what it was.
+"""
 
 from typing import NamedTuple
 
@@ -31,25 +36,6 @@ def carry(points: Points, twists: Float[Array, "k 6"], centers: Float[Array, "k 
     center = centers[:, None]
     turned = jnp.einsum("kij,kpj->kpi", jaxlie.SO3.exp(twists[:, 3:]).as_matrix(), points.means - center)
     return points._replace(means=center + turned + twists[:, None, :3])
-
-
-def sample_groups(
-    means: Float[Array, "m 3"],
-    colors: Float[Array, "m 3"],
-    seen: Float[Array, "c m"],
-    groups: Int[Array, "m"],
-    num_groups: int,
-    per_group: int,
-) -> Points:
-    """Up to `per_group` members of each group, spread over it; a large one needs no more."""
-    shuffle = 1.0 + jax.random.permutation(jax.random.key(1), groups.shape[0]).astype(jnp.float32)
-    size = min(per_group, groups.shape[0])
-
-    def one(group):
-        priority, rows = jax.lax.top_k(jnp.where(groups == group, shuffle, 0.0), size)
-        return Points(means[rows], colors[rows], seen[:, rows] * (priority > 0))
-
-    return jax.vmap(one)(jnp.arange(1, num_groups + 1))
 
 
 def pixels_of_groups(
@@ -91,3 +77,32 @@ def pixels_of_groups(
         colors.reshape(num_groups, -1, 3),
         seen.reshape(num_groups, num_cameras, -1),
     )
+
+
+class Keyframe(NamedTuple):
+    """Pixels that showed each group in an earlier frame, where they would be now."""
+
+    points: Points
+    turned: Float[Array, "k 4"]  # how each group has turned since then, as a quaternion
+
+
+def first_keyframe(pixels: Points) -> Keyframe:
+    """The last frame's pixels as keyframe."""
+    unturned = jnp.zeros((len(pixels.means), 4), pixels.means.dtype).at[:, 0].set(1.0)
+    return Keyframe(pixels, unturned)
+
+
+def renewed(keyframe: Keyframe, pixels: Points, max_turn: float) -> Keyframe:
+    """`pixels` for the groups that have turned by more than `max_turn` radians: they show other sides now."""
+    turn = 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
+
+    def choose(new, old):
+        return jnp.where((turn > max_turn).reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, first_keyframe(pixels), keyframe)
+
+
+def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:
+    """The keyframe after each group's twist about its centre."""
+    turned = jaxlie.SO3.exp(twists[:, 3:]) @ jaxlie.SO3(keyframe.turned)
+    return Keyframe(carry(keyframe.points, twists, centers), turned.normalize().wxyz)

@@ -42,8 +42,6 @@ def refine_loss(
     visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat))
     rendered = render(place(scene, pose), frame.cameras, batch.plan, roi=batch.roi, visibility=visibility)
     weights = jax.lax.stop_gradient(rendered.alphas) * batch.roi
-    if frame.weights is not None:
-        weights = weights * frame.weights
     difference = jnp.minimum(jnp.abs(rendered.colors - frame.images), config.color_limit).mean(-1)
     # Sums over pixels, in units of a thousand: an object's pull does not depend on what else is in view.
     color = 1e-3 * jnp.sum(difference * weights)
@@ -66,8 +64,7 @@ def refine_loss(
 
 def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Motion, dict[str, Any]]:
     """Adam from `motion`, with rates that fall to a tenth over the iterations."""
-    turning = config.rotation_rate if config.se3 else 0.0
-    rates = jnp.array([config.translation_rate] * 3 + [turning] * 3)
+    rates = jnp.array([config.translation_rate] * 3 + [config.rotation_rate] * 3)
 
     def scaled(updates: Motion, _) -> Motion:
         return Motion(rates * updates.twists, config.delta_rate * updates.delta)

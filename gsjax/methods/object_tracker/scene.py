@@ -14,7 +14,7 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.object_tracker.config import StartConfig
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, concatenate, take
-from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd
+from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd, valid_depth
 from gsjax.scene.labels import inherit_labels, lift_labels
 
 
@@ -68,7 +68,7 @@ def labelled_cloud(
     if mask.shape != depths.shape[1:]:
         raise ValueError(f"mask has shape {mask.shape}; the images have {depths.shape[1:]} (height, width)")
     clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]
-    footprints = [depth[depth > 0] / K[0, 0] for depth, K in zip(depths, Ks, strict=True)]
+    footprints = [depth[valid_depth(depth)] / K[0, 0] for depth, K in zip(depths, Ks, strict=True)]
     points = np.concatenate([points for points, _ in clouds])
     colors = np.concatenate([colors for _, colors in clouds])
     if len(points) == 0:
@@ -105,7 +105,8 @@ def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
     for value in sorted(set(np.unique(cloud.labels).tolist()) - {0}):
         rows = np.flatnonzero(cloud.labels == value)
         points = cloud.points[rows]
-        extent = float(np.ptp(points, axis=0).max())
+        # Quantiles: a few pixels that fly off an edge, as depth cameras have them, make nothing large.
+        extent = float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
         parts = np.zeros(len(rows), int)
         if extent > config.max_extent:
             count = int(np.ceil(extent / config.part_size))

@@ -105,5 +105,6 @@ def search(
     if frame.depths is not None:  # by colour alone, a plain thing would slide about within its outline
         starts = jnp.concatenate([starts, _shifted(points, centers, frame, config)[None]])
     best = best_of(aligned(starts))
-    best = best_of(aligned(turned(best, principal_axes(points, centers), config.turns)))
+    if config.max_turn:
+        best = best_of(aligned(turned(best, principal_axes(points, centers), config.turns)))
     return best_of(jnp.stack([starts[0], best, align(best, points, centers, frame, config)]))

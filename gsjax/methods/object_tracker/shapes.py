@@ -6,9 +6,9 @@ rendered images. Colours of everything are then read off the images.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -22,12 +22,13 @@ from gsjax.geometry.cameras import project
 from gsjax.geometry.neighbors import nearest
 from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.object_tracker.align import bilinear
-from gsjax.methods.object_tracker.config import RefineConfig, TrackerConfig
+from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.motion import Motion, first_pose, move
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import tiles_to_pixels, touched_tiles
 from gsjax.methods.object_tracker.scene import TrackedScene, assemble
 from gsjax.methods.object_tracker.tracker import render_labels
+from gsjax.optim.compiler import host_options
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.render import plan_render
@@ -121,7 +122,9 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
         )
     normal = np.asarray(shape.plane[:3], np.float64)
     normal, offset = normal / np.linalg.norm(normal), float(shape.plane[3]) / np.linalg.norm(normal)
-    low, high = extent.min(0), extent.max(0)
+    # Places are counted along two directions of the plane, whichever way it lies in the world.
+    across = np.linalg.svd(normal[None])[2][1:]
+    low, high = (extent @ across.T).min(0), (extent @ across.T).max(0)
     best = (np.inf, np.eye(4))
     for up in (1.0, -1.0):
         base, _ = Rotation.align_vectors([normal], [[0.0, 0.0, up]])
@@ -134,7 +137,7 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
         step, turn = _GRID_STEP, headings[1]
         for _ in range(4):  # ever finer around the best
             candidates = np.array([[px, py, h] for h in headings for px, py in places])
-            poses = _poses(candidates, base, normal, lift, center)
+            poses = _poses(candidates, base, normal, across, lift, center)
             cost = _scores(shape, poses, frame)
             winner = int(cost.argmin())
             if cost[winner] < best[0]:
@@ -148,16 +151,19 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
 
 
 def _poses(
-    candidates: np.ndarray, base: Rotation, normal: np.ndarray, lift: float, center: np.ndarray
+    candidates: np.ndarray,
+    base: Rotation,
+    normal: np.ndarray,
+    across: np.ndarray,
+    lift: float,
+    center: np.ndarray,
 ) -> np.ndarray:
     """Model-to-world transforms that turn the standing shape about its centre and move it over the plane."""
     turned = Rotation.from_rotvec(candidates[:, 2:] * normal)
     poses = np.tile(np.eye(4), (len(candidates), 1, 1))
     poses[:, :3, :3] = (turned * base).as_matrix()
-    across = np.column_stack([candidates[:, :2], np.zeros(len(candidates))])
-    across -= np.outer(across @ normal, normal)
     flat = center - (center @ normal) * normal
-    poses[:, :3, 3] = across + lift * normal - turned.apply(flat)
+    poses[:, :3, 3] = candidates[:, :2] @ across + lift * normal - turned.apply(flat)
     return poses
 
 
@@ -240,7 +246,12 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> Tracke
     groups = scene.labels[: scene.num_moving]
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
     still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
-    motion = _refine_rigidly(still, RefineBatch(scene, frame, plan, pose, centers, roi), config.refine)
+    rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0)
+    while True:
+        motion, info = _refine_rigidly()(still, RefineBatch(scene, frame, plan, pose, centers, roi), rates)
+        if not info["overflow"]:
+            break
+        plan = plan.grown(int(info["needed"]), config.headroom)
     moved = move(pose, motion, centers, groups)
     count = scene.num_moving
     gaussians = eqx.tree_at(
@@ -254,6 +265,7 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> Tracke
     return eqx.tree_at(lambda s: s.gaussians, scene, gaussians)
 
 
-@partial(jax.jit, static_argnames="config")
-def _refine_rigidly(motion: Motion, batch: RefineBatch, config: RefineConfig) -> Motion:
-    return refine(motion, batch, replace(config, iterations=_ITERATIONS, delta_rate=0.0))[0]
+@cache
+def _refine_rigidly() -> Callable:
+    """The jitted refinement; made late, because its options ask which machine this is."""
+    return jax.jit(refine, static_argnums=2, compiler_options=host_options())

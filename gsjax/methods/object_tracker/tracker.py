@@ -7,11 +7,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers, project
-from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.matching import lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
-from gsjax.methods.object_tracker.points import Points, join, pixels_of_groups, sample_groups
+from gsjax.methods.object_tracker.points import (
+    Keyframe,
+    Points,
+    carry_keyframe,
+    first_keyframe,
+    join,
+    pixels_of_groups,
+    renewed,
+)
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import (
     Needed,
@@ -35,7 +42,8 @@ class TrackerState(NamedTuple):
     """What the tracker carries from frame to frame."""
 
     motion: Motion  # of the last frame: where delta starts, and the constant-velocity hypothesis
-    frame: Frame  # the last frame, whose pixels show what the first one did not
+    pixels: Points  # what showed each group in the last frame
+    keyframe: Keyframe  # and in an earlier one
     count: Int[Array, ""]  # frames so far
 
 
@@ -78,32 +86,14 @@ def seen_from(
     return jax.vmap(one)(frame.cameras.viewmat, frame.cameras.K, rendered.depths, rendered.features)
 
 
-def _points(
-    scene: TrackedScene,
-    pose: Pose,
-    seen: Float[Array, "c m"],
-    last: Frame,
-    plan: TrackerPlan,
-    config: TrackerConfig,
-) -> tuple[Points, Int[Array, ""]]:
-    """What speaks for each group's pose: Gaussians that a camera sees, and pixels of the last frame, which
-    know the sides too that the first frame did not see. Also the capacity that finding these needed."""
-    groups = scene.labels[: scene.num_moving]
-    # Only Gaussians that a mask has named: what joined an object later may be a neighbour's.
-    named = jnp.any(scene.normals != 0, axis=-1) | ~jnp.any(scene.normals != 0)
-    count = config.align.centers
-    points = sample_groups(pose.means, _colors(scene), seen * named, groups, scene.num_objects, count)
-    if not config.align.pixels:
-        return points, jnp.int32(0)
-    solid = render_labels(scene, pose, last, plan.full)
-    assert solid.features is not None
-    shown = jnp.where(solid.alphas > 0.5, jnp.argmax(solid.features, axis=-1), 0)
-    pixels = pixels_of_groups(last, shown, solid.depths, scene.num_objects, config.align)
-    points = points._replace(seen=config.align.center_weight * points.seen)
-    return join(points, pixels), solid.meta.needed.max()
+def _pixels(frame: Frame, rendered: Rendered, num_objects: int, config: TrackerConfig) -> Points:
+    """The pixels of a frame that show each group, as the scene rendered solid says."""
+    assert rendered.features is not None
+    shown = jnp.where(rendered.alphas > 0.5, jnp.argmax(rendered.features, axis=-1), 0)
+    return pixels_of_groups(frame, shown, rendered.depths, num_objects, config.align)
 
 
-def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, reduction: int = 1) -> Step:
+def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch, reduction: int = 1) -> Step:
     """The step of the object-aware tracker.
 
     params: the `Pose` of the moving Gaussians. state: `TrackerState`. batch: `TrackerBatch`.
@@ -116,36 +106,37 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
     Args:
         config: see `TrackerConfig`.
         num_objects: groups that can move, K.
-        first_frame: the frame that the first pose shows; `init` puts it into the state.
+        first: the frame that the first pose shows, with the scene, for `init`.
         reduction: factor by which images shrink for template matching (objects larger than the template).
     """
 
     def init(params: Pose) -> TrackerState:
         nowhere = Motion(jnp.zeros((num_objects, 6), params.means.dtype), jnp.zeros_like(params.means))
-        return TrackerState(nowhere, first_frame, jnp.int32(0))
+        pixels = _pixels(
+            first.frame, render_labels(first.scene, params, first.frame, first.plan.full), num_objects, config
+        )
+        return TrackerState(nowhere, pixels, first_keyframe(pixels), jnp.int32(0))
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan = batch
         groups = scene.labels[: scene.num_moving]
-        centers = group_means(params.means, groups, scene.num_objects)
+        centers = group_means(params.means, groups, num_objects)
 
         last = render_labels(scene, params, frame, plan.full, one_sided=True)
         assert last.features is not None
         seen = seen_from(scene, params, last, frame, config.start.depth_gap)
-        visible = group_means(seen.max(0), groups, scene.num_objects) > _MIN_SEEN
+        visible = group_means(seen.max(0), groups, num_objects) > _MIN_SEEN
         match = match_templates(
             last.colors, last.depths, last.features[..., 1:], frame, config.match, reduction
         )
         jump, found = lift(match, frame, config.match)
 
-        points, solid_needed = _points(scene, params, seen, state.frame, plan, config)
+        points = join(state.pixels, state.keyframe.points)
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
         starts = jnp.stack([still, jumped, going, going.at[:, :3].set(jumped[:, :3])])
         aligned = search(starts, points, centers, frame, config.align)
-        if not config.refine.se3:
-            aligned = aligned.at[:, 3:].set(0.0)
         begun = Motion(aligned, state.motion.delta)
         tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
         near = near_background(scene, last, tiles)
@@ -164,11 +155,15 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
         kept = _select(visible, _select(better, refined, begun, groups), nowhere, groups)
 
         pose = move(params, kept, centers, groups)
-        full = jnp.maximum(last.meta.needed.max(), solid_needed)
+        solid = render_labels(scene, pose, frame, plan.full)
+        full = jnp.maximum(last.meta.needed.max(), solid.meta.needed.max())
         needed = Needed(full, info["needed"], near.sum())
         overflow = needed.exceeds(plan)
         sound = all_finite(pose) & ~overflow
-        new_state = TrackerState(kept, frame, state.count + 1)
+        pixels = _pixels(frame, solid, num_objects, config)
+        keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
+        keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
+        new_state = TrackerState(kept, pixels, keyframe, state.count + 1)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
@@ -179,6 +174,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first_frame: Frame, 
             "visible": visible,
             "residual": jnp.where(better, of_refined, of_begun),
             "motion": kept,
+            "rendered": solid,
         }
         return pose, new_state, info
 
@@ -191,11 +187,6 @@ def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "
         jnp.where(chosen[:, None], a.twists, b.twists),
         jnp.where(chosen[groups - 1][:, None], a.delta, b.delta),
     )
-
-
-def _colors(scene: TrackedScene) -> Float[Array, "m 3"]:
-    """The constant colour of each moving Gaussian."""
-    return scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
 
 
 def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, headroom: float) -> TrackerPlan:

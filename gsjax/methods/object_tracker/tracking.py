@@ -1,6 +1,7 @@
 """The host's side of tracking: compile once, feed frames, re-plan when a plan has become too small."""
 
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,11 +21,10 @@ from gsjax.methods.object_tracker.tracker import (
     TrackerState,
     object_tracker,
     plan_tracker,
-    render_labels,
 )
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import keep_if
-from gsjax.scene.frame import Frame
+from gsjax.scene.frame import Frame, without_broken
 from gsjax.scene.gaussians import Gaussians
 
 
@@ -68,26 +68,30 @@ def start_scene(
         ValueError: there is no depth, or the mask does not fit the images.
     """
     config = TrackerConfig() if config is None else config
+    frame, broken = without_broken(frame)
+    if broken:
+        warnings.warn(f"the first frame has {broken} pixels that are not finite; unused", stacklevel=2)
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
+@partial(jax.jit, static_argnames=("config", "num_objects"))
+def _first_state(pose, batch, config: TrackerConfig, num_objects: int):
+    return object_tracker(config, num_objects, batch).init(pose)
+
+
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
-    tracker = object_tracker(config, num_objects, state.frame, reduction)
-    scene, frame, plan = batch
-    moved, new_state, info = tracker.update(pose, state, batch, step=step, key=None)
-    info["joined"] = jnp.int32(0)
-    if not config.grow.slots or frame.depths is None:
-        return scene, moved, new_state, info
-    rendered = render_labels(scene, moved, frame, plan.full)
-    full = jnp.maximum(info["needed"].full, rendered.meta.needed.max())
-    overflow = info["overflow"] | rendered.meta.overflow.any()
-    grown = grow(scene, moved, rendered, frame, new_state.count, config.grow)
-    info |= {"needed": info["needed"]._replace(full=full), "overflow": overflow}
-    info["skipped"] |= overflow
-    scene, pose, state = keep_if(~info["skipped"], (*grown, new_state), (scene, pose, state))
-    info["joined"] = config.grow.slots - empty_slots(scene).sum()
+    frame, broken = without_broken(batch.frame)
+    batch = batch._replace(frame=frame)
+    tracker = object_tracker(config, num_objects, batch, reduction)
+    pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
+    rendered, scene = info.pop("rendered"), batch.scene
+    info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
+    if config.grow.slots and frame.depths is not None:
+        grown = grow(scene, pose, rendered, frame, state.count, config.grow)
+        scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
+        info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
 
 
@@ -111,19 +115,23 @@ def track(
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackerConfig`.
         pose, state: where to go on from, with the same `Tracked`'s scene; the first frame unless given.
+
+    Raises:
+        ValueError: a frame has other shapes than the first one.
     """
     config = TrackerConfig() if config is None else config
-    if config.grow.slots and first.depths is not None and not empty_slots(scene).any():
-        scene = with_slots(scene, config.grow.slots)
-    pose = first_pose(scene) if pose is None else pose
-    step = object_tracker(config, scene.num_objects, first)
-    state = step.init(pose) if state is None else state
-    plan: TrackerPlan | None = None
+    if pose is None:
+        if config.grow.slots and first.depths is not None:
+            scene = with_slots(scene, config.grow.slots)
+        pose = first_pose(scene)
+    first, _ = without_broken(first)
+    plan = plan_tracker(scene, pose, first, config.headroom)
+    reduction = _reduction(scene, first, config)
+    if state is None:
+        state = _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
     compiled: dict[TrackerPlan, Any] = {}
     for index, frame in enumerate(frames):
-        if plan is None:
-            plan = plan_tracker(scene, pose, frame, config.headroom)
-            reduction = _reduction(scene, frame, config)
+        _check_alike(frame, first, index + 1)
         jax.block_until_ready(frame)
         seconds = compile_seconds = 0.0
         while True:
@@ -145,6 +153,17 @@ def track(
         yield Tracked(scene, pose, state, info, seconds, compile_seconds, plan)
 
 
+def _check_alike(frame: Frame, first: Frame, index: int) -> None:
+    for name in ("images", "depths"):
+        found, wanted = getattr(frame, name), getattr(first, name)
+        found, wanted = (None if a is None else a.shape for a in (found, wanted))
+        if found != wanted:
+            raise ValueError(
+                f"frames: number {index} after the first has {name} of shape {found}, expected {wanted} as "
+                "in the first; give all frames one size and the same cameras"
+            )
+
+
 def _reduction(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> int:
     """By how much images shrink for matching, so that the largest object but one fits its template.
 
@@ -156,9 +175,8 @@ def _reduction(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> int:
     for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3)
-        sizes.append([np.ptp(pixels[groups == k], axis=0).max() for k in np.unique(groups)])
-    if not sizes or not sizes[0]:
-        return 1
+        there = [k for k in range(1, scene.num_objects + 1) if (groups == k).any()]  # no empty slots
+        sizes.append([np.ptp(pixels[groups == k], axis=0).max() for k in there])
     largest = np.sort(np.max(sizes, axis=0))
     size = largest[-2] if len(largest) > 1 else largest[-1]
     return max(1, int(np.ceil(size / config.match.patch)))
