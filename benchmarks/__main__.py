@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks import machine
 from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import TILE
 from gsjax.rasterize.rasterization import plan, rasterization
 
@@ -24,7 +25,7 @@ SIZES = ((320, 240), (640, 480))
 REPEATS = 9
 BLOCK = 2**20  # float32 values in 4 MB
 # Only the outermost jit of a program may carry compiler options. This one doubles the speed of compositing.
-OPTIONS = {"xla_cpu_prefer_vector_width": 512} if machine.has_avx512() else None
+OPTIONS = host_options() or None
 
 
 def scene(num: int, seed: int = 0) -> list:

@@ -3,6 +3,7 @@
 Commands are imported when they are called, so that `gsjax --help` answers at once.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -17,10 +18,21 @@ COMMANDS = {
 """Each command's module, which has a dataclass `Options` and `run(options)`, which returns the exit code."""
 
 
+def entry() -> None:
+    """The program. After Ctrl-C it leaves without waiting for XLA, which may still be compiling in a thread
+    and would crash while Python takes it down."""
+    code = main()
+    if code == 130:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (those of the process unless given) ask for; returns the exit code.
 
-    0: done. 2: the user's mistake, said in a sentence. 130: Ctrl-C.
+    0: done. 1: a fault of gsjax. 2: the user's mistake, said in a sentence. 130: Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])

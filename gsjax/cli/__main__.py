@@ -1,7 +1,5 @@
 """`python -m gsjax.cli` is `gsjax`."""
 
-import sys
+from gsjax.cli import entry
 
-from gsjax.cli import main
-
-sys.exit(main())
+entry()

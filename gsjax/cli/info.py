@@ -32,6 +32,8 @@ def run(options: Options) -> int:
     """
     with Notes(Console(stderr=True, highlight=False)):
         sequence = open_sequence(options.dataset)
+        for c in range(sequence.num_cameras):
+            sequence.image(0, c)  # says what is wrong with it
         masks = first_masks(sequence)
         table = Table.grid(padding=(0, 3, 0, 0))
         for name, text in describe_sequence(sequence, masks).items():

@@ -35,6 +35,7 @@ class Tracking:
         loop_s: seconds of the whole loop.
         plans: how many plans there were; more than one means that it had to plan again.
         visible: [K] of each update, which objects some camera saw.
+        skipped: updates that changed nothing, because a number in them was not finite.
         stopped: what ended the loop early, or None.
     """
 
@@ -49,6 +50,7 @@ class Tracking:
     loop_s: float = 0.0
     plans: int = 0
     visible: list[np.ndarray] = field(default_factory=list)
+    skipped: int = 0
     stopped: BaseException | None = None
 
     @property
@@ -124,8 +126,9 @@ def follow(
                     known = update.seconds + update.compile_seconds + frames.waited
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)
                 tracking.visible.append(np.asarray(update.info["visible"]))
+                tracking.skipped += int(update.info["skipped"])
                 plans.add(update.plan)
-                progress.update(task, advance=1, rate=_rate(tracking, update.info))
+                progress.update(task, advance=1, rate=_rate(tracking))
         except (KeyboardInterrupt, Exception) as stopped:
             tracking.stopped = stopped
             progress.update(task, rate="stopped")
@@ -134,8 +137,7 @@ def follow(
     return tracking
 
 
-def _rate(tracking: Tracking, info: dict) -> str:
-    """The rate of the last ten updates, and how good the picture is."""
+def _rate(tracking: Tracking) -> str:
+    """The rate of the last ten updates."""
     recent = tracking.update_s[1:][-10:]
-    text = f"{len(recent) / sum(recent):.2f} Hz"
-    return f"{text}  {float(info['psnr']):.1f} dB" if "psnr" in info else text
+    return f"{len(recent) / sum(recent):.2f} Hz"

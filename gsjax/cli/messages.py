@@ -43,11 +43,15 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
     except KeyboardInterrupt:
         say_error("stopped by Ctrl-C before there was anything to keep", word="stopped")
         return 130
-    except USER_ERRORS as error:
+    except Exception as error:
         if debug:
             raise
-        say_error(describe(error))
-        return 2
+        if isinstance(error, USER_ERRORS):
+            say_error(describe(error))
+            return 2
+        told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
+        say_error(f"{told}. Please report it with what --debug shows")
+        return 1
 
 
 def describe(error: BaseException) -> str:

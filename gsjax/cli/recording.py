@@ -1,5 +1,6 @@
 """Which part of a recording is tracked, which is only judged, and what its masks call things."""
 
+import warnings
 from collections.abc import Callable
 from collections.abc import Sequence as Indices
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +15,7 @@ from rich.progress import track
 
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence, open_sequence
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 
 
@@ -64,7 +66,13 @@ def open_recording(
     if not chosen:
         raise ValueError(f"--cameras: no camera is left to track; {sequence.name} has {known}.")
     total = sequence.num_frames
-    sequence = sequence.select(frames=parse_frames(frames))
+    chosen_frames = parse_frames(frames)
+    if not range(total)[chosen_frames]:
+        raise ValueError(f"--frames: {frames} holds no frame of {sequence.name}, which has 0 to {total - 1}.")
+    if (chosen_frames.stop or 0) > total:
+        message = f"--frames: {frames} goes beyond the last frame of {sequence.name}, {total - 1}"
+        warnings.warn(message, DataWarning, stacklevel=2)
+    sequence = sequence.select(frames=chosen_frames)
     simulated = dataset.startswith(SIMULATED_PREFIX)
     if simulated:
         sequence = _remember(sequence)
@@ -77,7 +85,7 @@ def open_recording(
 
 
 def parse_frames(text: str) -> slice:
-    """Frames as Python slices them: "0:60", "0:60:2", ":30", ":"; "7" is the eighth alone.
+    """Frames as Python slices them: "0:60", "0:60:2", ":30", ":".
 
     Raises:
         ValueError: it is none of these, or does not go forward.
@@ -86,11 +94,9 @@ def parse_frames(text: str) -> slice:
         parts = [int(part) if part.strip() else None for part in text.split(":")]
     except ValueError:
         parts = []
-    if not 1 <= len(parts) <= 3 or (len(parts) == 1 and parts[0] is None):
-        raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, found {text!r}.")
-    if len(parts) == 1:
-        first = parts[0] or 0
-        return slice(first, None if first == -1 else first + 1)
+    if not 2 <= len(parts) <= 3:
+        found = f"found {text!r}; :4 is the first four, 4:5 the fifth alone"
+        raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, {found}.")
     if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
         raise ValueError(f"--frames: frames are tracked forwards; found the step {parts[2]}.")
     return slice(*parts)
@@ -163,13 +169,15 @@ def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
         for c, name in enumerate(tracked.camera_ids):
             labels = tracked.mask(0, c) if camera in (None, name) else None
             if labels is not None:
+                _check_not_empty(labels, tracked, c)
                 return FirstMask(labels, name, "files")
         if camera is not None and source == "auto":
             raise ValueError(
                 f"--mask-camera: camera {camera} has no masks. Name another, or --masks segment."
             )
     if source == "files":
-        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks segment.")
+        other = "auto, which takes the shapes of this recording" if tracked.models else "segment"
+        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks {other}.")
     if source == "auto" and not tracked.has_depth and tracked.models:
         return FirstMask(None, None, "shapes")
     from gsjax.perception.segmenters import PlaneOrRegionSegmenter
@@ -178,6 +186,18 @@ def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
     c = tracked.camera_ids.index(name)
     labels = PlaneOrRegionSegmenter()(tracked.image(0, c), tracked.depth(0, c), tracked.Ks[0, c])
     return FirstMask(labels.astype(np.int32), name, "segment")
+
+
+def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
+    """Raises DataError where a first mask names nothing, and says whose mask does."""
+    if labels.any():
+        return
+    masks = {name: tracked.mask(0, i) for i, name in enumerate(tracked.camera_ids)}
+    better = [name for name, mask in masks.items() if mask is not None and mask.any()]
+    advice = f"Use --mask-camera {better[0]}" if better else "Choose other --frames"
+    what = f"{tracked.name}, the first mask of camera {tracked.camera_ids[c]}"
+    what = tracked.locate("mask", 0, c) if tracked.locate else what
+    raise DataError(what, "at least one object", "background only", f"{advice}, or --masks segment.")
 
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
@@ -202,7 +222,7 @@ def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int,
         for value in sorted(set(names) - there - {0}):
             notes.warn(
                 f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
-                "it is not tracked"
+                "it is not tracked; another --mask-camera may see it"
             )
     for value in sorted(there - set(scene_ids) - {0}):
         pixels = int((mask.labels == value).sum())

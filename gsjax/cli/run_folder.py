@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +29,9 @@ class RunFolder:
           renders/CAM/FRAME.png   rendered images
           video_CAM.mp4           input, render, error and labels side by side
           plots/NAME.svg|png      update time, error over frames, ...
-          report.html             all of it on one page, written last: a run that has it is finished
+          report.html             all of it on one page, written last
+
+    A run is finished when it has its report, and metrics.json does not say that it was stopped.
 
     Attributes:
         path: the folder, which exists.
@@ -64,7 +67,7 @@ class RunFolder:
             )
         if self.finished and not overwrite:
             raise FileExistsError(
-                f"{self.path}: holds a finished run (report.html); name another folder or ask to overwrite it"
+                f"{self.path}: holds a finished run; name another folder, or replace it with --overwrite"
             )
         for name in (*_FILES, *_FOLDERS, *_PATTERNS):
             for entry in self.path.glob(name):
@@ -72,8 +75,11 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether a run has written its report here."""
-        return self.report.is_file()
+        """Whether a run that was not stopped has written its report here."""
+        metrics = self.path / "metrics.json"
+        if not (self.report.is_file() and metrics.is_file()):
+            return False
+        return bool(json.loads(metrics.read_text(encoding="utf-8")).get("complete", True))
 
     @property
     def report(self) -> Path:

@@ -98,8 +98,8 @@ def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectSc
     """How each object of the truth was followed, by its mask value; empty without truth, depth or masks."""
     sequence = recording.tracked
     truth = sequence.truth
-    if truth is None or not (sequence.has_masks and sequence.has_depth):
-        return {}
+    if truth is None or not (sequence.has_masks and sequence.has_depth) or tracking.num_frames < 2:
+        return {}  # the first frame is what errors are counted from
     seen = [(sequence.mask(0, c), sequence.depth(0, c), c) for c in range(sequence.num_cameras)]
     seen = [(mask, depth, c) for mask, depth, c in seen if mask is not None and depth is not None]
     if not seen:
@@ -125,8 +125,10 @@ def metrics(
     motion: dict[int, ObjectScore],
     values: np.ndarray | None,
 ) -> dict[str, Any]:
-    """The scores of metrics.json; what was not scored is None. docs/tracker.md says what each one means."""
+    """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
+    though some Gaussian may lie on it. docs/tracker.md says what each score means."""
     names = object_names(tracking, recording, mask, values)
+    motion = {label: score for label, score in motion.items() if _members(tracking, values, label).any()}
     objects = {
         name: {
             "label": label,

@@ -120,7 +120,7 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
         if rows:
             console.print(_grid(columns, rows))
     frames, rate = found["frames"], found["update_hz"]
-    speed = f"{rate:.2f} Hz ({found['update_ms']['median']:.0f} ms an update)" if rate else "no updates"
+    speed = f"{rate:.2f} Hz ({found['update_ms']['mean']:.0f} ms an update)" if rate else "no updates"
     part = "" if found["complete"] else " [bold yellow](partial run)[/]"
     console.print(f"[bold]{frames['tracked']}[/] of {frames['asked']} frames, [bold]{speed}[/]{part}")
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)

@@ -195,6 +195,7 @@ def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores:
             "p95": float(np.percentile(updates, 95)) if len(updates) else None,
         },
         "plans": tracking.plans,
+        "updates_skipped": tracking.skipped,
         "machine": machine(),
     }
 
@@ -218,7 +219,8 @@ def _say_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> N
     if tracking.stopped is None:
         return
     after = f"after {tracking.num_frames} of {recording.tracked.num_frames} frames"
-    notes.add(f"This run is not complete: it was stopped {after} by {_reason(tracking.stopped)}.")
+    reason = _reason(tracking.stopped).rstrip(".")
+    notes.add(f"This run is not complete: it was stopped {after} by {reason}.")
     if isinstance(tracking.stopped, KeyboardInterrupt):
         say_error(f"by Ctrl-C {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
 
@@ -253,10 +255,13 @@ def _note_what_is_missing(
                 else "no Gaussian is surely its"
             )
             notes.add(f"{name}: motion not scored, {why}.")
+    if tracking.skipped:
+        notes.add(f"{tracking.skipped} updates gave numbers that are not finite and were left out.")
     unseen = [np.flatnonzero(~seen) for seen in tracking.visible]
     counts = np.bincount(np.concatenate([*unseen, []]).astype(int), minlength=tracking.scene.num_objects)
-    names = list(object_names(tracking, recording, mask, None if values is None else values).items())
+    names = object_names(tracking, recording, mask, values)
     ids = tracking.scene.label_ids if values is None else values.tolist()
-    for group in np.flatnonzero(counts):
-        name = dict(names).get(ids[group + 1], f"object {ids[group + 1]}")
-        notes.add(f"{name}: no camera saw it in {counts[group]} frames; it stood still meanwhile.")
+    for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
+        name = names.get(label, f"object {label}")
+        frames = max(counts[group] for group in range(len(counts)) if ids[group + 1] == label)
+        notes.add(f"{name}: no camera saw it, or a part of it, in {frames} frames; it stood still meanwhile.")

@@ -73,7 +73,7 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
     Raises:
         DataError: the file is missing, cut off, not a 16-bit single-channel image, or not of this size.
     """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    raw = _decode(path, cv2.IMREAD_UNCHANGED, "a depth image")
     _check_size(path, raw, width, height)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         found = f"{raw.dtype} with {1 if raw.ndim == 2 else raw.shape[2]} channels"
@@ -88,7 +88,7 @@ def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height wi
     Raises:
         DataError: the file is missing, cut off, of several differing channels, or not of this size.
     """
-    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    raw = _decode(path, cv2.IMREAD_UNCHANGED, "a mask")
     _check_size(path, raw, width, height)
     if raw.ndim == 3:
         colors = raw[..., :3]
@@ -99,18 +99,19 @@ def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height wi
     return raw.astype(np.int32)
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
+def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
     try:
         content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        raise DataError(path, "an image", "no such file", "Restore it, or leave out that frame.") from None
+        advice = "Restore it, or leave out that frame (of all cameras, in the meta too)."
+        raise DataError(path, kind, "no such file", advice) from None
     cut_off = any(
         content.startswith(head) and end not in content[-_TAIL:] for head, end in _END_MARKS.items()
     )
     image = None if cut_off or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
         what = "a file that is cut off" if cut_off else "something else"
-        raise DataError(path, "an image", f"{what} ({len(content)} bytes)", "Fetch the file again.")
+        raise DataError(path, kind, f"{what} ({len(content)} bytes)", "Fetch the file again.")
     return image
 
 

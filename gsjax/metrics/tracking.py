@@ -1,7 +1,7 @@
 """How far tracked Gaussians are from where the true motion of their object would have carried them.
 
 With x_t the Gaussian's centre at frame t and T_t the object's true pose (object to world), a perfect tracker
-has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. All in float64, on the host.
+has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. In float64, on the host.
 """
 
 from collections.abc import Mapping, Sequence

@@ -66,7 +66,7 @@ def check_inputs(
         )
     num_cameras = viewmats.shape[-3]
     _expect("viewmats", viewmats, (*lead, num_cameras, 4, 4), "leading axes as in means")
-    _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one matrix for each of viewmats")
+    _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one for each of viewmats; one camera is Ks[None]")
     if 0 in (*lead, num_cameras):
         raise ValueError(f"viewmats must hold at least one camera of one scene; got {tuple(viewmats.shape)}")
     colors = _check_colors(colors, plan, lead, num_cameras, n)
@@ -117,7 +117,7 @@ def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n
     per_camera = colors.ndim == len(lead) + 2 + inner
     bases = () if plan.sh_degree is None else (None,)
     cameras = (num_cameras,) if per_camera else ()
-    meaning = "values [N, D]"
+    meaning = "values [N, D] (SH coefficients [N, K, D] take sh_degree)"
     if plan.sh_degree is not None:
         meaning = "SH coefficients [N, K, D] since sh_degree is given"
     _expect("colors", colors, (*lead, *cameras, n, *bases, None), meaning)

@@ -87,14 +87,3 @@ def render(
     if visibility is not None:
         images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))
     return Rendered(images[..., :3], images[..., 3], alphas[..., 0], meta.features, meta)
-
-
-def stack_cameras(cameras: list[Camera]) -> Camera:
-    """One Camera of C from C of the same size."""
-    first = cameras[0]
-    return Camera(
-        viewmat=jnp.stack([c.viewmat for c in cameras]),
-        K=jnp.stack([c.K for c in cameras]),
-        width=first.width,
-        height=first.height,
-    )

@@ -40,7 +40,9 @@ def standing_still(scene, first, frames, config):
     """`track` for objects that never move."""
     for _ in frames:
         seen = np.ones(scene.num_objects, bool)
-        yield Tracked(scene, first_pose(scene), None, {"visible": seen, "joined": 0}, 0.01, 0.0, None)
+        yield Tracked(
+            scene, first_pose(scene), None, {"visible": seen, "joined": 0, "skipped": False}, 0.01, 0.0, None
+        )
 
 
 @pytest.fixture

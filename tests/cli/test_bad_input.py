@@ -115,7 +115,9 @@ def test_mask_of_another_size(refused, recording):
 
 def test_mask_that_is_all_background(refused, recording):
     rewrite(recording / "seg" / "1" / "000000.png", np.zeros_like)
-    assert "no object to track" in refused(recording, "--mask-camera", "1")
+    said = refused(recording, "--mask-camera", "1")
+    assert "seg/1/000000.png: expected at least one object" in said
+    assert "Use --mask-camera 0" in said
 
 
 @pytest.mark.parametrize(
@@ -127,7 +129,8 @@ def test_mask_that_is_all_background(refused, recording):
         (("--cameras", "0", "--eval-cameras", "0"), "camera 0 is tracked too"),
         (("--cameras", "0", "--mask-camera", "2"), "camera 2 is not tracked; the tracked ones are [0]."),
         (("--eval-cameras", "0", "1", "2"), "no camera is left to track"),
-        (("--frames", "60:90"), "it has frames 0 to 3"),
+        (("--frames", "60:90"), "--frames: 60:90 holds no frame of table, which has 0 to 3."),
+        (("--frames", "4"), "found '4'; :4 is the first four"),
         (("--frames", "x"), "--frames: expected START:STOP"),
     ],
 )
@@ -200,7 +203,7 @@ def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
 
 
 def test_one_frame_only(sound, pristine, tmp_path, still):
-    said, found = sound(pristine, "--frames", "2", "--eval-cameras", "2")
+    said, found = sound(pristine, "--frames", "2:3", "--eval-cameras", "2")
     assert "1 of 1 frames, no updates" in said
     assert found["frames"]["first_id"] == found["frames"]["last_id"] == 2
     assert found["update_hz"] is None

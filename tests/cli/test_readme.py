@@ -10,10 +10,8 @@ from gsjax.cli import main
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def programs() -> list[str]:
-    return re.findall(
-        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL
-    )
+def programs(page: Path = ROOT / "README.md") -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def test_it_fits_one_screen_and_its_picture_is_there():
@@ -26,10 +24,19 @@ def test_it_fits_one_screen_and_its_picture_is_there():
         assert 0 < (ROOT / picture).stat().st_size < 400_000
 
 
+@pytest.mark.parametrize("page", ["rasterizer.md", "data.md"])
+def test_the_programs_of_a_page_run_one_after_another(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for program in programs(ROOT / "docs" / page):
+        exec(compile(program, page, "exec"), names)
+    assert names
+
+
 @pytest.mark.slow
 def test_its_programs_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    quick = ("--frames", "0", "--tracker.start.iterations", "1")
+    quick = ("--frames", "0:1", "--tracker.start.iterations", "1")
     assert main(["track", "simulated:tabletop", "--cameras", "0", "--out", "runs/demo", *quick]) == 0
     for program in programs():
         exec(compile(program, "README.md", "exec"), {})

@@ -194,13 +194,13 @@ def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, stil
 
 @pytest.mark.parametrize(
     ("text", "frames"),
-    [("0:60", range(60)), (":30", range(30)), ("0:9:2", range(0, 9, 2)), ("7", [7]), (":", range(100))],
+    [("0:60", range(60)), (":30", range(30)), ("0:9:2", range(0, 9, 2)), ("7:8", [7]), (":", range(100))],
 )
 def test_frames_are_slices(text, frames):
     assert list(range(100))[parse_frames(text)] == list(frames)
 
 
-@pytest.mark.parametrize("text", ["", "a:b", "1:2:3:4", "0:10:-1", "0:10:0"])
+@pytest.mark.parametrize("text", ["", "7", "a:b", "1:2:3:4", "0:10:-1", "0:10:0"])
 def test_other_words_are_no_frames(text):
     with pytest.raises(ValueError, match="--frames"):
         parse_frames(text)

@@ -9,7 +9,7 @@ import pytest
 import gsjax
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
 from gsjax.scene.gaussians import gaussians_from_activated
-from gsjax.scene.render import plan_render, render, stack_cameras
+from gsjax.scene.render import plan_render, render
 
 WIDTH, HEIGHT = 40, 28
 
@@ -29,7 +29,7 @@ def make_cameras(count: int = 2) -> Camera:
     eyes = np.array([[1.0, 0.2, 0.4], [0.3, -1.0, 0.5], [-0.8, 0.6, 0.3]])[:count]
     K = jnp.asarray(intrinsics(1.2 * WIDTH, WIDTH, HEIGHT), jnp.float32)
     views = [jnp.asarray(look_at(eye, np.zeros(3)), jnp.float32) for eye in eyes]
-    return stack_cameras([Camera(view, K, WIDTH, HEIGHT) for view in views])
+    return Camera(jnp.stack(views), jnp.stack([K] * count), WIDTH, HEIGHT)
 
 
 def one_camera(cameras: Camera, c: int) -> Camera:

@@ -4,16 +4,32 @@ Read the files as the data flows: config, scene, fit, shapes, motion, matching, 
 region, refine, tracker, grow, tracking.
 """
 
-from gsjax.methods.object_tracker.config import MatchConfig, RefineConfig, StartConfig, TrackerConfig
-from gsjax.methods.object_tracker.grow import EMPTY
+from gsjax.methods.object_tracker.config import (
+    AlignConfig,
+    GrowConfig,
+    MatchConfig,
+    RefineConfig,
+    StartConfig,
+    TrackerConfig,
+)
+from gsjax.methods.object_tracker.grow import EMPTY, with_slots
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.shapes import scene_from_shapes
-from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker, render_labels
+from gsjax.methods.object_tracker.tracker import (
+    TrackerBatch,
+    TrackerState,
+    object_tracker,
+    plan_tracker,
+    render_labels,
+)
 from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
 
 __all__ = [
     "EMPTY",
+    "AlignConfig",
+    "GrowConfig",
     "MatchConfig",
     "Pose",
     "RefineConfig",
@@ -22,12 +38,15 @@ __all__ = [
     "TrackedScene",
     "TrackerBatch",
     "TrackerConfig",
+    "TrackerPlan",
     "TrackerState",
     "first_pose",
     "object_tracker",
     "place",
+    "plan_tracker",
     "render_labels",
     "scene_from_shapes",
     "start_scene",
     "track",
+    "with_slots",
 ]

@@ -1,4 +1,4 @@
-"""Every number of the object-aware tracker, with its unit and what it trades."""
+"""The settings of the object-aware tracker, with their units and what they trade."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -48,7 +48,7 @@ def pixels_of_groups(
     """Up to `config.pixels` pixels of each group in each camera, as points that this camera looks for.
 
     Args:
-        frame: what the cameras saw; without depth, the model's depth stands in.
+        frame: what the cameras saw; for a camera without depth, the model's depth stands in.
         labels: the group of each pixel, 0 for none.
         depths: of the model at that pixel. What is measured further off
             than a group is thick is something else.
@@ -57,7 +57,10 @@ def pixels_of_groups(
     grid = pixel_grid(width, height).reshape(-1, 2)
     # A fixed shuffle: any first few of the chosen pixels are spread over the whole group.
     shuffle = jax.random.permutation(jax.random.key(0), height * width).astype(jnp.float32)
-    measured = depths if frame.depths is None else frame.depths
+    measured = depths
+    if frame.depths is not None:
+        with_depth = (frame.depths > 0).any((1, 2))[:, None, None]
+        measured = jnp.where(with_depth, frame.depths, depths)
     usable = (measured > 0) & (jnp.abs(measured - depths) < config.max_thickness)
 
     def one(group, camera):

@@ -57,7 +57,8 @@ def labelled_cloud(
     """All cameras' points; labels come from one camera's mask, and from it to near neighbours unseen there.
 
     Raises:
-        ValueError: the frame has no depth or no valid depth, or the mask has another size.
+        ValueError: the frame has no depth or no valid depth, the mask has another size, or there is no such
+            camera.
     """
     if frame.depths is None:
         raise ValueError(
@@ -65,6 +66,8 @@ def labelled_cloud(
         )
     images, depths = np.asarray(frame.images), np.asarray(frame.depths)
     viewmats, Ks = np.asarray(frame.cameras.viewmat, np.float64), np.asarray(frame.cameras.K, np.float64)
+    if not 0 <= mask_camera < len(depths):
+        raise ValueError(f"mask_camera is {mask_camera}; the frame has {len(depths)} cameras, counted from 0")
     if mask.shape != depths.shape[1:]:
         raise ValueError(f"mask has shape {mask.shape}; the images have {depths.shape[1:]} (height, width)")
     clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]

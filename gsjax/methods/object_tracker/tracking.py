@@ -85,7 +85,8 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
     frame, broken = without_broken(batch.frame)
     batch = batch._replace(frame=frame)
     tracker = object_tracker(config, num_objects, batch, reduction)
-    pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
+    with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
+        pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
     rendered, scene = info.pop("rendered"), batch.scene
     info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
     if config.grow.slots and frame.depths is not None:
