@@ -109,7 +109,7 @@ def write_plots(
         keep(
             "update_time",
             plots.update_time(np.array([np.nan, *tracking.update_s[1:]])),
-            "Seconds of each update",
+            "Time of each update; compiling apart",
         )
     if scores.num_frames > 1:
         lines = {

@@ -41,10 +41,8 @@ class Recording:
         return self.judged.camera_ids[self.tracked.num_cameras :]
 
 
-def open_recording(
-    dataset: str, cameras: Indices[int] | None, eval_cameras: Indices[int], frames: str
-) -> Recording:
-    """Open a dataset and choose frames and cameras; without a choice all cameras that are not held out.
+def open_recording(dataset: str, cameras: Indices[int], eval_cameras: Indices[int], frames: str) -> Recording:
+    """Open a dataset and choose frames and cameras; without `cameras` all that are not held out.
 
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen.
@@ -52,7 +50,7 @@ def open_recording(
     """
     sequence = open_sequence(dataset)
     known = list(sequence.camera_ids)
-    chosen = [c for c in known if c not in eval_cameras] if cameras is None else list(cameras)
+    chosen = [c for c in known if c not in eval_cameras] if not cameras else list(cameras)
     for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):
         unknown = [c for c in ids if c not in known]
         if unknown:

@@ -21,6 +21,7 @@ from gsjax.cli.recording import (
     open_recording,
     warn_of_missing,
 )
+from gsjax.cli.report import format_number
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
 from gsjax.cli.summary import machine, print_summary, write_run_report
@@ -37,7 +38,7 @@ class Options:
     """Folder of a recording, or a built-in scene such as simulated:tabletop."""
     out: Path
     """Folder for the run. It must be new, empty, or hold an unfinished run."""
-    cameras: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="ID [ID ...]")] = None
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
     """Ids of the cameras to track with. All that are not held out, unless given."""
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
@@ -108,11 +109,19 @@ def _start(
     warn_of_missing(recording, mask, scene.label_ids, notes)
     seconds = perf_counter() - begun
     console.print(
-        f"[bold]scene[/]     {scene.gaussians.num:,} Gaussians, {scene.num_moving:,} of them in "
-        f"{scene.num_objects} objects, in {seconds:.1f} s; {_origin(mask)}",
+        f"[bold]scene[/]     {format_number(scene.gaussians.num)} Gaussians, "
+        f"{format_number(scene.num_moving)} of them in "
+        f"{_count(scene)}, in {seconds:.1f} s; {_origin(mask)}",
         soft_wrap=not console.is_terminal,
     )
     return scene, seconds
+
+
+def _count(scene: TrackedScene) -> str:
+    """How many objects there are; what is too large to be rigid is followed in parts."""
+    objects = len(set(scene.label_ids) - {0})
+    parts = f" ({scene.num_objects} rigid parts)" if scene.num_objects > objects else ""
+    return f"{objects} objects{parts}"
 
 
 def _origin(mask: FirstMask) -> str:

@@ -70,7 +70,7 @@ class AlignConfig:
     iterations: int = 6
     """Gauss-Newton iterations a frame; 0 leaves it out."""
     color_scale: float = 0.1
-    """A colour difference that is large, about 0 to 1; see `tones`."""
+    """A difference of log colours that is large; they span about 0 to 1."""
     depth_scale: float = 0.01
     """A depth difference that is large, metres."""
     pixels: int = 192
