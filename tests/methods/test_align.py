@@ -23,6 +23,7 @@ from gsjax.methods.object_tracker.points import (
     join,
     pixels_of_groups,
     renewed,
+    sample_groups,
 )
 from gsjax.methods.object_tracker.search import ball, principal_axes, search, turned
 
@@ -114,6 +115,16 @@ def test_only_pixels_of_the_group_are_picked(moved, table):
         assert chosen.sum() == min(CONFIG.pixels, (labels[c] == 1).sum())
         colors = np.asarray(frames[6].images[c])[labels[c] == 1]
         assert {tuple(row) for row in np.asarray(points.colors[0])[chosen]} <= {tuple(row) for row in colors}
+
+
+def test_samples_are_capped_and_never_strangers():
+    groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
+    means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
+    few = sample_groups(means, means, jnp.ones((2, 40)), groups, 4, 8)
+    assert few.means.shape == (4, 8, 3)
+    real = np.asarray(few.seen[:, 0]) > 0
+    np.testing.assert_array_equal(real.sum(1), [8, 3, 0, 7])
+    np.testing.assert_array_equal(few.means[real, 0], np.nonzero(real)[0] + 1)
 
 
 def test_join_holds_the_points_of_both(moved):

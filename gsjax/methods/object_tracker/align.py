@@ -1,6 +1,6 @@
 """Direct alignment of each group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
 
-What aligns is a set of points with colours: pixels of earlier frames that showed the group (see `points`).
+What aligns is a set of points with colours: pixels that showed the group earlier, and centres (see `points`).
 Each has a colour and a depth to agree with at the pixel it falls on:
 
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )

@@ -73,6 +73,10 @@ class AlignConfig:
     """A difference of log colours that is large; they span about 0 to 1."""
     depth_scale: float = 0.01
     """A depth difference that is large, metres."""
+    centers: int = 256
+    """Gaussians of a group whose centres are aligned."""
+    center_weight: float = 0.2
+    """What a centre counts beside a pixel, which looks more like the new frame."""
     pixels: int = 192
     """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
     keyframe_turn: float = 0.5
@@ -99,7 +103,15 @@ class AlignConfig:
         _check(
             self,
             above_zero=scales,
-            at_least={"iterations": 0, "pixels": 1, "reach": 0, "keyframe_turn": 0, "max_turn": 0},
+            at_least={
+                "iterations": 0,
+                "centers": 1,
+                "center_weight": 0,
+                "pixels": 1,
+                "reach": 0,
+                "keyframe_turn": 0,
+                "max_turn": 0,
+            },
         )
 
 

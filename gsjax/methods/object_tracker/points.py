@@ -1,8 +1,8 @@
 """What is aligned of each group: coloured points, as many for each, that cameras may look for.
 
-They are pixels: of the last frame, which look most like the new one, and of a keyframe, carried along since
-then. The last frame alone would drift, and what once slid off its object would take its neighbours' pixels
-for its own; the keyframe remembers what it was.
+They are pixels of the last frame, which look most like the new one; pixels of a keyframe, carried along since
+then; and centres of the Gaussians that the first mask named. The last frame alone would drift, and what once
+slid off its object would take its neighbours' pixels for its own; the others remember what it was.
 """
 
 from typing import NamedTuple
@@ -36,6 +36,25 @@ def carry(points: Points, twists: Float[Array, "k 6"], centers: Float[Array, "k 
     center = centers[:, None]
     turned = jnp.einsum("kij,kpj->kpi", jaxlie.SO3.exp(twists[:, 3:]).as_matrix(), points.means - center)
     return points._replace(means=center + turned + twists[:, None, :3])
+
+
+def sample_groups(
+    means: Float[Array, "m 3"],
+    colors: Float[Array, "m 3"],
+    seen: Float[Array, "c m"],
+    groups: Int[Array, "m"],
+    num_groups: int,
+    per_group: int,
+) -> Points:
+    """Up to `per_group` members of each group, spread over it; a large one needs no more."""
+    shuffle = 1.0 + jax.random.permutation(jax.random.key(1), groups.shape[0]).astype(jnp.float32)
+    size = min(per_group, groups.shape[0])
+
+    def one(group):
+        priority, rows = jax.lax.top_k(jnp.where(groups == group, shuffle, 0.0), size)
+        return Points(means[rows], colors[rows], seen[:, rows] * (priority > 0))
+
+    return jax.vmap(one)(jnp.arange(1, num_groups + 1))
 
 
 def pixels_of_groups(

@@ -2,7 +2,8 @@
 
 A shape with a pose (the ground) is placed as it is. One without is laid on its plane where the images look
 like it: a search over position and heading, scored by the colours its centres fall on, then refined against
-rendered images. Colours of everything are then read off the images.
+rendered images. Colours of everything are then read off the images, and at last all of it is optimised
+photometrically, as a scene from depth is: shapes that are too fat for their pictures become slimmer.
 """
 
 import warnings
@@ -23,6 +24,7 @@ from gsjax.geometry.neighbors import nearest
 from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.object_tracker.align import bilinear
 from gsjax.methods.object_tracker.config import TrackerConfig
+from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.motion import Motion, first_pose, move
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import tiles_to_pixels, touched_tiles
@@ -93,7 +95,7 @@ def scene_from_shapes(
     scene = _recolored(scene, frame)
     for _ in range(_REFINEMENTS):
         scene = _recolored(_refined(scene, frame, config), frame)
-    return scene
+    return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
 def _placed(shape: Shape, pose: np.ndarray) -> Gaussians:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers, project
+from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.matching import lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
@@ -18,6 +19,7 @@ from gsjax.methods.object_tracker.points import (
     join,
     pixels_of_groups,
     renewed,
+    sample_groups,
 )
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import (
@@ -93,6 +95,18 @@ def _pixels(frame: Frame, rendered: Rendered, num_objects: int, config: TrackerC
     return pixels_of_groups(frame, shown, rendered.depths, num_objects, config.align)
 
 
+def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
+    """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
+    one_sided = jnp.any(scene.normals != 0, axis=-1)
+    named = one_sided | ~jnp.any(
+        one_sided
+    )  # of shapes known beforehand both sides are seen, and all are named
+    colors = scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
+    groups = scene.labels[: scene.num_moving]
+    seen = config.align.center_weight * seen * named
+    return sample_groups(pose.means, colors, seen, groups, scene.num_objects, config.align.centers)
+
+
 def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch, reduction: int = 1) -> Step:
     """The step of the object-aware tracker.
 
@@ -131,7 +145,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         )
         jump, found = lift(match, frame, config.match)
 
-        points = join(state.pixels, state.keyframe.points)
+        named = _named(scene, params, seen, config)
+        points = join(join(named, state.pixels), state.keyframe.points)
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
