@@ -138,7 +138,7 @@ def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_tr
     monkeypatch.setattr(Sequence, "frame", interrupted)
     code, said = gsjax_track(pristine, "--cameras", "0", "1", "--eval-cameras", "2")
     assert code == 0
-    assert "scoring was stopped by Ctrl-C after 3 of 4 frames" in said
+    assert "scoring was stopped after 3 of 4 frames by Ctrl-C" in said
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (found["frames"]["tracked"], found["frames"]["scored"], found["complete"]) == (4, 3, False)
 
@@ -184,7 +184,7 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
 
 
 def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):
-    options = ("--cameras", "1", "--frames", "0")
+    options = ("--cameras", "1", "--frames", "0:1")
     assert gsjax_track(pristine, *options)[0] == 0
     code, said = gsjax_track(pristine, *options)
     assert code == 2

@@ -204,7 +204,7 @@ def test_files_of_a_kind_that_are_missing_or_bad(folder):
     with pytest.raises(DataError, match=r"seg/0/000000.png: expected 8x6 pixels, found 3x3"):
         sequence.mask(0, 0)
     (folder.root / "seg/0/000001.png").unlink()
-    with pytest.raises(DataError, match=r"seg/0/000001.png: expected an image, found no such file"):
+    with pytest.raises(DataError, match=r"seg/0/000001.png: expected a mask, found no such file"):
         sequence.mask(1, 0)
     cut(folder.root / "seg/0/000002.png")
     with pytest.raises(DataError, match="cut off"):

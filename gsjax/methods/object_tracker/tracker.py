@@ -97,10 +97,10 @@ def _pixels(frame: Frame, rendered: Rendered, num_objects: int, config: TrackerC
 
 def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
     """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
-    one_sided = jnp.any(scene.normals != 0, axis=-1)
-    named = one_sided | ~jnp.any(
-        one_sided
-    )  # of shapes known beforehand both sides are seen, and all are named
+    with_normal = jnp.any(scene.normals != 0, axis=-1)
+    named = (
+        with_normal | ~with_normal.any()
+    )  # shapes known beforehand have no normals, and nothing joins them
     colors = scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
     groups = scene.labels[: scene.num_moving]
     seen = config.align.center_weight * seen * named
@@ -126,9 +126,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
     def init(params: Pose) -> TrackerState:
         nowhere = Motion(jnp.zeros((num_objects, 6), params.means.dtype), jnp.zeros_like(params.means))
-        pixels = _pixels(
-            first.frame, render_labels(first.scene, params, first.frame, first.plan.full), num_objects, config
-        )
+        rendered = render_labels(first.scene, params, first.frame, first.plan.full)
+        pixels = _pixels(first.frame, rendered, num_objects, config)
         return TrackerState(nowhere, pixels, first_keyframe(pixels), jnp.int32(0))
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
@@ -145,8 +144,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         )
         jump, found = lift(match, frame, config.match)
 
-        named = _named(scene, params, seen, config)
-        points = join(join(named, state.pixels), state.keyframe.points)
+        points = join(_named(scene, params, seen, config), join(state.pixels, state.keyframe.points))
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
