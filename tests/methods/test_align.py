@@ -1,5 +1,7 @@
 """Direct alignment finds a known motion of a textured object, and keeps away from what is not there."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -125,6 +127,27 @@ def test_samples_are_capped_and_never_strangers():
     real = np.asarray(few.seen[:, 0]) > 0
     np.testing.assert_array_equal(real.sum(1), [8, 3, 0, 7])
     np.testing.assert_array_equal(few.means[real, 0], np.nonzero(real)[0] + 1)
+
+
+def test_without_turns_only_translation_is_sought_and_found(moved):
+    points, center, frame, _, _ = moved
+    config = replace(CONFIG, max_turn=0.0)
+    shift = jnp.array([[0.006, -0.004, 0.003]])
+    behind = points._replace(means=points.means - shift)
+    start = jnp.zeros((1, 1, 6))
+    twist = search(start, behind, center - shift, frame, config)
+    np.testing.assert_array_equal(twist[0, 3:], 0)
+    before, after = (disagreement(carry(behind, t, center - shift), frame, config) for t in (start[0], twist))
+    assert after[0] < before[0]
+
+
+def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
+    _, frames, _ = table(8, 2, **SIZE)
+    labels = moved[4]
+    blind = eqx.tree_at(lambda f: f.depths, frames[6], frames[6].depths.at[1].set(0.0))
+    points = pixels_of_groups(blind, labels, frames[6].depths, 1, CONFIG)
+    np.testing.assert_array_equal(points.seen, moved[0].seen)
+    np.testing.assert_allclose(points.means, moved[0].means)
 
 
 def test_join_holds_the_points_of_both(moved):

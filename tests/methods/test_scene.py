@@ -55,11 +55,25 @@ def test_values_of_the_mask_may_have_gaps(table):
     assert scene_from_cloud(labelled_cloud(frames[0], sparse, 0, START), START).label_ids == (0, 40)
 
 
+def test_a_pixel_that_flies_off_an_edge_makes_nothing_large(cloud, scene):
+    """Depth cameras have them: one point of the carton, half a metre behind it, cuts it into no parts."""
+    points = cloud.points.copy()
+    points[np.flatnonzero(cloud.labels == 2)[0]] += 0.5
+    flown = scene_from_cloud(cloud._replace(points=points), START)
+    assert flown.label_ids == scene.label_ids
+
+
 def test_normals_point_to_a_camera(table, scene):
     _, frames, _ = table()
     share = facing(scene, first_pose(scene), camera_centers(frames[0].cameras.viewmat))
     assert (np.abs(scene.normals).max(axis=1) == 1).all()
     assert float(share[:, : scene.num_moving].max(0).min()) >= 0.5 - 1e-3
+
+
+def test_a_mask_of_a_camera_that_is_not_there_is_refused(table):
+    _, frames, mask = table()
+    with pytest.raises(ValueError, match="mask_camera is 9; the frame has 2 cameras"):
+        labelled_cloud(frames[0], mask, 9, START)
 
 
 def test_bad_input_says_what_is_wrong(table):

@@ -97,10 +97,9 @@ def _pixels(frame: Frame, rendered: Rendered, num_objects: int, config: TrackerC
 
 def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
     """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
+    # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
-    named = (
-        with_normal | ~with_normal.any()
-    )  # shapes known beforehand have no normals, and nothing joins them
+    named = with_normal | ~with_normal.any()
     colors = scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
     groups = scene.labels[: scene.num_moving]
     seen = config.align.center_weight * seen * named
