@@ -21,6 +21,7 @@ from gsjax.methods.object_tracker.points import (
     Points,
     carry,
     carry_keyframe,
+    faded,
     first_keyframe,
     join,
     pixels_of_groups,
@@ -167,6 +168,8 @@ def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
     for turn, expected in ((0.3, [1.0, 1.0]), (0.6, [2.0, 1.0])):
         keyframe = renewed(carry_keyframe(keyframe, twists, centers), pixels(2.0), 0.5)
         np.testing.assert_allclose(keyframe.points.colors[:, 0, 0], expected, err_msg=str(turn))
+        count = faded(keyframe, 0.5).seen[:, 0, 0]
+        np.testing.assert_allclose(count, [0.4 if turn == 0.3 else 1.0, 1.0], rtol=1e-5)
     # Not renewed, so carried twice; renewed, so new, and unturned.
     np.testing.assert_allclose(keyframe.points.means[1, 0], [1.2, 1.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(keyframe.points.means[0, 0], [2.0, 2.0, 2.0])

@@ -79,8 +79,8 @@ class AlignConfig:
     """What a centre counts beside a pixel, which looks more like the new frame."""
     pixels: int = 192
     """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
-    keyframe_turn: float = 0.5
-    """Beyond this turn since then, the keyframe is replaced by the last frame, radians."""
+    keyframe_turn: float = 0.2
+    """The keyframe counts less as a group turns, and beyond this turn the last frame replaces it, radians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
     shading: float = 0.3

@@ -114,12 +114,23 @@ def first_keyframe(pixels: Points) -> Keyframe:
     return Keyframe(pixels, unturned)
 
 
+def turn_since(keyframe: Keyframe) -> Float[Array, "k"]:
+    """By how much each group has turned since its keyframe, radians."""
+    return 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
+
+
+def faded(keyframe: Keyframe, max_turn: float) -> Points:
+    """The keyframe's points, which count less the more a group has turned: it is lit differently by then."""
+    share = jnp.clip(1 - turn_since(keyframe) / max(max_turn, 1e-9), 0.0, 1.0)
+    return keyframe.points._replace(seen=keyframe.points.seen * share[:, None, None])
+
+
 def renewed(keyframe: Keyframe, pixels: Points, max_turn: float) -> Keyframe:
     """`pixels` for the groups that have turned by more than `max_turn` radians: they show other sides now."""
-    turn = 2 * jnp.arccos(jnp.clip(jnp.abs(keyframe.turned[:, 0]), 0.0, 1.0))
+    old = turn_since(keyframe) > max_turn
 
-    def choose(new, old):
-        return jnp.where((turn > max_turn).reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    def choose(new, kept):
+        return jnp.where(old.reshape(-1, *[1] * (kept.ndim - 1)), new, kept)
 
     return jax.tree.map(choose, first_keyframe(pixels), keyframe)
 

@@ -15,6 +15,7 @@ from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
     carry_keyframe,
+    faded,
     first_keyframe,
     join,
     pixels_of_groups,
@@ -143,7 +144,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         )
         jump, found = lift(match, frame, config.match)
 
-        points = join(_named(scene, params, seen, config), join(state.pixels, state.keyframe.points))
+        remembered = faded(state.keyframe, config.align.keyframe_turn)
+        points = join(_named(scene, params, seen, config), join(state.pixels, remembered))
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
