@@ -193,8 +193,7 @@ def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
     masks = {name: tracked.mask(0, i) for i, name in enumerate(tracked.camera_ids)}
     better = [name for name, mask in masks.items() if mask is not None and mask.any()]
     advice = f"Use --mask-camera {better[0]}" if better else "Choose other --frames"
-    what = f"{tracked.name}, the first mask of camera {tracked.camera_ids[c]}"
-    what = tracked.locate("mask", 0, c) if tracked.locate else what
+    what = tracked.where("mask", 0, c)
     raise DataError(what, "at least one object", "background only", f"{advice}, or --masks segment.")
 
 

@@ -188,7 +188,7 @@ class Sequence:
         Raises:
             DataError: the file is bad, or the loader gave another shape or type.
         """
-        image, what = self._raw_image(t, c), self._what("image", t, c)
+        image, what = self._raw_image(t, c), self.where("image", t, c)
         if self.float_images:
             finite = np.isfinite(image).all(-1)
             if not finite.all():
@@ -208,7 +208,7 @@ class Sequence:
         Raises:
             DataError: the file is bad, the loader gave another shape or type, or the unit is wrong.
         """
-        depth, what = self._load(self.load_depth, "depth", t, c), self._what("depth", t, c)
+        depth, what = self._load(self.load_depth, "depth", t, c), self.where("depth", t, c)
         if depth is None:
             return None
         _check_array(what, depth, (self.height, self.width), np.floating, "float metres")
@@ -225,7 +225,7 @@ class Sequence:
         mask = self._load(self.load_mask, "mask", t, c)
         if mask is None:
             return None
-        _check_array(self._what("mask", t, c), mask, (self.height, self.width), np.integer, "integer labels")
+        _check_array(self.where("mask", t, c), mask, (self.height, self.width), np.integer, "integer labels")
         return mask.astype(np.int32)
 
     def frame(self, t: int) -> Frame:
@@ -258,7 +258,7 @@ class Sequence:
         self._check_index(t + 1, c)
         flow = self.load_flow(t, t + 1, c)
         if flow is not None:
-            _check_array(self._what("flow", t, c), flow, (self.height, self.width, 2), np.floating, "floats")
+            _check_array(self.where("flow", t, c), flow, (self.height, self.width, 2), np.floating, "floats")
         return flow
 
     def select(
@@ -299,7 +299,7 @@ class Sequence:
     def _raw_image(self, t: int, c: int) -> np.ndarray:
         image = self._load(self.load_image, "image", t, c)
         kind, words = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
-        _check_array(self._what("image", t, c), image, (self.height, self.width, 3), kind, words)
+        _check_array(self.where("image", t, c), image, (self.height, self.width, 3), kind, words)
         return image
 
     def _load(self, loader: Callable | None, kind: str, t: int, c: int) -> np.ndarray | None:
@@ -317,7 +317,8 @@ class Sequence:
     def _camera_in_frame(self, t: int, c: int) -> str:
         return f"camera {self.camera_ids[c]} in frame {self.frame_ids[t]}"
 
-    def _what(self, kind: str, t: int, c: int) -> str:
+    def where(self, kind: str, t: int, c: int) -> str:
+        """What errors call the image, depth or mask of camera `c` in frame `t`: its path, if it has one."""
         if self.locate is not None:
             return self.locate(kind, t, c)
         return f"{self.name}, {kind} of {self._camera_in_frame(t, c)}"

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from gsjax.geometry.cameras import project
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, carry
+from gsjax.methods.object_tracker.points import Points, carry, of_groups
 from gsjax.scene.frame import Frame
 
 
@@ -150,7 +150,7 @@ def align(
         best, trial, damping = carried
         new = fit(trial)
         better = new.cost < best.cost
-        best = jax.tree.map(lambda a, b: _where(better, a, b), new, best)
+        best = jax.tree.map(lambda a, b: of_groups(better, a, b), new, best)
         damping = jnp.clip(jnp.where(better, damping * 0.3, damping * 10.0), 1e-4, 1e4)
         diagonal = jnp.einsum("kii->ki", best.hessian)
         # Directions that no pixel speaks of stand still.
@@ -165,10 +165,6 @@ def align(
     start = (nothing, twists, jnp.full(count, 1e-2))
     (best, *_), _ = jax.lax.scan(iterate, start, None, length=config.iterations + 1)
     return best.twists
-
-
-def _where(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array, "k *d"]):
-    return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
 def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:

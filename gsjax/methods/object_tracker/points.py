@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import pixel_grid, unproject
 from gsjax.methods.object_tracker.config import AlignConfig
@@ -29,6 +29,11 @@ def join(a: Points, b: Points) -> Points:
     """The points of both."""
     rows = (jnp.concatenate([x, y], axis=1) for x, y in zip(a[:2], b[:2], strict=True))
     return Points(*rows, jnp.concatenate([a.seen, b.seen], axis=2))
+
+
+def of_groups(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array, "k *d"]):
+    """The rows of `a` for the chosen groups, and of `b` for the others."""
+    return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
 def carry(points: Points, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Points:
@@ -128,11 +133,7 @@ def faded(keyframe: Keyframe, max_turn: float) -> Points:
 def renewed(keyframe: Keyframe, pixels: Points, max_turn: float) -> Keyframe:
     """`pixels` for the groups that have turned by more than `max_turn` radians: they show other sides now."""
     old = turn_since(keyframe) > max_turn
-
-    def choose(new, kept):
-        return jnp.where(old.reshape(-1, *[1] * (kept.ndim - 1)), new, kept)
-
-    return jax.tree.map(choose, first_keyframe(pixels), keyframe)
+    return jax.tree.map(lambda new, kept: of_groups(old, new, kept), first_keyframe(pixels), keyframe)
 
 
 def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:
