@@ -81,7 +81,7 @@ def make_scene(case: Case) -> Scene:
     depths = 1.5 + 2 * (rng.permutation(n) + rng.uniform(0.2, 0.8, n)) / n
     pixels = rng.uniform([-0.15 * width, -0.15 * height], [1.15 * width, 1.15 * height], (n, 2))
     crowd = min(n * 7 // 10, 350)
-    pixels[:crowd] = rng.uniform(16, 32, (crowd, 2))
+    pixels[:crowd] = rng.uniform(16, 24, (crowd, 2))
     y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
     x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     local = np.stack([x, y, np.ones(n)], axis=-1) * depths[:, None]

@@ -1,7 +1,8 @@
 """Which tiles a Gaussian touches, and each tile's list from front to back.
 
-Gaussians are ranked by depth, expanded to (tile, rank) pairs over the tiles of their bounding box, tested
-exactly against each tile, and sorted by tile. Lists have any length: nothing but the total is bounded.
+Gaussians are ranked by depth. Each is expanded to the rows of tiles that its ellipse crosses, and in every
+row to the columns between which it lies there; so the list of pairs is exact before it is laid out. Pairs
+are sorted by (tile, rank). Lists have any length: nothing but the total is bounded.
 """
 
 from typing import NamedTuple
@@ -10,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from gsjax.rasterize.plan import TILE, Plan
-from gsjax.rasterize.projection import ALPHA_MIN, Projected
+from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.projection import ALPHA_MIN, MAX_SIGMA, Projected
+from gsjax.rasterize.sorting import argsort_keys, sort_keys
 
 _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
 
@@ -23,61 +25,16 @@ class TileLists(NamedTuple):
     starts: Int[Array, "tiles"]
     counts: Int[Array, "tiles"]
     pairs: Int[Array, ""]  # Gaussian-tile pairs that are drawn
-    needed: Int[Array, ""]  # pairs that had to be laid out first: what the capacity must hold
+    needed: Int[Array, ""]  # what the capacity must hold
     overflow: Bool[Array, ""]
 
 
-def _boxes(projected: Projected, plan: Plan) -> tuple[Int[Array, "n 2"], Int[Array, "n 2"]]:
-    """First tile (x, y) and number of tiles (x, y) of each Gaussian's bounding box; none if not visible."""
-    limit = jnp.array([plan.tiles_x, plan.tiles_y])
-    mean, half = jax.lax.stop_gradient((projected.means2d, projected.extents))
+class _Spans(NamedTuple):
+    """One Gaussian in one row of tiles: the columns it covers there."""
 
-    def tile_of(position):  # clipped as floats: an int32 cannot hold every float
-        return jnp.clip(jnp.floor(position / TILE), -1, limit).astype(jnp.int32)
-
-    low = jnp.maximum(tile_of(mean - half), 0)
-    high = jnp.minimum(tile_of(mean + half) + 1, limit)
-    return low, jnp.where(projected.visible[:, None], jnp.maximum(high - low, 0), 0)
-
-
-def _total(counts: Int[Array, "n"]) -> Int[Array, ""]:
-    """Sum that saturates at the largest int32: 2.2e9 pairs have been seen in the wild."""
-    estimate = counts.astype(jnp.float32).sum()
-    return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
-
-
-def count_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
-    """The capacity that `bin_gaussians` needs."""
-    _, size = _boxes(projected, plan)
-    return _total(size[:, 0] * size[:, 1])
-
-
-def _touches(mean, conic, opacity, tile_x, tile_y) -> Bool[Array, "pairs"]:
-    """Whether alpha reaches 1/255 anywhere on the tile: an exact test on the rectangle of its pixel centres.
-
-    The least of a convex quadratic over a rectangle lies, when its centre is outside, on one of the (at most
-    two) edges that face the centre, and along an edge it is a clamped one-dimensional minimum.
-    """
-    a, b, c = conic
-    low_x, low_y = tile_x * TILE + 0.5 - mean[0], tile_y * TILE + 0.5 - mean[1]
-    high_x, high_y = low_x + (TILE - 1), low_y + (TILE - 1)
-    edge_x = jnp.clip(0.0, low_x, high_x)
-    edge_y = jnp.clip(0.0, low_y, high_y)
-
-    def form(dx, dy):  # less what its terms, which may cancel, can have lost to rounding
-        squares = a * dx * dx + c * dy * dy
-        return squares + 2 * b * dx * dy - rounding * squares
-
-    rounding = 8 * jnp.finfo(a.dtype).eps
-    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
-    on_vertical = form(edge_x, jnp.clip(-b * edge_x / jnp.maximum(c, tiny), low_y, high_y))
-    on_horizontal = form(jnp.clip(-b * edge_y / jnp.maximum(a, tiny), low_x, high_x), edge_y)
-    least = jnp.minimum(
-        jnp.where(edge_x == 0, jnp.inf, on_vertical), jnp.where(edge_y == 0, jnp.inf, on_horizontal)
-    )
-    least = jnp.where((edge_x == 0) & (edge_y == 0), 0.0, least)
-    # The pixels have the last word, so rounding here errs to the side of keeping.
-    return least <= 2 * jnp.log(opacity / ALPHA_MIN) * 1.001 + 1e-3
+    gaussian_rank: Int[Array, "rows"]
+    first_tile: Int[Array, "rows"]
+    count: Int[Array, "rows"]  # columns; 0 in an unused slot
 
 
 def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan) -> TileLists:
@@ -85,46 +42,22 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
 
     Equal depths keep the order of the input. Tiles outside `tile_mask`, where there is one, get empty lists.
     """
-    capacity, num_tiles = plan.capacity, plan.num_tiles
-    n = projected.depths.shape[0]
-    low, size = _boxes(projected, plan)
-    depths = jax.lax.stop_gradient(projected.depths)
-    by_depth = jnp.argsort(jnp.where(projected.visible, depths, jnp.inf), stable=True).astype(jnp.int32)
-    per_gaussian = (size[:, 0] * size[:, 1])[by_depth]
-    needed = _total(per_gaussian)
-    overflow = needed > capacity
-    per_gaussian = jnp.where(overflow, 0, per_gaussian)  # a call that overflowed draws nothing, and says so
-
-    # Expand each Gaussian to its tiles.
-    ends = jnp.cumsum(per_gaussian)
-    slot = jnp.arange(capacity, dtype=jnp.int32)
-    rank = jnp.repeat(jnp.arange(n, dtype=jnp.int32), per_gaussian, total_repeat_length=capacity)
-    gaussian = by_depth[rank]
-    within = slot - (ends - per_gaussian)[rank]
-    columns = jnp.maximum(size[:, 0], 1)[gaussian]
-    tile_x = low[gaussian, 0] + within % columns
-    tile_y = low[gaussian, 1] + within // columns
-
-    # Keep the pairs that are real, whose ellipse reaches the tile, and whose tile is asked for.
-    drawn_with = (projected.means2d, projected.conics, projected.opacities)
-    mean, conic, opacity = jax.lax.stop_gradient(drawn_with)
-    keep = slot < ends[-1]
-    keep &= _touches(
-        (mean[:, 0][gaussian], mean[:, 1][gaussian]),
-        tuple(conic[:, i][gaussian] for i in range(3)),
-        opacity[gaussian],
-        tile_x,
-        tile_y,
-    )
-    tile = tile_y * plan.tiles_x + tile_x
-    if tile_mask is not None:
-        keep &= tile_mask[jnp.clip(tile, 0, num_tiles - 1)]
-    tile = jnp.where(keep, tile, num_tiles)
-
-    tile, gaussian = _sort_by_tile(tile, rank, by_depth, num_tiles, n)
-    edges = jnp.searchsorted(tile, jnp.arange(num_tiles + 1, dtype=tile.dtype)).astype(jnp.int32)
+    projected = jax.lax.stop_gradient(projected)
+    by_depth = _depth_order(projected, plan)
+    first_row, num_rows = _rows(projected, tile_mask, plan)
+    first_row, num_rows = first_row[by_depth], num_rows[by_depth]
+    rows = _total(num_rows)
+    enough_rows = 2 * rows.astype(jnp.float32) <= plan.capacity
+    num_rows = jnp.where(enough_rows, num_rows, 0)
+    spans = _spans(projected, tile_mask, by_depth, first_row, num_rows, plan)
+    pairs = _total(spans.count)
+    overflow = ~enough_rows | (pairs > plan.capacity)
+    needed = jnp.where(enough_rows, jnp.maximum(pairs, 2 * rows), _bounding_pairs(projected, plan))
+    count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing, and says so
+    tiles, ids = _sorted_pairs(spans._replace(count=count), tile_mask, by_depth, plan)
+    edges = jnp.searchsorted(tiles, jnp.arange(plan.num_tiles + 1, dtype=tiles.dtype)).astype(jnp.int32)
     return TileLists(
-        ids=gaussian,
+        ids=ids,
         starts=edges[:-1],
         counts=edges[1:] - edges[:-1],
         pairs=edges[-1],
@@ -133,13 +66,155 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     )
 
 
-def _sort_by_tile(tile, rank, by_depth, num_tiles: int, n: int):
-    """Pairs in order of (tile, depth). Both fit one 32-bit key but for the largest of scenes."""
+def needed_capacity(
+    projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
+) -> Int[Array, ""]:
+    """What `bin_gaussians` needs: exactly, if the plan's capacity holds twice the rows; else at least the rows."""
+    first_row, num_rows = _rows(projected, tile_mask, plan)
+    rows = _total(num_rows)
+    num_rows = jnp.where(2 * rows.astype(jnp.float32) <= plan.capacity, num_rows, 0)
+    unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
+    spans = _spans(projected, tile_mask, unordered, first_row, num_rows, plan)
+    return jnp.maximum(_total(spans.count), _doubled(rows))
+
+
+def _total(counts: Int[Array, "n"]) -> Int[Array, ""]:
+    """Sum that saturates at the largest int32: 2.2e9 pairs have been seen in the wild."""
+    estimate = counts.astype(jnp.float32).sum()
+    return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
+
+
+def _doubled(rows: Int[Array, ""]) -> Int[Array, ""]:
+    return jnp.where(rows > _TOO_MANY // 2, jnp.iinfo(jnp.int32).max, 2 * rows)
+
+
+def _depth_order(projected: Projected, plan: Plan) -> Int[Array, "n"]:
+    """Visible Gaussians by depth, then the others."""
+    depths = jnp.where(projected.visible, projected.depths, jnp.inf)
+    if depths.dtype != jnp.float32:
+        return jnp.argsort(depths, stable=True).astype(jnp.int32)
+    # Floats that are not negative are ordered as their bits are.
+    return argsort_keys(jax.lax.bitcast_convert_type(depths, jnp.uint32), plan.sort)
+
+
+def _tile_of(position: Array, plan: Plan, limit: int) -> Int[Array, "n"]:
+    """Index of the tile at a pixel position, from -1 to `limit`."""
+    # Clipped as floats: an int32 cannot hold every float.
+    return jnp.clip(jnp.floor(position / plan.tile_size), -1, limit).astype(jnp.int32)
+
+
+def _box(projected: Projected, axis: int, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    """First and one past the last tile of each bounding box along an axis (0: x); equal if not visible."""
+    limit = (plan.tiles_x, plan.tiles_y)[axis]
+    mean, half = projected.means2d[:, axis], projected.extents[:, axis]
+    low = jnp.maximum(_tile_of(mean - half, plan, limit), 0)
+    high = jnp.minimum(_tile_of(mean + half, plan, limit) + 1, limit)
+    return low, jnp.where(projected.visible, jnp.maximum(high, low), low)
+
+
+def _rows(projected: Projected, tile_mask, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    """First row of tiles of each Gaussian and how many; none where it touches no tile of the mask."""
+    top, bottom = _box(projected, 1, plan)
+    if tile_mask is None:
+        return top, bottom - top
+    left, right = _box(projected, 0, plan)
+    grid = tile_mask.reshape(plan.tiles_y, plan.tiles_x).astype(jnp.int32)
+    wanted = jnp.pad(grid.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    inside = wanted[bottom, right] - wanted[top, right] - wanted[bottom, left] + wanted[top, left]
+    return top, jnp.where(inside > 0, bottom - top, 0)
+
+
+def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
+    """An upper bound of what is needed, from bounding boxes alone."""
+    (left, right), (top, bottom) = _box(projected, 0, plan), _box(projected, 1, plan)
+    columns, rows = right - left, bottom - top
+    return jnp.maximum(_total(columns * rows), _doubled(_total(rows)))
+
+
+def _repeat(values: Array, starts: Int[Array, "n"], size: int) -> Array:
+    """`values[i]` in slots from `starts[i]` to the next start; integers, whose differences may wrap."""
+    steps = jnp.diff(values, prepend=jnp.zeros(1, values.dtype))
+    return jnp.cumsum(jnp.zeros(size, values.dtype).at[starts].add(steps, mode="drop"), dtype=values.dtype)
+
+
+def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:
+    """Lay out the rows of all Gaussians, and find the columns that each covers in them."""
+    size = max(1, plan.capacity // 2)
+    ends = jnp.cumsum(num_rows)
+    starts = ends - num_rows
+    slot = jnp.arange(size, dtype=jnp.int32)
+    rank = _repeat(jnp.arange(num_rows.shape[0], dtype=jnp.int32), starts, size)
+    row = slot + (first_row - starts)[rank]
+    low, high = _columns_in_row(projected, by_depth[rank], row, plan)
+    count = jnp.where(slot < ends[-1], jnp.maximum(high - low, 0), 0)
+    if tile_mask is not None:
+        grid = tile_mask.reshape(plan.tiles_y, plan.tiles_x).astype(jnp.int32)
+        before = jnp.pad(jnp.cumsum(grid, axis=1), ((0, 0), (1, 0))).ravel()
+        line = jnp.clip(row, 0, plan.tiles_y - 1) * (plan.tiles_x + 1)
+        count = jnp.where(before[line + jnp.maximum(high, low)] > before[line + low], count, 0)
+    return _Spans(gaussian_rank=rank, first_tile=row * plan.tiles_x + low, count=count)
+
+
+def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
+    """First and one past the last column of tiles where alpha reaches 1/255 in a row's pixel centres.
+
+    The ellipse A dx^2 + 2 B dx dy + C dy^2 = t reaches furthest to the right at dy = -(B/C) h_x, as a
+    concave function of dy; so within a band of rows it does so at the nearest dy of the band, and likewise
+    to the left.
+    """
+    u, v = (projected.means2d[:, i][gaussian] for i in range(2))
+    a, b, c = (projected.conics[:, i][gaussian] for i in range(3))
+    half_x, half_y = (projected.extents[:, i][gaussian] for i in range(2))
+    level = jnp.minimum(2 * jnp.log(jnp.maximum(projected.opacities, ALPHA_MIN) / ALPHA_MIN), MAX_SIGMA**2)
+    level = level[gaussian] * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
+
+    tiny = jnp.finfo(u.dtype).tiny
+    top = row * plan.tile_size + 0.5 - v
+    low, high = jnp.maximum(top, -half_y), jnp.minimum(top + (plan.tile_size - 1), half_y)
+    furthest = -b / jnp.maximum(c, tiny) * half_x
+    slope = -b / jnp.maximum(a, tiny)
+
+    def reach(dy):
+        share = jnp.maximum(1 - (dy / half_y) ** 2, 0.0)
+        return jnp.sqrt(level * share / jnp.maximum(a, tiny))
+
+    at_right, at_left = jnp.clip(furthest, low, high), jnp.clip(-furthest, low, high)
+    slack = 1e-3 + 16 * jnp.finfo(u.dtype).eps * (jnp.abs(u) + half_x)
+    right = u + jnp.minimum(slope * at_right + reach(at_right), half_x) + slack
+    left = u + jnp.maximum(slope * at_left - reach(at_left), -half_x) - slack
+    # Pixel centres between left and right, and the tiles that hold them.
+    first = jnp.clip(jnp.ceil(left - 0.5), 0, plan.tiles_x * plan.tile_size)
+    last = jnp.clip(jnp.floor(right - 0.5), -1, plan.tiles_x * plan.tile_size - 1)
+    empty = (low > high) | (first > last)
+    start = _tile_of(first, plan, plan.tiles_x)
+    return start, jnp.where(empty, start, _tile_of(last, plan, plan.tiles_x) + 1)
+
+
+def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
+    """(tile, Gaussian) of every pair in order of (tile, depth); unused slots hold the tile past the last."""
+    size, num_tiles, n = plan.capacity, plan.num_tiles, by_depth.shape[0]
+    ends = jnp.cumsum(spans.count)
+    starts = ends - spans.count
+    slot = jnp.arange(size, dtype=jnp.int32)
+
+    def is_used(tile):
+        used = slot < ends[-1]
+        if tile_mask is not None:
+            used &= tile_mask[jnp.minimum(tile, num_tiles - 1)]
+        return used
+
+    base = spans.first_tile - starts
     rank_bits = max(1, (n - 1).bit_length())
-    if rank_bits + num_tiles.bit_length() <= 32:
-        key = (tile.astype(jnp.uint32) << rank_bits) | rank.astype(jnp.uint32)
-        key = jax.lax.sort(key)
-        rank = (key & jnp.uint32((1 << rank_bits) - 1)).astype(jnp.int32)
-        return (key >> rank_bits).astype(jnp.int32), by_depth[rank]
-    tile, rank = jax.lax.sort((tile, rank), num_keys=2)
-    return tile, by_depth[rank]
+    if rank_bits + num_tiles.bit_length() > 32:
+        rank = _repeat(spans.gaussian_rank, starts, size)
+        tile = _repeat(base, starts, size) + slot
+        tile = jnp.where(is_used(tile), tile, num_tiles)
+        order = argsort_keys(tile.astype(jnp.uint32), plan.sort)
+        return tile[order], by_depth[rank[order]]
+    # One key holds both. Sums modulo 2^32 are exact, since the key itself fits.
+    key = (base.astype(jnp.uint32) << rank_bits) + spans.gaussian_rank.astype(jnp.uint32)
+    key = _repeat(key, starts, size) + (slot.astype(jnp.uint32) << rank_bits)
+    used = is_used((key >> rank_bits).astype(jnp.int32))
+    key = sort_keys(jnp.where(used, key, jnp.uint32(num_tiles << rank_bits)), plan.sort)
+    rank = key & jnp.uint32((1 << rank_bits) - 1)
+    return (key >> rank_bits).astype(jnp.int32), by_depth[rank.astype(jnp.int32)]

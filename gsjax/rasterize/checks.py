@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from gsjax.geometry.spherical_harmonics import num_sh_bases
-from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.plan import Plan
 
 
 def is_concrete(tree: Any) -> bool:
@@ -36,6 +36,7 @@ def check_inputs(
     features,
     roi,
     means2d_offset,
+    reads,
 ) -> tuple[tuple, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
 
@@ -93,7 +94,11 @@ def check_inputs(
     if roi is not None:
         inner = (num_cameras, plan.height, plan.width)
         _expect("roi", roi, (*lead, *inner), "a pixel mask a camera")
-        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner))
+        tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner), plan.tile_size)
+    if reads is not None:
+        wanted = (*lead, num_cameras, plan.num_tiles)
+        _expect("reads", reads, wanted, "meta.reads of a call under the same plan")
+        reads = jnp.asarray(reads, jnp.int32).reshape(scenes, num_cameras, plan.num_tiles)
 
     views = (
         flat(means, (n, 3)),
@@ -107,6 +112,7 @@ def check_inputs(
         means2d_offset,
         backgrounds,
         tile_mask,
+        reads,
     )
     return views, (*lead, num_cameras)
 
@@ -129,8 +135,8 @@ def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n
     return colors if per_camera else jnp.expand_dims(colors, len(lead))
 
 
-def _tiles_with_a_pixel(roi):
+def _tiles_with_a_pixel(roi, edge: int):
     scenes, cameras, height, width = roi.shape
-    padded = jnp.pad(roi, ((0, 0), (0, 0), (0, -height % TILE), (0, -width % TILE)))
-    tiles = padded.reshape(scenes, cameras, padded.shape[2] // TILE, TILE, padded.shape[3] // TILE, TILE)
+    padded = jnp.pad(roi, ((0, 0), (0, 0), (0, -height % edge), (0, -width % edge)))
+    tiles = padded.reshape(scenes, cameras, padded.shape[2] // edge, edge, padded.shape[3] // edge, edge)
     return tiles.any(axis=(3, 5)).reshape(scenes, cameras, -1)

@@ -1,29 +1,32 @@
-"""Front-to-back alpha compositing (Kerbl et al. 2023, eq. 3), and its hand-written VJP.
+"""Front-to-back alpha compositing (Kerbl et al. 2023, eq. 3) of one tile, and of all tiles.
 
-Tiles are sorted by the length of their lists and taken in batches; a batch walks its lists in chunks of 16
-Gaussians until its longest list ends or all its pixels are opaque. So lists have any length, one compiled
-program serves them all, and no tile waits for a much longer one. Arrays are [tile, pixel], pixels last.
+Arrays are [Gaussian, pixel] within a tile and [tile, Gaussian, pixel] within a batch of tiles. XLA:CPU cannot
+write two results from one loop, which is why things are split as they are: the alphas of a chunk of Gaussians
+are stored once, in a stack that stays in cache, and whatever follows from them (the light that is left, colours,
+gradients) is a pass of cheap multiply-adds over that stack.
 
-The backward pass walks the chunks in reverse. It recovers the transmittance by dividing by 1 - alpha, keeps
-the suffix sum S of what lies behind, and reduces the pixels' gradients to Gaussians with two matmuls: one
-against the monomials 1, x, y, x^2, xy, y^2 of the tile's pixels, one against the gradient of the image.
+Tiles are taken in batches. A batch walks its lists chunk by chunk until each of them has ended or has all its
+pixels opaque. So lists have any length, and one compiled program serves them all.
 """
 
+import math
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import ALPHA_MIN
+from gsjax.rasterize.sorting import argsort_keys
 
 MIN_TRANSMITTANCE = 1e-4  # a pixel is opaque when the next Gaussian would take it to this
-CHUNK = 16  # Gaussians that one pass over a tile's pixels takes
-_UNROLLED_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
-_SMALL = 1e-6
+SATURATION = 1e-6  # an alpha so close, relatively, to alpha_max is alpha_max
+CHUNK = 8  # Gaussians whose alphas are stored together
+MANY_CHUNK = 32  # the same where many channels are composited, by matmul
+FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
 
 
 class Splats(NamedTuple):
@@ -39,31 +42,67 @@ class TileState(NamedTuple):
     """Compositing of P pixels, as far as it has come."""
 
     values: Float[Array, "*tiles channels pixels"]
-    transmittance: Float[Array, "*tiles pixels"]  # what light still passes
-    product: Float[Array, "*tiles pixels"]  # the same without the early stop, which it decides
-    read: Int[Array, "*tiles pixels"]  # list entries before the one that ended the pixel
-    position: Int[Array, "*tiles"]  # list entries seen
+    light: Float[Array, "*tiles pixels"]  # the transmittance; its negative once the pixel has ended
+
+    @property
+    def transmittance(self) -> Float[Array, "*tiles pixels"]:
+        """What light still passes."""
+        return jnp.abs(self.light)
 
 
 def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
     """The state of pixels that nothing covers yet."""
-    ones = jnp.ones(num_pixels, dtype)
-    return TileState(
-        values=jnp.zeros((channels, num_pixels), dtype),
-        transmittance=ones,
-        product=ones,
-        read=jnp.zeros(num_pixels, jnp.int32),
-        position=jnp.int32(0),
-    )
+    return TileState(jnp.zeros((channels, num_pixels), dtype), jnp.ones(num_pixels, dtype))
 
 
-def _alpha(mean, conic, opacity, pixels, alpha_max):
-    """(clamped alpha, unclamped alpha, whether it is drawn) at `pixels`; coordinates on the last axis."""
-    dx, dy = pixels[..., 0] - mean[..., 0], pixels[..., 1] - mean[..., 1]
-    power = -0.5 * (conic[..., 0] * dx * dx + conic[..., 2] * dy * dy) - conic[..., 1] * dx * dy
-    raw = opacity * jnp.exp(power)
-    alpha = jnp.where(raw < alpha_max, raw, alpha_max)  # at the clamp itself the gradient is 0, not 1/2
-    return alpha, raw, (power <= 0) & (alpha >= ALPHA_MIN)
+def splat_alphas(
+    splats: Splats, pixels: Float[Array, "pixels 2"], alpha_max: float
+) -> Float[Array, "list pixels"]:
+    """min(alpha_max, o exp(-d^T conic d / 2)) of a list at every pixel; 0 where that is below 1/255."""
+    dx = pixels[:, 0] - splats.means2d[:, 0, None]
+    dy = pixels[:, 1] - splats.means2d[:, 1, None]
+    a, b, c = (splats.conics[:, i, None] for i in range(3))
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+    # In logarithms, since what ends in the exponential XLA:CPU stores; the rest it would work out many times.
+    log_alpha = jnp.log(jnp.maximum(splats.opacities, 0.5 * ALPHA_MIN))[:, None] + jnp.minimum(power, 0.0)
+    ceiling = math.log(alpha_max)
+    saturated = log_alpha >= ceiling - SATURATION  # without gradient, there too where both are the same
+    clamped = jnp.where(saturated, ceiling, log_alpha)
+    return jnp.exp(jnp.where(log_alpha >= math.log(ALPHA_MIN), clamped, -jnp.inf))
+
+
+def dimmed(light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"]) -> Float[Array, "*pixels"]:
+    """The light of a TileState behind a list."""
+    for alpha in alphas:
+        after = light * (1 - alpha)
+        light = jnp.where(after > MIN_TRANSMITTANCE, after, -jnp.abs(light))
+    return light
+
+
+def splat_weights(
+    alphas: Float[Array, "list pixels"], light: Float[Array, "pixels"]
+) -> Float[Array, "list pixels"]:
+    """w_i = alpha_i T_i, and 0 from where the pixel has ended.
+
+    Every row multiplies its own T_i together, in list order and so to the same bits as `dimmed`: for a short
+    list that is cheaper than to store them all.
+    """
+    length = alphas.shape[0]
+    row = np.arange(length)[:, None]
+    before = jnp.broadcast_to(light, alphas.shape)
+    for j in range(length - 1):
+        before = before * jnp.where(row > j, 1 - alphas[j], 1.0)
+    return jnp.where(before * (1 - alphas) > MIN_TRANSMITTANCE, alphas * before, 0.0)
+
+
+def weights_of_many(alphas, light):
+    """(`splat_weights` of a longer list, chunk by chunk; the light behind it)."""
+    weights = []
+    for i in range(0, alphas.shape[0], CHUNK):
+        piece = alphas[i : i + CHUNK]
+        weights.append(splat_weights(piece, light))
+        light = dimmed(light, piece)
+    return jnp.concatenate(weights), light
 
 
 def composite_tile(
@@ -89,45 +128,43 @@ def composite_tile(
         The new state: values `sum_i w_i v_i` and the transmittance left for a background.
     """
     length, channels = splats.values.shape
+    dtype = splats.opacities.dtype
     if state is None:
-        state = start_tile(pixels.shape[0], channels, splats.values.dtype)
+        state = start_tile(pixels.shape[0], channels, dtype)
     if length == 0:
         return state
-    if length > CHUNK:
-        return _composite_long(splats, pixels, state, alpha_max)
+    chunk = chunk_length(channels)
+    if length > chunk:
+        return _composite_long(splats, pixels, state, alpha_max, chunk)
 
-    values, transmittance, product, read, position = state
-    splat = (splats.means2d[:, None], splats.conics[:, None], splats.opacities[:, None])
-    alpha, _, drawn = _alpha(*splat, pixels, alpha_max)
-    alpha = jnp.where(drawn, alpha, 0.0)
-    products = [product]
-    for i in range(length):  # unrolled: the one thing that must go in order is this product
-        products.append(products[-1] * (1 - alpha[i]))
-    before, after = jnp.stack(products[:-1]), jnp.stack(products[1:])
-    live = after > MIN_TRANSMITTANCE  # once false, false for good, since the product only falls
-    weights = jnp.where(live, alpha * before, 0.0)
-    if channels <= _UNROLLED_CHANNELS:
-        values = values + jnp.sum(weights[None] * splats.values.T[:, :, None], axis=1)
-    else:
-        values = values + jnp.matmul(splats.values.T, weights, precision="highest")
-    return TileState(
-        values=values,
-        transmittance=jnp.minimum(transmittance, jnp.min(jnp.where(live, after, jnp.inf), axis=0)),
-        product=products[-1],
-        read=read + live.sum(axis=0, dtype=jnp.int32),
-        position=position + length,
-    )
+    alphas = splat_alphas(splats, pixels, alpha_max)
+    if channels > FEW_CHANNELS:
+        weights, light = weights_of_many(alphas, state.light)
+        painted = jnp.matmul(splats.values.T, weights, precision="highest", preferred_element_type=dtype)
+        return TileState(state.values + painted, light)
+    # Every channel goes through the light on its own, which costs less than to store the weights.
+    values, light = state.values, jnp.broadcast_to(state.light, state.values.shape)
+    for alpha, value in zip(alphas, splats.values.astype(dtype), strict=True):
+        after = light * (1 - alpha)
+        live = after > MIN_TRANSMITTANCE
+        values = values + jnp.where(live, alpha * light, 0.0) * value[:, None]
+        light = jnp.where(live, after, -jnp.abs(light))
+    return TileState(values, dimmed(state.light, alphas))
 
 
-def _composite_long(splats: Splats, pixels, state: TileState, alpha_max: float) -> TileState:
+def chunk_length(channels: int) -> int:
+    """Gaussians that one pass over a tile's pixels takes."""
+    return CHUNK if channels <= FEW_CHANNELS else MANY_CHUNK
+
+
+def _composite_long(splats: Splats, pixels, state: TileState, alpha_max: float, chunk: int) -> TileState:
     length = splats.opacities.shape[0]
-    padding = -length % CHUNK
 
     def chunked(a):
-        return jnp.pad(a, [(0, padding)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, CHUNK, *a.shape[1:])
+        return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, chunk, *a.shape[1:])
 
-    def body(state, chunk):
-        return composite_tile(chunk, pixels, state, alpha_max=alpha_max), None
+    def body(state, piece):
+        return composite_tile(piece, pixels, state, alpha_max=alpha_max), None
 
     return jax.lax.scan(body, state, jax.tree.map(chunked, splats))[0]
 
@@ -140,179 +177,85 @@ class Lists(NamedTuple):
     counts: Int[Array, "tiles"]
 
 
-def _tile_pixels(dtype) -> np.ndarray:
-    """Pixel centres relative to the tile's centre: small numbers, whose squares float32 holds exactly."""
-    offsets = np.arange(TILE) + 0.5 - TILE / 2
-    x, y = np.meshgrid(offsets, offsets)
-    return np.stack([x.ravel(), y.ravel()], axis=-1).astype(dtype)
+class Batches(NamedTuple):
+    """Tiles that are read about equally far, side by side: [batches, batch, ...]."""
+
+    tiles: Int[Array, "batches batch"]  # -1 where a batch is not full
+    centers: Float[Array, "batches batch 2"]  # pixels
+    starts: Int[Array, "batches batch"]
+    counts: Int[Array, "batches batch"]
 
 
-def _batches(lists: Lists, plan: Plan):
-    """Tiles by falling list length, in batches: (order, per-batch tile centres, starts, counts)."""
-    order = jnp.argsort(-lists.counts).astype(jnp.int32)
-    size = min(plan.tiles_per_batch, order.shape[0])
-    order = jnp.pad(order, (0, -order.shape[0] % size), constant_values=-1)
-    real = order >= 0
+def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: Plan) -> Batches:
+    """All tiles by falling `length`, an estimate of how far each is read, of speed alone."""
+    order = argsort_keys(jnp.iinfo(jnp.int32).max - length.astype(jnp.uint32), plan.sort)
+    # With many channels it is the values that must stay in cache.
+    size = min(max(1, plan.batch_size * FEW_CHANNELS // max(channels, FEW_CHANNELS)), order.shape[0])
+    order = jnp.pad(order, (0, -order.shape[0] % size), constant_values=-1).reshape(-1, size)
     tile = jnp.maximum(order, 0)
     within = tile % plan.num_tiles
-    centers = jnp.stack([within % plan.tiles_x, within // plan.tiles_x], axis=-1) * TILE + TILE / 2
-    counts = jnp.where(real, lists.counts[tile], 0)
-    batched = (centers, lists.starts[tile], counts)
-    return order, jax.tree.map(lambda a: a.reshape(-1, size, *a.shape[1:]), batched)
+    corner = jnp.stack([within % plan.tiles_x, within // plan.tiles_x], axis=-1) * plan.tile_size
+    counts = jnp.where(order >= 0, lists.counts[tile], 0)
+    return Batches(order, corner + plan.tile_size / 2, lists.starts[tile], counts)
 
 
-def _chunk(splats: Splats, lists: Lists, centers, starts, counts, first):
-    """Rows and splats `first .. first + 15` of each tile of a batch, means relative to the tile's centre."""
-    entry = first + jnp.arange(CHUNK, dtype=jnp.int32)
-    slots = jnp.minimum(starts[:, None] + entry, lists.ids.shape[0] - 1)
-    ids = lists.ids[slots]
-    real = entry < counts[:, None]
+def tile_pixels(plan: Plan, dtype) -> Float[Array, "pixels 2"]:
+    """Pixel centres relative to the tile's centre: small numbers, whose squares float32 holds exactly."""
+    offsets = np.arange(plan.tile_size) + 0.5 - plan.tile_size / 2
+    x, y = np.meshgrid(offsets, offsets)
+    return jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), dtype)
+
+
+def read_chunk(splats: Splats, lists: Lists, batch: Batches, first: Int[Array, ""], chunk: int):
+    """Ids and splats `first .. first + chunk - 1` of each tile of a batch; means from the tile's centre."""
+    entry = first + jnp.arange(chunk, dtype=jnp.int32)
+    ids = lists.ids[jnp.minimum(batch.starts[:, None] + entry, lists.ids.shape[0] - 1)]
     # Column by column: a gather of scalars is the quick one on a CPU.
     mean = jnp.stack([splats.means2d[:, i][ids] for i in range(2)], axis=-1)
     conic = jnp.stack([splats.conics[:, i][ids] for i in range(3)], axis=-1)
-    opacity = jnp.where(real, splats.opacities[ids], 0.0)
-    mean = mean - centers[:, None, :].astype(mean.dtype)
-    return ids, Splats(mean, conic, opacity, splats.values[ids])
+    opacity = jnp.where(entry < batch.counts[:, None], splats.opacities[ids], 0.0)
+    if splats.values.shape[1] <= FEW_CHANNELS:
+        values = jnp.stack([splats.values[:, i][ids] for i in range(splats.values.shape[1])], axis=-1)
+    else:
+        values = splats.values[ids]
+    return ids, Splats(mean - batch.centers[:, None, :].astype(mean.dtype), conic, opacity, values)
 
 
-def _forward(splats: Splats, lists: Lists, plan: Plan):
-    """Every tile's values [tiles, channels, pixels], transmittance and entries read [tiles, pixels]."""
-    dtype, channels = splats.values.dtype, splats.values.shape[1]
-    pixels = jnp.asarray(_tile_pixels(dtype))
-    order, batches = _batches(lists, plan)
+def still_read(
+    batch: Batches, first: Int[Array, ""], light: Float[Array, "batch pixels"]
+) -> Bool[Array, "batch"]:
+    """Tiles with entries from `first` on, and a pixel that is not opaque."""
+    return (first < batch.counts) & jnp.any(light > 0, axis=1)
+
+
+def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan):
+    """Every tile's values [tiles, channels, pixels], transmittance [tiles, pixels], and entries read [tiles].
+
+    `reads` from an earlier call groups tiles that end early with their like; it does not change the result.
+    """
+    dtype, channels = splats.opacities.dtype, splats.values.shape[1]
+    chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
+    length = lists.counts if reads is None else jnp.minimum(lists.counts, reads)
+    batches = batch_tiles(lists, length, channels, plan)
     compose = jax.vmap(partial(composite_tile, alpha_max=plan.alpha_max), in_axes=(0, None, 0))
+    fresh = jax.vmap(lambda _: start_tile(plan.tile_pixels, channels, dtype))
 
-    def one_batch(_, batch):
-        centers, starts, counts = batch
-        longest = counts.max()
-        state = jax.vmap(lambda _: start_tile(TILE * TILE, channels, dtype))(counts)
-
-        def unfinished(state):
-            return (state.position[0] < longest) & jnp.any(state.product > MIN_TRANSMITTANCE)
-
-        def step(state):
-            _, chunk = _chunk(splats, lists, centers, starts, counts, state.position[0])
-            return compose(chunk, pixels, state)
-
-        state = jax.lax.while_loop(unfinished, step, state)
-        return None, (state.values, state.transmittance, state.read)
-
-    _, outputs = jax.lax.scan(one_batch, None, batches)
-    num_tiles = lists.counts.shape[0]
-    place = jnp.where(order >= 0, order, num_tiles)
-
-    def unsort(a):
-        a = a.reshape(-1, *a.shape[2:])
-        empty = jnp.zeros((num_tiles, *a.shape[1:]), a.dtype)
-        return empty.at[place].set(a, mode="drop", unique_indices=True)
-
-    return jax.tree.map(unsort, outputs)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _composite_reverse(splats: Splats, lists: Lists, plan: Plan):
-    values, transmittance, _ = _forward(splats, lists, plan)
-    return values, transmittance
-
-
-def _composite_fwd(splats, lists, plan):
-    values, transmittance, read = _forward(splats, lists, plan)
-    return (values, transmittance), (splats, lists, transmittance, read)
-
-
-def _composite_bwd(plan: Plan, residuals, cotangents):
-    splats, lists, transmittance, read = residuals
-    d_values, d_transmittance = cotangents
-    dtype = splats.values.dtype
-    pixels = jnp.asarray(_tile_pixels(dtype))
-    x, y = pixels[:, 0], pixels[:, 1]
-    monomials = jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    order, batches = _batches(lists, plan)
-    tiles = jnp.maximum(order, 0).reshape(batches[1].shape)
-
-    def one_batch(total, batch):
-        (centers, starts, counts), tile = batch
-        after, ended, d_image = transmittance[tile], read[tile], d_values[tile]
-        behind = d_transmittance[tile] * after  # S, begun with what the background receives
-
+    def one_batch(_, batch: Batches):
         def unfinished(carry):
-            return carry[0] >= 0
+            first, state, _ = carry
+            return jnp.any(still_read(batch, first, state.light))
 
         def step(carry):
-            first, after, behind, total = carry
-            ids, chunk = _chunk(splats, lists, centers, starts, counts, first)
-            after, behind, rows = _chunk_vjp(
-                chunk, pixels, monomials, d_image, after, behind, ended - first, plan.alpha_max
-            )
-            total = jax.tree.map(lambda t, r: t.at[ids.ravel()].add(r.reshape(-1, *t.shape[1:])), total, rows)
-            return first - CHUNK, after, behind, total
+            first, state, read = carry
+            read = jnp.where(still_read(batch, first, state.light), first + chunk, read)
+            _, piece = read_chunk(splats, lists, batch, first, chunk)
+            return first + chunk, compose(piece, pixels, state), read
 
-        last = (jnp.max(jnp.where(counts[:, None] > 0, ended, 0)) - 1) // CHUNK * CHUNK
-        *_, total = jax.lax.while_loop(unfinished, step, (last, after, behind, total))
-        return total, None
+        start = (jnp.int32(0), fresh(batch.counts), jnp.zeros_like(batch.counts))
+        _, state, read = jax.lax.while_loop(unfinished, step, start)
+        return None, (state.values, state.transmittance, jnp.minimum(read, batch.counts))
 
-    # One row a Gaussian: (u, v, A, B, C, opacity), and its values.
-    zeros = (jnp.zeros((splats.opacities.shape[0], 6), dtype), jnp.zeros_like(splats.values))
-    (geometry, d_splat_values), _ = jax.lax.scan(one_batch, zeros, (batches, tiles))
-    d_splats = Splats(geometry[:, :2], geometry[:, 2:5], geometry[:, 5], d_splat_values)
-    return d_splats, None
-
-
-def _chunk_vjp(chunk: Splats, pixels, monomials, d_image, after, behind, ended, alpha_max):
-    """Gradients of one chunk in each tile of a batch, and (T, S) in front of it.
-
-    With q_i = sum_c v_ic dL/dI_c and S_i the sum of w_j q_j over j behind i (and the background's share):
-    dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i).
-    """
-    channels = chunk.values.shape[-1]
-    unrolled = channels <= _UNROLLED_CHANNELS
-    if not unrolled:
-        along = jnp.einsum("bkc,bcp->bkp", chunk.values, d_image, precision="highest")
-    d_power, weights = [None] * CHUNK, [None] * CHUNK
-    for i in reversed(range(CHUNK)):
-        splat = (chunk.means2d[:, i, None], chunk.conics[:, i, None], chunk.opacities[:, i, None])
-        alpha, raw, drawn = _alpha(*splat, pixels, alpha_max)
-        drawn &= i < ended
-        alpha = jnp.where(drawn, alpha, 0.0)
-        left = jnp.maximum(1 - alpha, _SMALL)
-        after = after / left
-        weight = alpha * after
-        if unrolled:
-            q = sum(chunk.values[:, i, c, None] * d_image[:, c] for c in range(channels))
-        else:
-            q = along[:, i]
-        d_alpha = after * q - behind / left
-        d_power[i] = jnp.where(drawn & (raw < alpha_max), d_alpha * alpha, 0.0)
-        weights[i] = weight
-        behind = behind + weight * q
-    moments = jnp.einsum("bkp,pm->bkm", jnp.stack(d_power, axis=1), monomials, precision="highest")
-    d_values = jnp.einsum("bkp,bcp->bkc", jnp.stack(weights, axis=1), d_image, precision="highest")
-    return after, behind, (_gradient_rows(chunk, moments), d_values)
-
-
-def _gradient_rows(chunk: Splats, moments):
-    """Gradients of (u, v, A, B, C, opacity) from the six moments of dL/dpower over a tile's pixels."""
-    u, v = chunk.means2d[..., 0], chunk.means2d[..., 1]
-    a, b, c = jnp.moveaxis(chunk.conics, -1, 0)
-    m, mx, my, mxx, mxy, myy = jnp.moveaxis(moments, -1, 0)
-    # Moments about the Gaussian's own centre.
-    sx, sy = mx - u * m, my - v * m
-    sxx = mxx - 2 * u * mx + u * u * m
-    sxy = mxy - u * my - v * mx + u * v * m
-    syy = myy - 2 * v * my + v * v * m
-    opacity = chunk.opacities
-    d_opacity = jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0)
-    return jnp.stack([a * sx + b * sy, b * sx + c * sy, -0.5 * sxx, -sxy, -0.5 * syy, d_opacity], axis=-1)
-
-
-_composite_reverse.defvjp(_composite_fwd, _composite_bwd)
-
-
-def composite(
-    splats: Splats, lists: Lists, plan: Plan
-) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"]]:
-    """Values of all tiles, and the transmittance left. Differentiable as the plan says."""
-    if plan.derivative == "forward":
-        values, transmittance, _ = _forward(splats, lists, plan)
-        return values, transmittance
-    return _composite_reverse(splats, lists, plan)
+    _, outputs = jax.lax.scan(one_batch, None, batches)
+    # Where each tile stands in the batches; what fills up the last batch, -1, is the largest of keys.
+    place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[: lists.counts.shape[0]]
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)

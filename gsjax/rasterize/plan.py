@@ -11,14 +11,14 @@ from typing import Any
 
 import jax
 
-TILE = 16
-"""Edge of a tile in pixels. Smaller tiles touch fewer pixel pairs, larger ones need fewer tile lists."""
-
 _LADDER_START, _LADDER_RATIO = 4096, math.sqrt(2.0)
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 DERIVATIVES = ("reverse", "forward")
+TILE_SIZES = (4, 8, 16, 32)
+SORTS = ("host", "device")
+_BATCH_PIXELS = 16384  # pixels composited together: what a step of 8 Gaussians makes of them stays in L2
 
 
 @jax.tree_util.register_static
@@ -28,7 +28,8 @@ class Plan:
 
     Attributes:
         width, height: image size in pixels.
-        capacity: Gaussian-tile pairs that one camera may have.
+        capacity: Gaussian-tile pairs that one camera may have, and twice the tile rows that its Gaussians may
+            cross.
         near_plane, far_plane: depths between which Gaussians are drawn, metres.
         eps2d: variance added to projected Gaussians, square pixels.
         sh_degree: None when colours are values, else the degree their coefficients are read to.
@@ -36,7 +37,9 @@ class Plan:
         rasterize_mode: classic, or antialiased (opacity scaled by what the dilation spread out).
         derivative: "reverse" for the hand-written VJP, "forward" for jvp, linearize and Gauss-Newton.
         alpha_max: where a single contribution saturates.
-        tiles_per_batch: tiles composited together; a matter of speed alone.
+        tile_size: edge of a tile, pixels. Small tiles have fewer pixel pairs, large ones shorter lists.
+        tiles_per_batch: tiles composited together (default: 16384 pixels); a matter of speed alone.
+        sort: "host" for numpy's sort where XLA runs on the CPU, "device" for XLA's own; of speed alone.
     """
 
     width: int
@@ -50,7 +53,9 @@ class Plan:
     rasterize_mode: str = "classic"
     derivative: str = "reverse"
     alpha_max: float = 0.99
-    tiles_per_batch: int = 32
+    tile_size: int = 8
+    tiles_per_batch: int | None = None
+    sort: str = "host"
 
     def __post_init__(self):
         for name, allowed in (
@@ -58,12 +63,16 @@ class Plan:
             ("rasterize_mode", RASTERIZE_MODES),
             ("derivative", DERIVATIVES),
             ("sh_degree", (None, 0, 1, 2, 3)),
+            ("tile_size", TILE_SIZES),
+            ("sort", SORTS),
         ):
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {value!r}")
         for name in ("width", "height", "tiles_per_batch"):
             value = getattr(self, name)
+            if name == "tiles_per_batch" and value is None:
+                continue
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
         if not self.near_plane < self.far_plane:
@@ -75,15 +84,24 @@ class Plan:
 
     @property
     def tiles_x(self) -> int:
-        return -(-self.width // TILE)
+        return -(-self.width // self.tile_size)
 
     @property
     def tiles_y(self) -> int:
-        return -(-self.height // TILE)
+        return -(-self.height // self.tile_size)
 
     @property
     def num_tiles(self) -> int:
         return self.tiles_x * self.tiles_y
+
+    @property
+    def tile_pixels(self) -> int:
+        return self.tile_size * self.tile_size
+
+    @property
+    def batch_size(self) -> int:
+        """Tiles composited together."""
+        return self.tiles_per_batch or max(1, _BATCH_PIXELS // self.tile_pixels)
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.

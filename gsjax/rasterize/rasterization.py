@@ -14,10 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
-from gsjax.rasterize.binning import bin_gaussians, count_pairs
+from gsjax.rasterize.binning import bin_gaussians, needed_capacity
 from gsjax.rasterize.checks import check_inputs, is_concrete
-from gsjax.rasterize.compositing import Lists, Splats, composite
-from gsjax.rasterize.plan import OPTION_NAMES, TILE, UNSET, Plan, resolve
+from gsjax.rasterize.compositing import Lists, Splats
+from gsjax.rasterize.gradients import composite
+from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
 
 
@@ -28,10 +29,11 @@ class Meta(NamedTuple):
     radii: Int[Array, "*batch n 2"]  # half-widths in pixels, (x, y); 0 where not visible
     depths: Float[Array, "*batch n"]  # z in the camera's frame, where visible
     features: Float[Array, "*batch height width channels"] | None
+    reads: Int[Array, "*batch tiles"]  # how far each tile's list was read before all its pixels were opaque
     pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
     culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area)
     overflow: Bool[Array, "*batch"]  # the plan was too small: nothing was drawn
-    needed: Int[Array, "*batch"]  # pairs that the plan's capacity has to hold
+    needed: Int[Array, "*batch"]  # what the plan's capacity has to hold
 
 
 class _Views(NamedTuple):
@@ -48,6 +50,7 @@ class _Views(NamedTuple):
     means2d_offset: Float[Array, "b c n 2"] | None
     backgrounds: Float[Array, "b c channels"] | None
     tile_mask: Bool[Array, "b c tiles"] | None
+    reads: Int[Array, "b c tiles"] | None
 
 
 def rasterization(
@@ -73,9 +76,12 @@ def rasterization(
     features: Float[Array, "*batch n f"] | None = None,
     roi: Bool[Array, "*batch c height width"] | None = None,
     means2d_offset: Float[Array, "*batch c n 2"] | None = None,
+    reads: Int[Array, "*batch c tiles"] | None = None,
     derivative: str = UNSET,
     alpha_max: float = UNSET,
-    tiles_per_batch: int = UNSET,
+    tile_size: int = UNSET,
+    tiles_per_batch: int | None = UNSET,
+    sort: str = UNSET,
 ) -> tuple[Float[Array, "*batch c height width d"], Float[Array, "*batch c height width 1"], Meta]:
     """Draw 3D Gaussians (Kerbl et al. 2023) into one or many cameras.
 
@@ -105,9 +111,13 @@ def rasterization(
         features: more values [N, F], composited in the same pass into `meta.features`, without background.
         roi: pixels that are wanted. Tiles without one are not drawn and show the background.
         means2d_offset: added to the projected means; pass zeros to read their gradient.
+        reads: `meta.reads` of an earlier call with a similar view. The image does not change, but tiles that
+            end early are then drawn beside their like, which is faster.
         derivative: "reverse" (default, a fast VJP) or "forward" (jvp, linearize, Gauss-Newton).
         alpha_max: where one contribution saturates (default 0.99).
-        tiles_per_batch: tiles composited together (default 32); of speed alone.
+        tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Of speed alone.
+        tiles_per_batch: tiles composited together (default: 16384 pixels); of speed alone.
+        sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; of speed alone.
 
     Returns:
         (render_colors, render_alphas, meta).
@@ -118,7 +128,8 @@ def rasterization(
     """
     plan = resolve(plan, width, height, _options(locals()))
     gaussians = (means, quats, scales, opacities, colors)
-    views, batch = check_inputs(plan, *gaussians, viewmats, Ks, backgrounds, features, roi, means2d_offset)
+    others = (backgrounds, features, roi, means2d_offset, reads)
+    views, batch = check_inputs(plan, *gaussians, viewmats, Ks, *others)
     if plan.capacity == 0:
         plan = _planned(views, plan, headroom=1.0)
     return _rasterize(_Views(*views), plan, batch)
@@ -135,6 +146,7 @@ def plan(
     height: int,
     *,
     headroom: float = 1.25,
+    roi: Bool[Array, "*batch c height width"] | None = None,
     near_plane: float = UNSET,
     far_plane: float = UNSET,
     eps2d: float = UNSET,
@@ -143,11 +155,14 @@ def plan(
     rasterize_mode: str = UNSET,
     derivative: str = UNSET,
     alpha_max: float = UNSET,
-    tiles_per_batch: int = UNSET,
+    tile_size: int = UNSET,
+    tiles_per_batch: int | None = UNSET,
+    sort: str = UNSET,
 ) -> Plan:
     """A plan whose capacity holds what the neediest of these cameras needs, times `headroom`.
 
-    Arguments as for `rasterization`. Values must be concrete: call it outside jit.
+    Arguments as for `rasterization`. Values must be concrete: call it outside jit. With `roi` the plan is for
+    calls that draw no more than that.
 
     Raises:
         ValueError: a shape or an option is wrong, or values are traced.
@@ -156,7 +171,7 @@ def plan(
     bases = () if bare.sh_degree is None else (num_sh_bases(bare.sh_degree),)
     colors = jnp.zeros((*np.shape(means)[:-1], *bases, 1))
     gaussians = (means, quats, scales, opacities, colors)
-    views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, None, None)
+    views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, roi, None, None)
     return _planned(views, bare, headroom)
 
 
@@ -172,13 +187,21 @@ def _planned(views, bare: Plan, headroom: float) -> Plan:
             "plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, "
             "with typical values, and pass plan=plan inside; meta.overflow tells if it becomes too small"
         )
-    return bare.grown(int(_needed(_Views(*values), bare)), headroom)
+    if values[0].shape[1] == 0:
+        return bare.grown(0, headroom)
+    # Rows of tiles first, then the pairs, which are counted row by row.
+    enough_rows = bare.grown(int(_needed(_Views(*values), bare)))
+    return bare.grown(int(_needed(_Views(*values), enough_rows)), headroom)
 
 
 @partial(jax.jit, static_argnames="plan")
 def _needed(views: _Views, plan: Plan) -> Int[Array, ""]:
     projected = _project_all(views, plan)
-    return jax.vmap(jax.vmap(partial(count_pairs, plan=plan)))(projected).max(initial=0)
+    count = partial(needed_capacity, plan=plan)
+    mask_axis = None if views.tile_mask is None else 0
+    return jax.vmap(jax.vmap(count, (0, mask_axis)), (0, mask_axis))(projected, views.tile_mask).max(
+        initial=0
+    )
 
 
 def _project_all(views: _Views, plan: Plan) -> Projected:
@@ -224,6 +247,7 @@ def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c
 
 
 class _Counts(NamedTuple):
+    reads: Int[Array, "views tiles"]
     pairs: Int[Array, "views"]
     overflow: Bool[Array, "views"]
     needed: Int[Array, "views"]
@@ -238,14 +262,14 @@ def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
     def merge(a):
         return a.reshape(math.prod(shape), *a.shape[2:])
 
-    mask = None if views.tile_mask is None else merge(views.tile_mask)
-    tiles, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, plan)
+    mask, reads = jax.tree.map(merge, (views.tile_mask, views.reads))
+    tiles, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, reads, plan)
     image = _untile(tiles, shape, plan)
     alphas = 1 - _untile(transmittance[:, None], shape, plan)
     return _finish(image, alphas, views, projected, counts, plan, batch)
 
 
-def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, plan: Plan):
+def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, reads, plan: Plan):
     """Bin and composite all views at once, every view's tiles after the last one's."""
     num_views, n, channels = values.shape
     if num_views * max(n, plan.capacity) >= 2**31:
@@ -255,8 +279,9 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
         )
     if n == 0:
         zeros = jnp.zeros(num_views, jnp.int32)
-        tiles = jnp.zeros((num_views * plan.num_tiles, channels, TILE * TILE), values.dtype)
-        return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(zeros, zeros > 0, zeros)
+        tiles = jnp.zeros((num_views * plan.num_tiles, channels, plan.tile_pixels), values.dtype)
+        unread = jnp.zeros((num_views, plan.num_tiles), jnp.int32)
+        return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(unread, zeros, zeros > 0, zeros)
 
     bin_view = partial(bin_gaussians, plan=plan)
     binned = jax.vmap(bin_view, in_axes=(0, None if mask is None else 0))(projected, mask)
@@ -268,16 +293,19 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
     )
     rows = (projected.means2d, projected.conics, projected.opacities, values)
     splats = Splats(*(a.reshape(num_views * n, *a.shape[2:]) for a in rows))
-    tiles, transmittance = composite(splats, lists, plan)
-    return tiles, transmittance, _Counts(binned.pairs, binned.overflow, binned.needed)
+    reads = None if reads is None else reads.ravel()
+    tiles, transmittance, reads = composite(splats, lists, reads, plan)
+    reads = reads.reshape(num_views, plan.num_tiles)
+    return tiles, transmittance, _Counts(reads, binned.pairs, binned.overflow, binned.needed)
 
 
 def _untile(tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, int], plan: Plan):
     """[B, C, H, W, channels] of what was composited tile by tile."""
     channels = tiles.shape[1]
-    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, TILE, TILE)
+    edge = plan.tile_size
+    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
     image = image.transpose(0, 1, 2, 5, 3, 6, 4)
-    image = image.reshape(*shape, plan.tiles_y * TILE, plan.tiles_x * TILE, channels)
+    image = image.reshape(*shape, plan.tiles_y * edge, plan.tiles_x * edge, channels)
     return image[:, :, : plan.height, : plan.width]
 
 
@@ -298,12 +326,13 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     def outer(a):
         return a.reshape(*batch, *a.shape[2:])
 
-    counts = jax.tree.map(lambda a: outer(a.reshape(*shape)), counts)
+    counts = jax.tree.map(lambda a: outer(a.reshape(*shape, *a.shape[1:])), counts)
     meta = Meta(
         means2d=outer(projected.means2d),
         radii=outer(jnp.ceil(jnp.minimum(projected.extents, 2.0**30)).astype(jnp.int32)),
         depths=outer(projected.depths),
         features=None if features is None else outer(features),
+        reads=counts.reads,
         pairs=counts.pairs,
         culled=outer(projected.culled),
         overflow=counts.overflow,

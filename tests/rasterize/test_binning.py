@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.rasterize.binning import _sort_by_tile, _total, bin_gaussians, count_pairs
-from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.binning import _sorted_pairs, _Spans, _total, bin_gaussians, needed_capacity
+from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 
 PLAN = Plan(70, 40, capacity=4096)
@@ -18,14 +18,14 @@ N = 30
 def binned(means, quats, scales, opacities):
     K = jnp.array([[50.0, 0.0, 35.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
     projected = project_gaussians(means, quats, scales, opacities, jnp.ones(N, bool), jnp.eye(4), K, PLAN)
-    return projected, bin_gaussians(projected, None, PLAN), count_pairs(projected, PLAN)
+    return projected, bin_gaussians(projected, None, PLAN), needed_capacity(projected, None, PLAN)
 
 
 def seen_pairs(projected) -> set[tuple[int, int]]:
     """(tile, Gaussian) with a pixel at which alpha reaches 1/255 by more than rounding."""
     means, conics, opacities = (np.float64(a) for a in (*projected[:2], projected.opacities))
     x, y = np.meshgrid(np.arange(PLAN.width) + 0.5, np.arange(PLAN.height) + 0.5)
-    tile = (y // TILE * PLAN.tiles_x + x // TILE).astype(int)
+    tile = (y // PLAN.tile_size * PLAN.tiles_x + x // PLAN.tile_size).astype(int)
     pairs = set()
     for i in np.flatnonzero(np.asarray(projected.visible)):
         dx, dy = x - means[i, 0], y - means[i, 1]
@@ -73,27 +73,34 @@ def test_only_tiles_of_the_mask_get_lists():
     np.testing.assert_array_equal(masked.counts, jnp.where(mask, lists.counts, 0))
 
 
-def test_keys_wider_than_32_bits_sort_in_two_columns():
+def in_order(spans, by_depth, tiles_x, tiles_y):
+    """`_sorted_pairs` of spans given as rows (rank, first tile, count), and the same by numpy."""
+    rank, first, count = np.array(spans).T
+    plan = Plan(8 * tiles_x, 8 * tiles_y, capacity=4096)
+    columns = (jnp.asarray(np.pad(a, (0, 2048 - len(a))), jnp.int32) for a in (rank, first, count))
+    sorted_pairs = jax.jit(_sorted_pairs, static_argnames="plan")
+    tile, ids = sorted_pairs(_Spans(*columns), None, jnp.asarray(by_depth, jnp.int32), plan)
+    pairs = [(t, r) for r, f, c in zip(rank, first, count, strict=True) for t in range(f, f + c)]
+    want = np.array(sorted(pairs))
+    np.testing.assert_array_equal(tile[: len(pairs)], want[:, 0])
+    np.testing.assert_array_equal(ids[: len(pairs)], by_depth[want[:, 1]])
+    np.testing.assert_array_equal(tile[len(pairs) :], plan.num_tiles)
+
+
+def test_keys_wider_than_32_bits_are_sorted_as_right():
     # 1e6 Gaussians x 32,400 tiles need 35 bits, and without x64 there is no wider integer to hide in.
     assert not jax.config.jax_enable_x64
     rng = np.random.default_rng(0)
-    n, num_tiles = 1_000_000, 32_400
-    tile, rank = rng.integers(0, num_tiles + 1, 5000), rng.integers(0, n, 5000)
-    by_depth = rng.permutation(n)
-    columns = (jnp.asarray(a, jnp.int32) for a in (tile, rank, by_depth))
-    sorted_tile, sorted_ids = _sort_by_tile(*columns, num_tiles, n)
-    order = np.lexsort((rank, tile))
-    np.testing.assert_array_equal(sorted_tile, tile[order])
-    np.testing.assert_array_equal(sorted_ids, by_depth[rank[order]])
+    n = 1_000_000
+    rank = np.sort(rng.integers(0, n, 1000))
+    spans = np.stack([rank, rng.integers(0, 32_395, 1000), rng.integers(0, 5, 1000)], axis=1)
+    in_order(spans, rng.permutation(n), 240, 135)
 
 
-def test_keys_that_just_fit_32_bits_sort_in_one():
-    n, num_tiles = 2**20, 2**12 - 1  # 20 + 12 bits, the tile of unused slots included
-    tile = jnp.array([num_tiles, num_tiles - 1, 0, num_tiles - 1], jnp.int32)
-    rank = jnp.array([n - 1, n - 1, 5, 3], jnp.int32)
-    sorted_tile, ids = _sort_by_tile(tile, rank, jnp.arange(n, dtype=jnp.int32), num_tiles, n)
-    np.testing.assert_array_equal(sorted_tile, [0, num_tiles - 1, num_tiles - 1, num_tiles])
-    np.testing.assert_array_equal(ids, [5, 3, n - 1, n - 1])
+def test_keys_that_just_fit_32_bits_are_sorted_as_one():
+    n, num_tiles = 2**20, 63 * 65  # 20 + 12 bits, the tile of unused slots included
+    spans = [(3, num_tiles - 2, 2), (5, 0, 3), (n - 2, 0, 0), (n - 1, num_tiles - 2, 2)]
+    in_order(spans, np.arange(n)[::-1], 63, 65)
 
 
 def test_a_count_beyond_int32_saturates_instead_of_wrapping():

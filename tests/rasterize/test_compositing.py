@@ -56,7 +56,6 @@ def test_a_list_of_any_length_equals_the_plain_loop(length, channels):
     values, transmittance = plain_loop(splats, grid())
     np.testing.assert_allclose(state.values, values, atol=1e-12)
     np.testing.assert_allclose(state.transmittance, transmittance, atol=1e-12)
-    assert int(state.position) >= length
 
 
 @pytest.mark.usefixtures("x64")
@@ -107,7 +106,7 @@ def test_the_gaussian_that_crosses_the_early_stop_is_excluded_and_all_behind_it(
     state = composite_tile(stack_of([0.98, 0.98, 0.9, 0.1]), grid())
     np.testing.assert_allclose(state.transmittance, 4e-4, rtol=1e-4)
     np.testing.assert_allclose(state.values, 1 - 4e-4, rtol=1e-6)
-    np.testing.assert_array_equal(state.read, 2)
+    np.testing.assert_array_equal(state.light < 0, True)
 
 
 def test_a_contribution_under_1_in_255_is_skipped():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.rasterize.plan import TILE, Plan
+from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import plan, rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
@@ -111,10 +111,10 @@ def test_colours_may_differ_from_camera_to_camera(small):
 def test_roi_draws_the_tiles_it_touches_exactly_and_leaves_the_others_to_the_background(small):
     this, scene = small()
     width, height = this.width, this.height
-    p = Plan(width, height, 4096)
+    p = Plan(width, height, 4096, tile_size=16)
     roi = jnp.zeros((1, height, width), bool).at[0, 3, 20].set(True)  # in the second tile
     kept = np.zeros((height, width), bool)
-    kept[:TILE, TILE : 2 * TILE] = True
+    kept[:16, 16:32] = True
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(1, height, width, 3)), jnp.float32)
 
     def loss(scene, weights, roi):
@@ -204,10 +204,53 @@ def test_the_offset_moves_projected_means_and_reads_their_gradient():
     assert float(gradient[0, 0, 0]) > 0.01
 
 
-def test_tiles_per_batch_is_of_speed_alone(small):
+@pytest.mark.parametrize(
+    "options",
+    [{"tiles_per_batch": 2}, {"tile_size": 4}, {"tile_size": 16}, {"tile_size": 32}, {"sort": "device"}],
+    ids=str,
+)
+def test_options_of_speed_do_not_change_the_image_or_its_gradient(small, options):
     _, scene = small()
-    images = [
-        rasterization(**scene, width=33, height=17, plan=Plan(33, 17, 4096, tiles_per_batch=size))[0]
-        for size in (2, 32)
-    ]
-    np.testing.assert_allclose(images[1], images[0], atol=1e-6)
+
+    def run(plan):
+        def loss(scene):
+            image, alphas, _ = rasterization(**scene, width=33, height=17, plan=plan)
+            return jnp.sum(image**2) + jnp.sum(alphas), image
+
+        return jax.jit(jax.grad(loss, has_aux=True))(scene)
+
+    (want, image), (got, other) = run(Plan(33, 17, 4096)), run(Plan(33, 17, 4096, **options))
+    np.testing.assert_allclose(other, image, atol=1e-6)
+    for name in want:
+        tolerance = 1e-4 * float(jnp.abs(want[name]).max())
+        np.testing.assert_allclose(got[name], want[name], atol=tolerance, err_msg=name)
+
+
+def test_reads_of_an_earlier_call_change_nothing_but_the_order_of_work(small):
+    _, scene = small()
+    p = Plan(33, 17, 4096)
+    run = jax.jit(lambda reads: rasterization(**scene, width=33, height=17, plan=p, reads=reads))
+    image, alphas, meta = run(None)
+    assert meta.reads.shape == (1, p.num_tiles)
+    nonsense = jnp.asarray(np.random.default_rng(0).integers(-5, 2**31 - 1, meta.reads.shape), jnp.int32)
+    for reads in (meta.reads, jnp.zeros_like(meta.reads), nonsense):
+        again = run(reads)
+        np.testing.assert_array_equal(again[0], image)
+        np.testing.assert_array_equal(again[1], alphas)
+        np.testing.assert_array_equal(again[2].reads, meta.reads)
+
+
+def test_a_saturated_tile_is_read_no_further():
+    n = 400
+    scene = {
+        "means": jnp.tile(jnp.array([0.0, 0.0, 1.0]), (n, 1)).at[:, 2].add(jnp.arange(n) * 1e-3),
+        "quats": jnp.ones((n, 4)),
+        "scales": jnp.full((n, 3), 10.0),
+        "opacities": jnp.full(n, 0.9),
+        "colors": jnp.ones((n, 3)),
+        "viewmats": jnp.eye(4)[None],
+        "Ks": jnp.array([[[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]]),
+    }
+    _, _, meta = rasterization(**scene, width=16, height=16)
+    assert int(meta.pairs[0]) == 4 * n
+    assert int(meta.reads.max()) <= 8  # 0.1^4 is the early stop

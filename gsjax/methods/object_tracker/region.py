@@ -10,10 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import project
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.rasterize.plan import TILE, Plan, rung
+from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import take
 from gsjax.scene.render import Rendered
+
+TILE = 16  # edge of the tiles of which the region is made, pixels; a multiple of the rasterizer's
 
 
 @jax.tree_util.register_static

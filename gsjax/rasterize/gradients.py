@@ -1,0 +1,157 @@
+"""`composite`, the compositing of all tiles, with its hand-written VJP.
+
+The backward pass reads the lists front to back as the forward pass did, and makes the same weights from the
+same alphas. With q_i = sum_c v_ic dL/dI_c, and what lies behind Gaussian i, S_i = sum_{j>i} w_j q_j + T dL/dT,
+
+    dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i),   so   dL/dpower_i = w_i q_i - S_i alpha_i / (1 - alpha_i),
+
+where S begins as the whole, which the finished image knows: sum_c I_c dL/dI_c + T dL/dT. The pixels' gradients
+are summed to Gaussians by two matmuls: dL/dpower against the monomials 1, x, y, x^2, xy, y^2 of the tile's
+pixels, and w against dL/dI.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.rasterize.compositing import (
+    CHUNK,
+    FEW_CHANNELS,
+    SATURATION,
+    Batches,
+    Lists,
+    Splats,
+    batch_tiles,
+    chunk_length,
+    composite_forward,
+    read_chunk,
+    splat_alphas,
+    still_read,
+    tile_pixels,
+    weights_of_many,
+)
+from gsjax.rasterize.plan import Plan
+
+_SMALL = 1e-6  # 1 - alpha is not divided by less
+
+
+def composite(
+    splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan
+) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
+    """Values of all tiles, the transmittance left, and how far each list was read.
+
+    Differentiable as the plan says. `reads` from an earlier call makes this one faster where much is the same;
+    it does not change the result.
+    """
+    if plan.derivative == "forward":
+        return composite_forward(splats, lists, reads, plan)
+    return _composite(splats, lists, reads, plan)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _composite(splats: Splats, lists: Lists, reads, plan: Plan):
+    return composite_forward(splats, lists, reads, plan)
+
+
+def _composite_fwd(splats, lists, reads, plan):
+    outputs = composite_forward(splats, lists, reads, plan)
+    return outputs, (splats, lists, outputs)
+
+
+def _composite_bwd(plan: Plan, residuals, cotangents):
+    splats, lists, (values, transmittance, reads) = residuals
+    d_values, d_transmittance, _ = cotangents
+    dtype, channels = splats.opacities.dtype, splats.values.shape[1]
+    chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
+    behind = jnp.einsum("tcp,tcp->tp", values, d_values) + d_transmittance * transmittance
+    of_chunk = partial(
+        _chunk_gradients, pixels=pixels, monomials=_monomials(pixels), alpha_max=plan.alpha_max
+    )
+    of_chunk = jax.vmap(of_chunk)
+
+    def one_batch(total, batch: Batches):
+        tile = jnp.maximum(batch.tiles, 0)
+        d_image = d_values[tile]
+
+        def unfinished(carry):
+            first, light, *_ = carry
+            return jnp.any(still_read(batch, first, light))
+
+        def step(carry):
+            first, light, behind, total = carry
+            ids, piece = read_chunk(splats, lists, batch, first, chunk)
+            light, behind, rows = of_chunk(piece, d_image, light, behind)
+            total = total.at[ids.ravel()].add(rows.reshape(-1, 6 + channels))
+            return first + chunk, light, behind, total
+
+        start = (jnp.int32(0), jnp.ones((len(tile), plan.tile_pixels), dtype), behind[tile], total)
+        return jax.lax.while_loop(unfinished, step, start)[3], None
+
+    # One row a Gaussian: (u, v, A, B, C, opacity), then its values.
+    rows = jnp.zeros((splats.opacities.shape[0], 6 + channels), dtype)
+    rows, _ = jax.lax.scan(one_batch, rows, batch_tiles(lists, reads, channels, plan))
+    d_splats = Splats(rows[:, :2], rows[:, 2:5], rows[:, 5], rows[:, 6:].astype(splats.values.dtype))
+    return d_splats, None, None
+
+
+def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
+    """1, x, y, x^2, xy, y^2, and two columns of zeros: eight is a width that matmuls are made for."""
+    x, y = pixels[:, 0], pixels[:, 1]
+    return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y, 0 * x, 0 * x], axis=-1)
+
+
+def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials, alpha_max):
+    """(light, S) behind one chunk of one tile, and its rows of gradients: geometry, then values."""
+    channels, dtype = piece.values.shape[1], d_image.dtype
+    alphas = splat_alphas(piece, pixels, alpha_max)
+    weights, light = weights_of_many(alphas, light)
+    values = piece.values.astype(dtype)
+    if channels <= FEW_CHANNELS:
+        toward = sum(values[:, c, None] * d_image[c] for c in range(channels))
+        d_values = (weights[:, None] * d_image).sum(axis=-1)
+    else:
+        toward = jnp.matmul(values, d_image, precision="highest")
+        d_values = jnp.matmul(weights, d_image.T, precision="highest")
+    passed = weights * toward
+    d_power = []
+    for i in range(0, alphas.shape[0], CHUNK):
+        some = slice(i, i + CHUNK)
+        suffix = _suffix(behind, passed[some])
+        slope = suffix * alphas[some] / jnp.maximum(1 - alphas[some], _SMALL)
+        moved = (weights[some] > 0) & (alphas[some] < alpha_max * (1 - 0.5 * SATURATION))
+        d_power.append(jnp.where(moved, passed[some] - slope, 0.0))
+        behind = behind - passed[some].sum(axis=0)
+    moments = jnp.matmul(jnp.concatenate(d_power), monomials, precision="highest")
+    return light, behind, jnp.concatenate([_gradient_rows(piece, moments), d_values], axis=-1)
+
+
+def _suffix(
+    behind: Float[Array, "pixels"], passed: Float[Array, "list pixels"]
+) -> Float[Array, "list pixels"]:
+    """S_i: what is behind, less what entries up to i have contributed."""
+    row = np.arange(passed.shape[0])[:, None]
+    suffix = jnp.broadcast_to(behind, passed.shape)
+    for j in range(passed.shape[0]):
+        suffix = suffix - jnp.where(row >= j, passed[j], 0.0)
+    return suffix
+
+
+def _gradient_rows(piece: Splats, moments: Float[Array, "list 8"]) -> Float[Array, "list 6"]:
+    """Gradients of (u, v, A, B, C, opacity) from the moments of dL/dpower over a tile's pixels."""
+    u, v = piece.means2d[:, 0], piece.means2d[:, 1]
+    a, b, c = (piece.conics[:, i] for i in range(3))
+    m, mx, my, mxx, mxy, myy = (moments[:, i] for i in range(6))
+    # Moments about the Gaussian's own centre.
+    sx, sy = mx - u * m, my - v * m
+    sxx = mxx - 2 * u * mx + u * u * m
+    sxy = mxy - u * my - v * mx + u * v * m
+    syy = myy - 2 * v * my + v * v * m
+    opacity = piece.opacities
+    d_opacity = jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0)
+    return jnp.stack([a * sx + b * sy, b * sx + c * sy, -0.5 * sxx, -sxy, -0.5 * syy, d_opacity], axis=-1)
+
+
+_composite.defvjp(_composite_fwd, _composite_bwd)

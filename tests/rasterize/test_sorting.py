@@ -1,0 +1,79 @@
+"""The host's sort is XLA's sort, faster: same results, in every transformation and on one core."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsjax.rasterize import sorting
+from gsjax.rasterize.sorting import argsort_keys, sort_keys
+
+SORTS = ("host", "device")
+
+
+def test_the_host_sort_is_there():
+    # If XLA's interface changes all still works, but slower: whoever upgrades JAX should notice.
+    assert sorting._AVAILABLE
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 17, 1000]), st.sampled_from([2, 2**31, 2**32]))
+def test_both_ways_sort_as_numpy_does(seed, length, top):
+    keys = np.random.default_rng(seed).integers(0, top, length, dtype=np.uint32)
+    for where in SORTS:
+        np.testing.assert_array_equal(sort_keys(jnp.asarray(keys), where), np.sort(keys))
+        order = argsort_keys(jnp.asarray(keys), where)
+        assert order.dtype == jnp.int32
+        np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize("sort", [sort_keys, argsort_keys])
+def test_vmap_and_loops_sort_every_row(sort):
+    rows = jax.random.bits(jax.random.key(0), (3, 4, 50), jnp.uint32) % 20
+    want = [[sort(row) for row in some] for some in rows]
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.vmap(sort)))(rows), want)
+    _, scanned = jax.lax.scan(lambda c, some: (c, jax.vmap(sort)(some)), None, rows)
+    np.testing.assert_array_equal(scanned, want)
+
+
+def test_a_failure_on_the_host_is_an_error_with_its_words(monkeypatch):
+    def fail(keys, out):
+        raise MemoryError("no room")
+
+    handler = sorting._handler(fail, np.uint32)
+    monkeypatch.setitem(sorting._HANDLERS, "gsjax_fail", handler)
+    monkeypatch.setattr(sorting, "_HANDLERS", {"gsjax_fail": handler})
+    assert sorting._register()
+    with pytest.raises(Exception, match="sorting on the host failed: MemoryError: no room"):
+        jax.block_until_ready(sorting._on_host("gsjax_fail", jnp.zeros(3, jnp.uint32), jnp.uint32))
+
+
+def test_without_the_interface_xla_sorts(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise RuntimeError("unknown version")
+
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
+    assert not sorting._register()
+    monkeypatch.setattr(sorting, "_AVAILABLE", False)
+    np.testing.assert_array_equal(sort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 3])
+    np.testing.assert_array_equal(argsort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 0])
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
+def test_one_core_does_not_hang():
+    # jax.pure_callback does: its only worker waits for a copy that the same worker would have to make.
+    program = (
+        "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])\n"
+        "import jax, jax.numpy as jnp\n"
+        "from gsjax.rasterize.sorting import sort_keys\n"
+        "keys = jnp.arange(2_000_000, dtype=jnp.uint32)\n"
+        "step = lambda i, k: sort_keys(k * jnp.uint32(747796405) + 1)\n"
+        "run = jax.jit(lambda k: jax.lax.fori_loop(0, 3, step, k))\n"
+        "jax.block_until_ready([run(keys + i) for i in range(3)])\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
