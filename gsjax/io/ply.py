@@ -2,7 +2,7 @@
 
 One vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
 then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. Ours adds feature_* and label
-where a scene has them; other readers pass over both.
+where a scene has them; other readers pass over both. PlayCanvas's compressed PLY is read too, not written.
 """
 
 import os
@@ -15,6 +15,7 @@ from jaxtyping import Int, Integer
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsjax.io.atomic import atomic_write
+from gsjax.io.compressed_ply import PACKED, decompress, find_fault, is_compressed
 from gsjax.scene.gaussians import SH_SIZES, Gaussians, take, valid_rows
 
 _REQUIRED = (
@@ -97,18 +98,40 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
-    """Gaussians of a 3DGS PLY (binary of either byte order, or ascii), as float32.
+    """Gaussians of a PLY of 3DGS or a compressed one of PlayCanvas (the header tells), as float32.
 
-    Rows that no renderer could draw (a NaN, an infinity, a zero quaternion) are culled and counted.
+    Binary of either byte order, or ascii. Rows that no renderer could draw (a NaN, an infinity, a zero
+    quaternion) are culled and counted. `gsjax.io.compressed_ply` says how packed values are read.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
-        PlyError: the file is no PLY, is cut off, or lacks properties of a Gaussian.
+        PlyError: the file is no PLY, is cut off, or lacks properties of a Gaussian; or a compressed one has
+            another number of chunks than its Gaussians fill, or a chunk whose bounds are not finite.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a PLY file of Gaussians, found no file. Check the path")
-    vertices = _read_vertices(path)
+    ply = _parse(path)
+    vertices = ply["vertex"].data
+    if is_compressed(ply):
+        if fault := find_fault(ply):
+            raise PlyError(path, *fault)
+        gaussians, known = decompress(ply), {*PACKED}
+    else:
+        gaussians, known = _uncompressed(path, vertices)
+    names = vertices.dtype.names or ()
+    valid = valid_rows(gaussians)
+    report = PlyReport(
+        stored=len(vertices),
+        culled=int(np.sum(~valid)),
+        extra=tuple(name for name in names if name not in {*known, "label"}),
+        labels=np.asarray(vertices["label"])[valid].astype(np.int32) if "label" in names else None,
+    )
+    return take(gaussians, np.flatnonzero(valid)), report
+
+
+def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]]:
+    """The Gaussians of the layout of 3DGS, and the properties that belong to it."""
     names = vertices.dtype.names or ()
     missing = [name for name in _REQUIRED if name not in names]
     if missing:
@@ -136,19 +159,11 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
         shN=None if shN is None else jnp.asarray(shN.transpose(0, 2, 1)),
         features=jnp.asarray(_stack(vertices, features)) if features else None,
     )
-    valid = valid_rows(gaussians)
-    known = {*_REQUIRED, *_NORMALS, *rest, *features, "label"}
-    report = PlyReport(
-        stored=len(vertices),
-        culled=int(np.sum(~valid)),
-        extra=tuple(name for name in names if name not in known),
-        labels=np.asarray(vertices["label"])[valid].astype(np.int32) if "label" in names else None,
-    )
-    return take(gaussians, np.flatnonzero(valid)), report
+    return gaussians, {*_REQUIRED, *_NORMALS, *rest, *features}
 
 
-def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex element of a PLY as a structured array."""
+def _parse(path: Path) -> PlyData:
+    """The elements of a PLY, one of which is `vertex`."""
     with open(path, "rb") as stream:
         start = stream.read(4)
     if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
@@ -165,7 +180,7 @@ def _read_vertices(path: Path) -> np.ndarray:
     if "vertex" not in ply:
         names = ", ".join(element.name for element in ply.elements) or "none"
         raise PlyError(path, "an element 'vertex'", f"elements {names}", "Export a scene of Gaussians")
-    return ply["vertex"].data
+    return ply
 
 
 def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
@@ -183,8 +198,6 @@ def _stack(vertices: np.ndarray, names) -> np.ndarray:
 
 def _advice(names: tuple[str, ...]) -> str:
     """What to do about a PLY that lacks properties, by what it seems to be."""
-    if "packed_position" in names:
-        return "This is PlayCanvas's compressed PLY: convert it to an uncompressed one (splat-transform does)"
     if {"scale_0", "scale_1"} <= set(names) and "scale_2" not in names:
         return "This seems to be 2D Gaussian splatting, which has no third axis"
     if {"x", "y", "z"} <= set(names):

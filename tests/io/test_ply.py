@@ -153,7 +153,6 @@ def test_a_missing_file_is_named(tmp_path):
     ("names", "advice"),
     [
         (["x", "y", "z"], "point cloud or a mesh"),
-        (["packed_position"], "compressed PLY"),
         (["intensity"], "Gaussian splatting PLY format"),
         (["x", "y", "z", "scale_0", "scale_1"], "no third axis"),
     ],

@@ -1,0 +1,182 @@
+"""PlayCanvas's compressed PLY, which SuperSplat and splat-transform write: 16 bytes a Gaussian and harmonics.
+
+Gaussians stand in chunks of 256; the last may hold fewer. Element `chunk` has the range of each quantity in
+each chunk, element `vertex` four uint32 a Gaussian. In them k of b bits stands for k / (2^b - 1) of a range:
+
+    packed_position  11-10-11    x y z in the scene's unit, from min_x.. to max_x..
+    packed_rotation  2-10-10-10  which of w x y z is largest, then the other three, -1/sqrt(2) to 1/sqrt(2)
+    packed_scale     11-10-11    log scales, from min_scale_x.. to max_scale_x..
+    packed_color     8-8-8-8     red green blue, from min_r.. to max_r.. (older files lack these: 0 to 1);
+                                 opacity, 0 to 1
+
+An element `sh`, if there is one, has f_rest_* in the order of 3DGS, a byte each. The writer cuts [-4, 4] into
+256 bins. As in splat-transform, byte k is read as the middle of its bin, 8 ((k + 0.5) / 256 - 0.5), but 0 as
+-4 and 255 as 4; so a coefficient of 0 comes back as 1/64. (The PlayCanvas engine reads 8 k / 255 - 4, which
+differs by less than 1/64.)
+
+Axes are those of the 3DGS PLY. Source: decompress-ply.ts, compressed-chunk.ts and write-compressed-ply.ts of
+github.com/playcanvas/splat-transform.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, UInt32
+from plyfile import PlyData, PlyElement
+
+from gsjax.scene.gaussians import SH_SIZES, Gaussians, gaussians_from_activated
+
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+CHUNK_SIZE = 256
+
+_POSITION = ("x", "y", "z")
+_SCALE = ("scale_x", "scale_y", "scale_z")
+_COLOR = ("r", "g", "b")
+_REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES[1:])
+_REST_VALUES = 8 * ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5)
+_REST_VALUES[[0, 255]] = -4, 4  # they also stand for what was clipped
+
+_ADVICE = "It may be damaged or of another format: export it again (SuperSplat and splat-transform write it)"
+_NAN_ADVICE = "One bad Gaussian spoils its chunk: remove those that are NaN or infinite before compressing"
+
+Fault = tuple[str, str, str]
+"""What was expected, what was found, what to do."""
+
+
+def is_compressed(ply: PlyData) -> bool:
+    """Whether the vertices of `ply` are packed (or some of their properties are: `find_fault` tells)."""
+    return not set(PACKED).isdisjoint(ply["vertex"].data.dtype.names or ())
+
+
+def decompress(ply: PlyData) -> Gaussians:
+    """The Gaussians of a compressed PLY without a fault, float32.
+
+    Colours and opacities are stored as one sees them, so they (and scales) take the clamps of
+    `gaussians_from_activated`: an opacity of 0 or 255 has a finite logit.
+    """
+    chunks, vertices = ply["chunk"].data, ply["vertex"].data
+    positions = _fractions(vertices["packed_position"], (11, 10, 11))
+    log_scales = _fractions(vertices["packed_scale"], (11, 10, 11))
+    colors, opacities = np.split(_fractions(vertices["packed_color"], (8, 8, 8, 8)), [3], axis=1)
+    if "min_r" in chunks.dtype.names:
+        colors = _in_range(chunks, _COLOR, colors)
+    return gaussians_from_activated(
+        _in_range(chunks, _POSITION, positions),
+        _quats(vertices["packed_rotation"]),
+        np.exp(_in_range(chunks, _SCALE, log_scales)),
+        opacities[:, 0],
+        colors,
+        shN=_harmonics(ply["sh"].data) if "sh" in ply else None,
+    )
+
+
+def _fractions(words: UInt32[np.ndarray, "N"], bits: tuple[int, ...]) -> Float[np.ndarray, "N parts"]:
+    """The last sum(bits) bits of each word cut into unsigned integers, highest first, as fractions 0 to 1."""
+    shifts = sum(bits) - np.cumsum(bits)
+    largest = (1 << np.array(bits)) - 1
+    return (np.asarray(words)[:, None] >> shifts & largest) / largest
+
+
+def _in_range(
+    chunks: np.ndarray, quantities: tuple[str, ...], fractions: Float[np.ndarray, "N parts"]
+) -> Float[np.ndarray, "N parts"]:
+    """`fractions` of the way from min_* to max_* of each Gaussian's chunk."""
+    # float64, in which the difference of two float32 cannot overflow
+    low, high = (
+        np.stack([chunks[f"{end}_{name}"] for name in quantities], axis=1).astype(np.float64)
+        for end in ("min", "max")
+    )
+    chunk = np.arange(len(fractions)) // CHUNK_SIZE
+    return low[chunk] * (1 - fractions) + high[chunk] * fractions
+
+
+def _quats(words: UInt32[np.ndarray, "N"]) -> Float[np.ndarray, "N 4"]:
+    """Quaternions w x y z. The largest component is not stored: it is positive, and the length is 1."""
+    others = np.sqrt(2) * (_fractions(words, (10, 10, 10)) - 0.5)
+    is_largest = np.arange(4) == (np.asarray(words) >> 30)[:, None]
+    quats = np.empty((len(words), 4))
+    quats[is_largest] = np.sqrt(np.maximum(0, 1 - np.sum(others**2, axis=1)))
+    quats[~is_largest] = others.ravel()
+    return quats
+
+
+def _harmonics(rows: np.ndarray) -> Float[np.ndarray, "N rest 3"]:
+    """shN of the element `sh`."""
+    names = _rest_names(rows)
+    values = _REST_VALUES[np.stack([rows[name] for name in names], axis=1)]
+    # The file is channel-major, as in 3DGS.
+    return values.reshape(len(rows), 3, len(names) // 3).transpose(0, 2, 1)
+
+
+def _rest_names(rows: np.ndarray) -> list[str]:
+    """f_rest_0 and so on, as many as there are properties f_rest_*."""
+    return [f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in rows.dtype.names or ()))]
+
+
+def _bounds(chunks: np.ndarray) -> list[str]:
+    """The properties that an element `chunk` must have; those of colours if it has any of them."""
+    position, scale, color = (
+        [f"{end}_{name}" for end in ("min", "max") for name in group] for group in (_POSITION, _SCALE, _COLOR)
+    )
+    has_color = not set(color).isdisjoint(chunks.dtype.names or ())
+    return [*position, *scale, *(color if has_color else ())]
+
+
+def find_fault(ply: PlyData) -> Fault | None:
+    """Why `decompress` cannot read `ply`; None if it can."""
+    # Each looks at a file in which those before it found nothing.
+    return _element_fault(ply) or _count_fault(ply) or _range_fault(ply["chunk"].data)
+
+
+def _element_fault(ply: PlyData) -> Fault | None:
+    """An element or property that is missing or of another type."""
+    if "chunk" not in ply:
+        found = ", ".join(element.name for element in ply.elements)
+        return "an element 'chunk' beside packed vertices", f"only elements {found}", _ADVICE
+    chunk = ply["chunk"]
+    fault = _property_fault(chunk, _bounds(chunk.data), ("float32", "float64"))
+    fault = fault or _property_fault(ply["vertex"], PACKED, ("uint32",))
+    if fault or "sh" not in ply:
+        return fault
+    names = _rest_names(ply["sh"].data)
+    if len(names) not in _REST_COUNTS:
+        wanted = ", ".join(map(str, _REST_COUNTS))
+        return f"{wanted} properties f_rest_* (degree 1 to 3) in element 'sh'", f"{len(names)}", _ADVICE
+    return _property_fault(ply["sh"], names, ("uint8",))
+
+
+def _property_fault(element: PlyElement, names: Sequence[str], types: Sequence[str]) -> Fault | None:
+    """A property of `element` that is missing or has none of `types`."""
+    dtype = element.data.dtype
+    found = dtype.names or ()
+    missing = [name for name in names if name not in found]
+    if missing:
+        expected = f"the properties {', '.join(names)} in element '{element.name}'"
+        return expected, f"no {', '.join(missing)} among {', '.join(found) or 'none'}", _ADVICE
+    other = [f"{dtype[name].name} {name}" for name in names if dtype[name].name not in types]
+    if other:
+        return f"{' or '.join(types)} in element '{element.name}'", ", ".join(other), _ADVICE
+    return None
+
+
+def _count_fault(ply: PlyData) -> Fault | None:
+    """Elements whose numbers of rows do not belong together."""
+    count, chunks = ply["vertex"].count, ply["chunk"].count
+    wanted = -(-count // CHUNK_SIZE)
+    if chunks != wanted:
+        expected = f"{wanted} rows of element 'chunk' ({count} Gaussians, {CHUNK_SIZE} a chunk)"
+        return expected, f"{chunks}", _ADVICE
+    if "sh" in ply and ply["sh"].count != count:
+        expected = f"{count} rows of element 'sh' (one a Gaussian)"
+        return expected, f"{ply['sh'].count}", _ADVICE
+    return None
+
+
+def _range_fault(chunks: np.ndarray) -> Fault | None:
+    """A bound of a chunk that is NaN or infinite."""
+    for name in _bounds(chunks):
+        bad = np.flatnonzero(~np.isfinite(chunks[name]))
+        if bad.size:
+            found = f"{name} = {chunks[name][bad[0]]} in chunk {bad[0]} (counted from 0)"
+            return "finite bounds in every chunk", found, _NAN_ADVICE
+    return None
