@@ -14,8 +14,10 @@ from rich.table import Table
 COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
+    "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
 }
-"""Each command's module, which has a dataclass `Options` and `run(options)`, which returns the exit code."""
+"""Each command's module, which has `Options`, a dataclass or a union of them (subcommands), and
+`run(options)`, which returns the exit code."""
 
 
 def entry() -> None:
