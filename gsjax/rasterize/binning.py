@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from gsjax.rasterize.plan import Plan
-from gsjax.rasterize.projection import ALPHA_MIN, MAX_SIGMA, Projected
+from gsjax.rasterize.projection import Projected
 from gsjax.rasterize.sorting import argsort_keys, sort_keys
 
 _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
@@ -56,11 +56,14 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing, and says so
     tiles, ids = _sorted_pairs(spans._replace(count=count), tile_mask, by_depth, plan)
     edges = jnp.searchsorted(tiles, jnp.arange(plan.num_tiles + 1, dtype=tiles.dtype)).astype(jnp.int32)
+    counts = edges[1:] - edges[:-1]
+    if plan.max_per_tile is not None:
+        counts = jnp.minimum(counts, plan.max_per_tile)
     return TileLists(
         ids=ids,
         starts=edges[:-1],
-        counts=edges[1:] - edges[:-1],
-        pairs=edges[-1],
+        counts=counts,
+        pairs=counts.sum(),
         needed=needed,
         overflow=overflow,
     )
@@ -69,7 +72,7 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
 def needed_capacity(
     projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
 ) -> Int[Array, ""]:
-    """What `bin_gaussians` needs: exactly, if the plan's capacity holds twice the rows; else at least the rows."""
+    """What `bin_gaussians` needs: exactly, if the capacity holds twice the rows; else twice the rows."""
     first_row, num_rows = _rows(projected, tile_mask, plan)
     rows = _total(num_rows)
     num_rows = jnp.where(2 * rows.astype(jnp.float32) <= plan.capacity, num_rows, 0)
@@ -156,7 +159,7 @@ def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan:
 
 
 def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
-    """First and one past the last column of tiles where alpha reaches 1/255 in a row's pixel centres.
+    """First and one past the last column of tiles where alpha reaches alpha_min in a row's pixel centres.
 
     The ellipse A dx^2 + 2 B dx dy + C dy^2 = t reaches furthest to the right at dy = -(B/C) h_x, as a
     concave function of dy; so within a band of rows it does so at the nearest dy of the band, and likewise
@@ -165,7 +168,7 @@ def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
     u, v = (projected.means2d[:, i][gaussian] for i in range(2))
     a, b, c = (projected.conics[:, i][gaussian] for i in range(3))
     half_x, half_y = (projected.extents[:, i][gaussian] for i in range(2))
-    level = jnp.minimum(2 * jnp.log(jnp.maximum(projected.opacities, ALPHA_MIN) / ALPHA_MIN), MAX_SIGMA**2)
+    level = 2 * jnp.log(jnp.maximum(projected.opacities / plan.alpha_min, 1.0))
     level = level[gaussian] * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
 
     tiny = jnp.finfo(u.dtype).tiny

@@ -40,7 +40,7 @@ def check_inputs(
 ) -> tuple[tuple, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
 
-    Half precision is computed in float32.
+    Half precision is computed in float32; colours and features (not SH coefficients) are stored as they are.
 
     Raises:
         ValueError: names the argument, the shape it got and the shape it wants.
@@ -75,8 +75,9 @@ def check_inputs(
     scenes = math.prod(lead)
     dtype = jnp.result_type(means, quats, scales, opacities, colors, viewmats, Ks, jnp.float32)
 
-    def flat(array, inner):
-        return jnp.asarray(array, dtype).reshape(scenes, *inner)
+    def flat(array, inner, stored=False):
+        half = stored and jnp.asarray(array).dtype in (jnp.bfloat16, jnp.float16)
+        return jnp.asarray(array, None if half else dtype).reshape(scenes, *inner)
 
     channels = colors.shape[-1]
     if backgrounds is not None:
@@ -85,7 +86,7 @@ def check_inputs(
         backgrounds = flat(backgrounds, (num_cameras, channels))
     if features is not None:
         _expect("features", features, (*lead, n, None), lead_words)
-        features = flat(features, features.shape[-2:])
+        features = flat(features, features.shape[-2:], stored=True)
     if means2d_offset is not None:
         wanted = (*lead, num_cameras, n, 2)
         _expect("means2d_offset", means2d_offset, wanted, "a pixel offset a camera and Gaussian")
@@ -105,7 +106,7 @@ def check_inputs(
         flat(quats, (n, 4)),
         flat(scales, (n, 3)),
         flat(opacities, (n,)),
-        flat(colors, colors.shape[len(lead) :]),
+        flat(colors, colors.shape[len(lead) :], stored=plan.sh_degree is None),
         features,
         flat(viewmats, (num_cameras, 4, 4)),
         flat(Ks, (num_cameras, 3, 3)),

@@ -2,8 +2,8 @@
 
 Arrays are [Gaussian, pixel] within a tile and [tile, Gaussian, pixel] within a batch of tiles. XLA:CPU cannot
 write two results from one loop, which is why things are split as they are: the alphas of a chunk of Gaussians
-are stored once, in a stack that stays in cache, and whatever follows from them (the light that is left, colours,
-gradients) is a pass of cheap multiply-adds over that stack.
+are stored once, in a stack that stays in cache, and whatever follows from them (the light that is left,
+colours, gradients) is a pass of cheap multiply-adds over that stack.
 
 Tiles are taken in batches. A batch walks its lists chunk by chunk until each of them has ended or has all its
 pixels opaque. So lists have any length, and one compiled program serves them all.
@@ -18,11 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.rasterize.plan import Plan
-from gsjax.rasterize.projection import ALPHA_MIN
+from gsjax.rasterize.plan import DEFAULT_LIMITS, Limits, Plan
 from gsjax.rasterize.sorting import argsort_keys
 
-MIN_TRANSMITTANCE = 1e-4  # a pixel is opaque when the next Gaussian would take it to this
 SATURATION = 1e-6  # an alpha so close, relatively, to alpha_max is alpha_max
 CHUNK = 8  # Gaussians whose alphas are stored together
 MANY_CHUNK = 32  # the same where many channels are composited, by matmul
@@ -56,31 +54,35 @@ def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
 
 
 def splat_alphas(
-    splats: Splats, pixels: Float[Array, "pixels 2"], alpha_max: float
+    splats: Splats, pixels: Float[Array, "pixels 2"], limits: Limits
 ) -> Float[Array, "list pixels"]:
-    """min(alpha_max, o exp(-d^T conic d / 2)) of a list at every pixel; 0 where that is below 1/255."""
+    """min(alpha_max, o exp(-d^T conic d / 2)) of a list at every pixel; 0 where that is below alpha_min."""
     dx = pixels[:, 0] - splats.means2d[:, 0, None]
     dy = pixels[:, 1] - splats.means2d[:, 1, None]
     a, b, c = (splats.conics[:, i, None] for i in range(3))
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
     # In logarithms, since what ends in the exponential XLA:CPU stores; the rest it would work out many times.
-    log_alpha = jnp.log(jnp.maximum(splats.opacities, 0.5 * ALPHA_MIN))[:, None] + jnp.minimum(power, 0.0)
-    ceiling = math.log(alpha_max)
+    log_alpha = jnp.log(jnp.maximum(splats.opacities, 0.5 * limits.alpha_min))[:, None] + jnp.minimum(
+        power, 0.0
+    )
+    ceiling = math.log(limits.alpha_max)
     saturated = log_alpha >= ceiling - SATURATION  # without gradient, there too where both are the same
     clamped = jnp.where(saturated, ceiling, log_alpha)
-    return jnp.exp(jnp.where(log_alpha >= math.log(ALPHA_MIN), clamped, -jnp.inf))
+    return jnp.exp(jnp.where(log_alpha >= math.log(limits.alpha_min), clamped, -jnp.inf))
 
 
-def dimmed(light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"]) -> Float[Array, "*pixels"]:
+def dimmed(
+    light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"], limits: Limits
+) -> Float[Array, "*pixels"]:
     """The light of a TileState behind a list."""
     for alpha in alphas:
         after = light * (1 - alpha)
-        light = jnp.where(after > MIN_TRANSMITTANCE, after, -jnp.abs(light))
+        light = jnp.where(after > limits.min_transmittance, after, -jnp.abs(light))
     return light
 
 
 def splat_weights(
-    alphas: Float[Array, "list pixels"], light: Float[Array, "pixels"]
+    alphas: Float[Array, "list pixels"], light: Float[Array, "pixels"], limits: Limits
 ) -> Float[Array, "list pixels"]:
     """w_i = alpha_i T_i, and 0 from where the pixel has ended.
 
@@ -92,16 +94,16 @@ def splat_weights(
     before = jnp.broadcast_to(light, alphas.shape)
     for j in range(length - 1):
         before = before * jnp.where(row > j, 1 - alphas[j], 1.0)
-    return jnp.where(before * (1 - alphas) > MIN_TRANSMITTANCE, alphas * before, 0.0)
+    return jnp.where(before * (1 - alphas) > limits.min_transmittance, alphas * before, 0.0)
 
 
-def weights_of_many(alphas, light):
+def weights_of_many(alphas, light, limits: Limits):
     """(`splat_weights` of a longer list, chunk by chunk; the light behind it)."""
     weights = []
     for i in range(0, alphas.shape[0], CHUNK):
         piece = alphas[i : i + CHUNK]
-        weights.append(splat_weights(piece, light))
-        light = dimmed(light, piece)
+        weights.append(splat_weights(piece, light, limits))
+        light = dimmed(light, piece, limits)
     return jnp.concatenate(weights), light
 
 
@@ -110,19 +112,19 @@ def composite_tile(
     pixels: Float[Array, "pixels 2"],
     state: TileState | None = None,
     *,
-    alpha_max: float = 0.99,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> TileState:
     """Composite one list of Gaussians, front to back, over the pixels of one tile.
 
-    alpha_i = min(alpha_max, o_i exp(-d^T conic d / 2)) with contributions under 1/255 skipped; the pixel ends
-    before the Gaussian that would take its transmittance to 1e-4. A pure function for one tile: vmap it over
-    many, and pass the state on to go through a long list piece by piece.
+    alpha_i = min(alpha_max, o_i exp(-d^T conic d / 2)) with contributions under alpha_min skipped; the pixel
+    ends before the Gaussian that would take its transmittance to min_transmittance. A pure function for one
+    tile: vmap it over many, and pass the state on to go through a long list piece by piece.
 
     Args:
         splats: the list, [L] of each field.
         pixels: positions of the pixels, in the same coordinates as `splats.means2d`.
         state: where an earlier piece of the list ended; an empty tile unless given.
-        alpha_max: where a contribution saturates; its opacity then gets no gradient.
+        limits: where contributions start and saturate (their opacity then gets no gradient) and pixels end.
 
     Returns:
         The new state: values `sum_i w_i v_i` and the transmittance left for a background.
@@ -135,21 +137,21 @@ def composite_tile(
         return state
     chunk = chunk_length(channels)
     if length > chunk:
-        return _composite_long(splats, pixels, state, alpha_max, chunk)
+        return _composite_long(splats, pixels, state, limits, chunk)
 
-    alphas = splat_alphas(splats, pixels, alpha_max)
+    alphas = splat_alphas(splats, pixels, limits)
     if channels > FEW_CHANNELS:
-        weights, light = weights_of_many(alphas, state.light)
-        painted = jnp.matmul(splats.values.T, weights, precision="highest", preferred_element_type=dtype)
+        weights, light = weights_of_many(alphas, state.light, limits)
+        painted = jnp.matmul(splats.values.astype(dtype).T, weights, precision="highest")
         return TileState(state.values + painted, light)
     # Every channel goes through the light on its own, which costs less than to store the weights.
     values, light = state.values, jnp.broadcast_to(state.light, state.values.shape)
     for alpha, value in zip(alphas, splats.values.astype(dtype), strict=True):
         after = light * (1 - alpha)
-        live = after > MIN_TRANSMITTANCE
+        live = after > limits.min_transmittance
         values = values + jnp.where(live, alpha * light, 0.0) * value[:, None]
         light = jnp.where(live, after, -jnp.abs(light))
-    return TileState(values, dimmed(state.light, alphas))
+    return TileState(values, dimmed(state.light, alphas, limits))
 
 
 def chunk_length(channels: int) -> int:
@@ -157,14 +159,14 @@ def chunk_length(channels: int) -> int:
     return CHUNK if channels <= FEW_CHANNELS else MANY_CHUNK
 
 
-def _composite_long(splats: Splats, pixels, state: TileState, alpha_max: float, chunk: int) -> TileState:
+def _composite_long(splats: Splats, pixels, state: TileState, limits: Limits, chunk: int) -> TileState:
     length = splats.opacities.shape[0]
 
     def chunked(a):
         return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, chunk, *a.shape[1:])
 
     def body(state, piece):
-        return composite_tile(piece, pixels, state, alpha_max=alpha_max), None
+        return composite_tile(piece, pixels, state, limits=limits), None
 
     return jax.lax.scan(body, state, jax.tree.map(chunked, splats))[0]
 
@@ -210,15 +212,25 @@ def read_chunk(splats: Splats, lists: Lists, batch: Batches, first: Int[Array, "
     """Ids and splats `first .. first + chunk - 1` of each tile of a batch; means from the tile's centre."""
     entry = first + jnp.arange(chunk, dtype=jnp.int32)
     ids = lists.ids[jnp.minimum(batch.starts[:, None] + entry, lists.ids.shape[0] - 1)]
-    # Column by column: a gather of scalars is the quick one on a CPU.
-    mean = jnp.stack([splats.means2d[:, i][ids] for i in range(2)], axis=-1)
-    conic = jnp.stack([splats.conics[:, i][ids] for i in range(3)], axis=-1)
+
+    def rows(columns):
+        return jnp.stack([column[ids] for column in columns], axis=-1)
+
     opacity = jnp.where(entry < batch.counts[:, None], splats.opacities[ids], 0.0)
-    if splats.values.shape[1] <= FEW_CHANNELS:
-        values = jnp.stack([splats.values[:, i][ids] for i in range(splats.values.shape[1])], axis=-1)
-    else:
-        values = splats.values[ids]
-    return ids, Splats(mean - batch.centers[:, None, :].astype(mean.dtype), conic, opacity, values)
+    mean = rows(splats.means2d) - batch.centers[:, None, :].astype(opacity.dtype)
+    values = rows(splats.values) if isinstance(splats.values, tuple) else splats.values[ids]
+    return ids, Splats(mean, rows(splats.conics), opacity, values)
+
+
+def in_columns(splats: Splats) -> Splats:
+    """Columns apart, for `read_chunk`: a gather of scalars is the quick one. Many channels stay rows."""
+
+    def columns(a):
+        return tuple(a[:, i] for i in range(a.shape[1]))
+
+    few = splats.values.shape[1] <= FEW_CHANNELS
+    values = columns(splats.values) if few else splats.values
+    return Splats(columns(splats.means2d), columns(splats.conics), splats.opacities, values)
 
 
 def still_read(
@@ -237,7 +249,8 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     length = lists.counts if reads is None else jnp.minimum(lists.counts, reads)
     batches = batch_tiles(lists, length, channels, plan)
-    compose = jax.vmap(partial(composite_tile, alpha_max=plan.alpha_max), in_axes=(0, None, 0))
+    columns = in_columns(splats)
+    compose = jax.vmap(partial(composite_tile, limits=plan.limits), in_axes=(0, None, 0))
     fresh = jax.vmap(lambda _: start_tile(plan.tile_pixels, channels, dtype))
 
     def one_batch(_, batch: Batches):
@@ -248,7 +261,7 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
         def step(carry):
             first, state, read = carry
             read = jnp.where(still_read(batch, first, state.light), first + chunk, read)
-            _, piece = read_chunk(splats, lists, batch, first, chunk)
+            _, piece = read_chunk(columns, lists, batch, first, chunk)
             return first + chunk, compose(piece, pixels, state), read
 
         start = (jnp.int32(0), fresh(batch.counts), jnp.zeros_like(batch.counts))

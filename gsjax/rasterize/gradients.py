@@ -1,13 +1,13 @@
 """`composite`, the compositing of all tiles, with its hand-written VJP.
 
 The backward pass reads the lists front to back as the forward pass did, and makes the same weights from the
-same alphas. With q_i = sum_c v_ic dL/dI_c, and what lies behind Gaussian i, S_i = sum_{j>i} w_j q_j + T dL/dT,
+same alphas. With q_i = sum_c v_ic dL/dI_c, and what is behind Gaussian i, S_i = sum_{j>i} w_j q_j + T dL/dT,
 
-    dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i),   so   dL/dpower_i = w_i q_i - S_i alpha_i / (1 - alpha_i),
+    dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i),  so  dL/dpower_i = w_i q_i - S_i alpha_i / (1 - alpha_i),
 
-where S begins as the whole, which the finished image knows: sum_c I_c dL/dI_c + T dL/dT. The pixels' gradients
-are summed to Gaussians by two matmuls: dL/dpower against the monomials 1, x, y, x^2, xy, y^2 of the tile's
-pixels, and w against dL/dI.
+where S begins as the whole, which the finished image knows: sum_c I_c dL/dI_c + T dL/dT. The pixels'
+gradients are summed to Gaussians by two matmuls: dL/dpower against the monomials 1, x, y, x^2, xy, y^2 of the
+tile's pixels, and w against dL/dI.
 """
 
 from functools import partial
@@ -27,13 +27,14 @@ from gsjax.rasterize.compositing import (
     batch_tiles,
     chunk_length,
     composite_forward,
+    in_columns,
     read_chunk,
     splat_alphas,
     still_read,
     tile_pixels,
     weights_of_many,
 )
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import Limits, Plan
 
 _SMALL = 1e-6  # 1 - alpha is not divided by less
 
@@ -43,8 +44,8 @@ def composite(
 ) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
     """Values of all tiles, the transmittance left, and how far each list was read.
 
-    Differentiable as the plan says. `reads` from an earlier call makes this one faster where much is the same;
-    it does not change the result.
+    Differentiable as the plan says. `reads` from an earlier call makes this one faster where much is the
+    same; it does not change the result.
     """
     if plan.derivative == "forward":
         return composite_forward(splats, lists, reads, plan)
@@ -67,10 +68,9 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     behind = jnp.einsum("tcp,tcp->tp", values, d_values) + d_transmittance * transmittance
-    of_chunk = partial(
-        _chunk_gradients, pixels=pixels, monomials=_monomials(pixels), alpha_max=plan.alpha_max
-    )
-    of_chunk = jax.vmap(of_chunk)
+    constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}
+    of_chunk = jax.vmap(partial(_chunk_gradients, **constants))
+    columns = in_columns(splats)
 
     def one_batch(total, batch: Batches):
         tile = jnp.maximum(batch.tiles, 0)
@@ -82,7 +82,7 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
 
         def step(carry):
             first, light, behind, total = carry
-            ids, piece = read_chunk(splats, lists, batch, first, chunk)
+            ids, piece = read_chunk(columns, lists, batch, first, chunk)
             light, behind, rows = of_chunk(piece, d_image, light, behind)
             total = total.at[ids.ravel()].add(rows.reshape(-1, 6 + channels))
             return first + chunk, light, behind, total
@@ -103,11 +103,11 @@ def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
     return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y, 0 * x, 0 * x], axis=-1)
 
 
-def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials, alpha_max):
+def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials, limits: Limits):
     """(light, S) behind one chunk of one tile, and its rows of gradients: geometry, then values."""
     channels, dtype = piece.values.shape[1], d_image.dtype
-    alphas = splat_alphas(piece, pixels, alpha_max)
-    weights, light = weights_of_many(alphas, light)
+    alphas = splat_alphas(piece, pixels, limits)
+    weights, light = weights_of_many(alphas, light, limits)
     values = piece.values.astype(dtype)
     if channels <= FEW_CHANNELS:
         toward = sum(values[:, c, None] * d_image[c] for c in range(channels))
@@ -121,7 +121,7 @@ def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials
         some = slice(i, i + CHUNK)
         suffix = _suffix(behind, passed[some])
         slope = suffix * alphas[some] / jnp.maximum(1 - alphas[some], _SMALL)
-        moved = (weights[some] > 0) & (alphas[some] < alpha_max * (1 - 0.5 * SATURATION))
+        moved = (weights[some] > 0) & (alphas[some] < limits.alpha_max * (1 - 0.5 * SATURATION))
         d_power.append(jnp.where(moved, passed[some] - slope, 0.0))
         behind = behind - passed[some].sum(axis=0)
     moments = jnp.matmul(jnp.concatenate(d_power), monomials, precision="highest")

@@ -7,7 +7,7 @@ scene that grows compiles a few variants in all, and re-planning on a known rung
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -19,6 +19,17 @@ DERIVATIVES = ("reverse", "forward")
 TILE_SIZES = (4, 8, 16, 32)
 SORTS = ("host", "device")
 _BATCH_PIXELS = 16384  # pixels composited together: what a step of 8 Gaussians makes of them stays in L2
+
+
+class Limits(NamedTuple):
+    """Where compositing starts and ends. What the field agrees on (Kerbl et al. 2023) is the default."""
+
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    min_transmittance: float = 1e-4
+
+
+DEFAULT_LIMITS = Limits()
 
 
 @jax.tree_util.register_static
@@ -36,7 +47,11 @@ class Plan:
         render_mode: RGB, D (accumulated depth), ED (expected depth), RGB+D, RGB+ED.
         rasterize_mode: classic, or antialiased (opacity scaled by what the dilation spread out).
         derivative: "reverse" for the hand-written VJP, "forward" for jvp, linearize and Gauss-Newton.
+        alpha_min: a fainter contribution is skipped.
         alpha_max: where a single contribution saturates.
+        min_transmittance: a pixel ends before the Gaussian that would take its transmittance to this.
+        max_per_tile: Gaussians of a tile that are drawn, nearest first; None for all. With a number the image
+            is an approximation, and Gaussians left out get no gradient.
         tile_size: edge of a tile, pixels. Small tiles have fewer pixel pairs, large ones shorter lists.
         tiles_per_batch: tiles composited together (default: 16384 pixels); a matter of speed alone.
         sort: "host" for numpy's sort where XLA runs on the CPU, "device" for XLA's own; of speed alone.
@@ -52,7 +67,10 @@ class Plan:
     render_mode: str = "RGB"
     rasterize_mode: str = "classic"
     derivative: str = "reverse"
-    alpha_max: float = 0.99
+    alpha_min: float = DEFAULT_LIMITS.alpha_min
+    alpha_max: float = DEFAULT_LIMITS.alpha_max
+    min_transmittance: float = DEFAULT_LIMITS.min_transmittance
+    max_per_tile: int | None = None
     tile_size: int = 8
     tiles_per_batch: int | None = None
     sort: str = "host"
@@ -69,16 +87,19 @@ class Plan:
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {value!r}")
-        for name in ("width", "height", "tiles_per_batch"):
+        for name in ("width", "height", "tiles_per_batch", "max_per_tile"):
             value = getattr(self, name)
-            if name == "tiles_per_batch" and value is None:
+            if value is None and name in ("tiles_per_batch", "max_per_tile"):
                 continue
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
         if not self.near_plane < self.far_plane:
             raise ValueError(f"near_plane {self.near_plane} must be below far_plane {self.far_plane}")
-        if not 0 < self.alpha_max < 1:
-            raise ValueError(f"alpha_max must lie between 0 and 1; got {self.alpha_max}")
+        for name in Limits._fields:
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} must lie between 0 and 1; got {getattr(self, name)}")
+        if not self.alpha_min < self.alpha_max:
+            raise ValueError(f"alpha_min {self.alpha_min} must be below alpha_max {self.alpha_max}")
         if self.eps2d < 0:
             raise ValueError(f"eps2d must not be negative; got {self.eps2d}")
 
@@ -93,6 +114,10 @@ class Plan:
     @property
     def num_tiles(self) -> int:
         return self.tiles_x * self.tiles_y
+
+    @property
+    def limits(self) -> Limits:
+        return Limits(self.alpha_min, self.alpha_max, self.min_transmittance)
 
     @property
     def tile_pixels(self) -> int:

@@ -13,8 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.rotations import MIN_SQUARED_NORM
 from gsjax.rasterize.plan import Plan
 
-ALPHA_MIN = 1 / 255  # a fainter contribution is skipped
-MAX_SIGMA = 3.33  # no Gaussian reaches further, in standard deviations
 MIN_COMPENSATION = 0.005  # floor of the antialiasing factor
 
 
@@ -25,7 +23,7 @@ class Projected(NamedTuple):
     conics: Float[Array, "n 3"]  # inverse covariance (A, B, C): A dx^2 + 2 B dx dy + C dy^2
     depths: Float[Array, "n"]  # z in the camera's frame, metres
     opacities: Float[Array, "n"]  # after antialiasing
-    extents: Float[Array, "n 2"]  # half-widths of the box where alpha can be 1/255, pixels; else 0
+    extents: Float[Array, "n 2"]  # half-widths of the box where alpha reaches alpha_min, pixels; else 0
     visible: Bool[Array, "n"]
     culled: Int[Array, ""]  # rows refused for their values: not finite, no rotation, no area
 
@@ -77,8 +75,8 @@ def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
     margin_x, margin_y = 0.15 * plan.width / fx, 0.15 * plan.height / fy
     tx = jnp.clip(x / z, -cx / fx - margin_x, (plan.width - cx) / fx + margin_x)
     ty = jnp.clip(y / z, -cy / fy - margin_y, (plan.height - cy) / fy + margin_y)
-    # Rows of M = J W R S, one entry for each of the Gaussian's axes. They divide last because XLA:CPU stores a
-    # quotient, while products and sums it would work out again wherever they are used.
+    # Rows of M = J W R S, one entry for each of the Gaussian's axes. They divide last because XLA:CPU stores
+    # a quotient, while products and sums it would work out again wherever they are used.
     row_u, row_v = [], []
     for axis, scale in zip(_rotation_columns(quats), scales, strict=True):
         in_x, in_y, in_z = _rotate(viewmat[:3, :3], axis)
@@ -145,8 +143,8 @@ def project_gaussians(
     in_range = (z > plan.near_plane) & (z < plan.far_plane)
     culled = jnp.sum(~sound | (in_range & ~has_area))
 
-    # The box in which alpha = o exp(-q/2) >= 1/255, that is q <= 2 ln(255 o).
-    reach = jnp.minimum(MAX_SIGMA**2, 2 * jnp.log(jnp.maximum(alphas / ALPHA_MIN, 1e-30)))
+    # The box in which alpha = o exp(-q/2) reaches alpha_min, that is q <= 2 ln(o / alpha_min).
+    reach = 2 * jnp.log(jnp.maximum(alphas / plan.alpha_min, 1e-30))
     half = jnp.sqrt(jnp.maximum(reach, 0.0)[:, None] * jnp.stack(variances, axis=-1))
     half = half * 1.0001 + 1e-3  # rounding must not shave a pixel off
     size = jnp.array([plan.width, plan.height], means2d.dtype)

@@ -78,7 +78,10 @@ def rasterization(
     means2d_offset: Float[Array, "*batch c n 2"] | None = None,
     reads: Int[Array, "*batch c tiles"] | None = None,
     derivative: str = UNSET,
+    alpha_min: float = UNSET,
     alpha_max: float = UNSET,
+    min_transmittance: float = UNSET,
+    max_per_tile: int | None = UNSET,
     tile_size: int = UNSET,
     tiles_per_batch: int | None = UNSET,
     sort: str = UNSET,
@@ -95,7 +98,8 @@ def rasterization(
         scales: standard deviations along the own axes, metres.
         opacities: 0 to 1 (values outside are clipped).
         colors: values of any dimension D, or SH coefficients [N, K, D] when `sh_degree` is given. An axis of
-            cameras before N, [..., C, N, D], makes them differ from camera to camera.
+            cameras before N, [..., C, N, D], makes them differ from camera to camera. Values of type
+            bfloat16 or float16 stay so until they are composited, in float32.
         viewmats: world to camera, OpenCV axes.
         Ks: intrinsics, pixels; pixel centres at +0.5.
         width, height: image size, static.
@@ -108,13 +112,19 @@ def rasterization(
             and where it is not finite.
         render_mode: RGB (default), D (sum of w z), ED (D over alpha), RGB+D or RGB+ED: depth comes last.
         rasterize_mode: classic (default) or antialiased.
-        features: more values [N, F], composited in the same pass into `meta.features`, without background.
+        features: more values [N, F], composited in the same pass into `meta.features`, without background. In
+            half precision like the colours they stay so until they are composited.
         roi: pixels that are wanted. Tiles without one are not drawn and show the background.
         means2d_offset: added to the projected means; pass zeros to read their gradient.
         reads: `meta.reads` of an earlier call with a similar view. The image does not change, but tiles that
             end early are then drawn beside their like, which is faster.
         derivative: "reverse" (default, a fast VJP) or "forward" (jvp, linearize, Gauss-Newton).
+        alpha_min: a fainter contribution is skipped (default 1/255).
         alpha_max: where one contribution saturates (default 0.99).
+        min_transmittance: a pixel ends before the Gaussian that would take its transmittance to this (default
+            1e-4).
+        max_per_tile: Gaussians of a tile that are drawn, nearest first (default None: all). With a number the
+            image is an approximation; `docs/choosing.md` says how good.
         tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Of speed alone.
         tiles_per_batch: tiles composited together (default: 16384 pixels); of speed alone.
         sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; of speed alone.
@@ -154,7 +164,10 @@ def plan(
     render_mode: str = UNSET,
     rasterize_mode: str = UNSET,
     derivative: str = UNSET,
+    alpha_min: float = UNSET,
     alpha_max: float = UNSET,
+    min_transmittance: float = UNSET,
+    max_per_tile: int | None = UNSET,
     tile_size: int = UNSET,
     tiles_per_batch: int | None = UNSET,
     sort: str = UNSET,
@@ -213,6 +226,7 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
     # What a Gaussian is painted with decides too whether it can be drawn; so large that its square overflows,
     # it would drown the gradients of all that share a pixel with it.
     def paintable(a):
+        a = a.astype(views.means.dtype)
         return jnp.isfinite(a * a).all(axis=(1, *range(3, a.ndim)))
 
     usable = paintable(views.colors)
@@ -243,7 +257,9 @@ def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c
         columns.append(projected.depths[..., None])
     if views.features is not None:
         columns.append(jnp.where(seen, views.features[:, None], 0.0))
-    return jnp.concatenate(columns, axis=-1)
+    same = len({c.dtype for c in columns}) == 1  # half precision stays only where all are
+    dtype = columns[0].dtype if same else views.means.dtype
+    return jnp.concatenate([c.astype(dtype) for c in columns], axis=-1)
 
 
 class _Counts(NamedTuple):
@@ -279,7 +295,8 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
         )
     if n == 0:
         zeros = jnp.zeros(num_views, jnp.int32)
-        tiles = jnp.zeros((num_views * plan.num_tiles, channels, plan.tile_pixels), values.dtype)
+        dtype = projected.depths.dtype
+        tiles = jnp.zeros((num_views * plan.num_tiles, channels, plan.tile_pixels), dtype)
         unread = jnp.zeros((num_views, plan.num_tiles), jnp.int32)
         return tiles, jnp.ones(tiles.shape[::2], tiles.dtype), _Counts(unread, zeros, zeros > 0, zeros)
 

@@ -7,8 +7,9 @@ import pytest
 
 from gsjax.rasterize.compositing import Splats, start_tile
 from gsjax.rasterize.compositing import composite_tile as one_tile
+from gsjax.rasterize.plan import Limits
 
-composite_tile = jax.jit(one_tile, static_argnames="alpha_max")
+composite_tile = jax.jit(one_tile, static_argnames="limits")
 
 
 def random_list(length: int, seed: int = 0, channels: int = 3, opaque: float = 0.3) -> Splats:
@@ -117,7 +118,9 @@ def test_a_contribution_under_1_in_255_is_skipped():
 
 def test_a_contribution_saturates_at_alpha_max_without_gradient():
     def alpha(opacity, alpha_max):
-        return composite_tile(stack_of(opacity[None]), grid(), alpha_max=alpha_max).values.mean()
+        return composite_tile(
+            stack_of(opacity[None]), grid(), limits=Limits(alpha_max=alpha_max)
+        ).values.mean()
 
     value, slope = jax.value_and_grad(alpha)(jnp.float32(0.995), 0.99)
     assert (float(value), float(slope)) == (pytest.approx(0.99), 0.0)

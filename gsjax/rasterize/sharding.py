@@ -1,0 +1,153 @@
+"""Cameras and scenes over a mesh of devices, or of processes: each device draws its own, Gaussians are shared.
+
+Every camera's image depends on that camera and its scene alone, so drawing needs no communication. Only the
+backward pass does: a Gaussian that many devices drew receives the sum of what they have to say.
+"""
+
+import functools
+import inspect
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from gsjax.rasterize.checks import check_inputs
+from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
+from gsjax.rasterize.rasterization import plan as make_plan
+from gsjax.rasterize.rasterization import rasterization
+
+AxisNames = str | tuple[str, ...]
+
+_PER_SCENE = ("means", "quats", "scales", "opacities", "features")
+_PER_CAMERA = ("viewmats", "Ks", "backgrounds", "roi", "means2d_offset", "reads")
+_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+_ARRAYS += ("backgrounds", "features", "roi", "means2d_offset", "reads")  # in the order of `check_inputs`
+_SIGNATURE = inspect.signature(rasterization)
+
+
+def sharded_rasterization(
+    mesh: Mesh, *, cameras: AxisNames | None = None, scenes: AxisNames | None = None
+) -> Callable:
+    """`gsjax.rasterization` over a mesh: the same arguments, options, results and derivatives.
+
+    Cameras (axis C of viewmats, Ks, backgrounds, roi, means2d_offset, reads, and of colors that have one) are
+    split over the mesh axis `cameras`, scenes (the first leading axis of all arrays) over `scenes`. Gaussians
+    are whole on every device of their scene, and their gradients are summed over `cameras`. Images and every
+    field of `meta` come out split in the same way. Mesh axes named in neither repeat the work.
+
+    Args:
+        mesh: of devices, from `jax.make_mesh`; with `jax.distributed` those of all processes.
+        cameras: the mesh axis, or a tuple of them, that cameras are split over; None leaves them together.
+        scenes: the same for scenes, which then need a leading axis.
+
+    Returns:
+        A function with the arguments of `gsjax.rasterization`. It may be called under jit, grad (a reverse
+        plan) and jvp (a forward plan). A plan is for the neediest camera of all, as ever.
+
+    Raises:
+        ValueError: an axis is not of the mesh, or both are the same, or neither is given. When called: as
+            `gsjax.rasterization`, and if cameras or scenes do not divide evenly over their axis.
+    """
+    cameras, scenes = _names("cameras", cameras, mesh), _names("scenes", scenes, mesh)
+    if not cameras and not scenes:
+        raise ValueError("name the mesh axis to split over: cameras=..., scenes=..., or both")
+    if shared := set(cameras) & set(scenes):
+        raise ValueError(f"cameras and scenes cannot both be split over mesh axis {shared.pop()!r}")
+
+    @functools.wraps(rasterization)
+    def draw(*args, **kwargs):
+        given = _SIGNATURE.bind(*args, **kwargs).arguments
+        arrays = {name: given[name] for name in _ARRAYS if given.get(name) is not None}
+        options = {name: given[name] for name in OPTION_NAMES if given.get(name, UNSET) is not UNSET}
+        width, height, plan = given["width"], given["height"], given.get("plan")
+        plan = resolve(plan, width, height, options)
+        # Shapes alone, and those of the whole: a message about one device's part would puzzle its reader.
+        shapes = {name: _shape_of(array) for name, array in arrays.items()}
+        jax.eval_shape(functools.partial(check_inputs, plan), *map(shapes.get, _ARRAYS))
+        _check_divides(arrays, mesh, cameras, scenes)
+        if plan.capacity == 0:
+            names = (*_ARRAYS[:4], "viewmats", "Ks", "roi")
+            *geometry, roi = (_placed(arrays.get(name), mesh, P()) for name in names)
+            plan = make_plan(*geometry, width, height, headroom=1.0, roi=roi, **options)
+        return _draw(arrays, mesh, cameras, scenes, plan)
+
+    return draw
+
+
+def _shape_of(array):
+    """What the checks look at: not how the array is split over an explicit mesh, which their reshapes mind."""
+    return jax.ShapeDtypeStruct(array.shape, array.dtype) if hasattr(array, "dtype") else array
+
+
+def _placed(array, mesh: Mesh, spec: P):
+    """The array split as `spec` says where types carry that (explicit mesh axes); elsewhere XLA sees to it."""
+    if array is None or AxisType.Explicit not in mesh.axis_types:
+        return array
+    return jax.reshard(array, NamedSharding(mesh, spec))
+
+
+def _names(what: str, axes: AxisNames | None, mesh: Mesh) -> tuple[str, ...]:
+    names = () if axes is None else (axes,) if isinstance(axes, str) else tuple(axes)
+    for name in names:
+        if name not in mesh.axis_names:
+            raise ValueError(f"{what}={name!r} is not an axis of the mesh, which has {mesh.axis_names}")
+    return names
+
+
+def _check_divides(arrays: dict[str, Any], mesh: Mesh, cameras, scenes) -> None:
+    means, viewmats = arrays["means"], arrays["viewmats"]
+    parts = math.prod(mesh.shape[name] for name in cameras)
+    count = viewmats.shape[-3]
+    if count % parts:
+        raise ValueError(
+            f"viewmats holds {count} cameras, which do not divide evenly over the {parts} devices of mesh axis "
+            f"{_quoted(cameras)}; repeat a camera in viewmats, Ks and all else that has one entry a camera until "
+            f"there are {-(-count // parts) * parts}, and weigh the repeated ones with 0 in the loss, or use a "
+            f"mesh whose axis divides {count}"
+        )
+    if not scenes:
+        return
+    if means.ndim == 2:
+        raise ValueError(
+            f"means has no leading axis to split over mesh axis {_quoted(scenes)}; got shape {means.shape}, "
+            "wanted (B, N, 3). One scene is split by its cameras: cameras=... in place of scenes=..."
+        )
+    parts = math.prod(mesh.shape[name] for name in scenes)
+    count = means.shape[0]
+    if count % parts:
+        raise ValueError(
+            f"means holds {count} scenes, which do not divide evenly over the {parts} devices of mesh axis "
+            f"{_quoted(scenes)}; repeat a scene in every array until there are {-(-count // parts) * parts}, and "
+            f"weigh the repeated ones with 0 in the loss, or use a mesh whose axis divides {count}"
+        )
+
+
+def _quoted(names: tuple[str, ...]) -> str:
+    return " x ".join(map(repr, names))
+
+
+def _specs(arrays: dict[str, Any], plan: Plan, cameras, scenes) -> tuple[dict[str, P], P]:
+    """How each argument is split, and how every result is."""
+    lead = arrays["means"].ndim - 2
+    per_scene = P(*((scenes or None), *(None,) * (lead - 1))) if lead else P()
+    per_camera = P(*per_scene, cameras or None)
+    specs = dict.fromkeys(_PER_SCENE, per_scene) | dict.fromkeys(_PER_CAMERA, per_camera)
+    shared_colors = arrays["colors"].ndim == lead + (2 if plan.sh_degree is None else 3)
+    specs["colors"] = per_scene if shared_colors else per_camera
+    return {name: specs[name] for name in arrays}, per_camera
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "cameras", "scenes", "plan"))
+def _draw(arrays: dict[str, Any], mesh: Mesh, cameras, scenes, plan: Plan):
+    specs, per_camera = _specs(arrays, plan, cameras, scenes)
+
+    def own_part(arrays):
+        return rasterization(**arrays, width=plan.width, height=plan.height, plan=plan)
+
+    # Loops inside start from constants, which are the same everywhere, and end with what differs; the check of
+    # varying axes refuses that. Without it every gradient of a shared input is summed, which is what we want.
+    split = jax.shard_map(own_part, mesh=mesh, in_specs=(specs,), out_specs=per_camera, check_vma=False)
+    return split({name: _placed(array, mesh, specs[name]) for name, array in arrays.items()})
