@@ -28,8 +28,8 @@ test: $(VENV)/installed-test ## the tests, with coverage; slow ones left out
 test-all: $(VENV)/installed-test ## every test, the slow ones too
 	$(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
 
-bench: $(VENV)/installed-test ## the benchmark suite
-	$(BIN)/python -m benchmarks
+bench: $(VENV)/installed-test ## the whole benchmark suite, on a machine that does nothing else
+	$(BIN)/gsjax bench
 
 docs: $(VENV)/installed-dev ## build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -30,6 +30,13 @@ def describe() -> dict[str, str]:
     }
 
 
+def name() -> str:
+    """What two runs must share for their milliseconds to be compared: processor, cores and device."""
+    d = describe()
+    device = "" if d["device"] == "cpu" else f", {d['device']}"
+    return f"{d['cpu']}, {d['cores']} cores{device}"
+
+
 def in_words() -> str:
     d = describe()
     extra = ", AVX-512" if d["avx512"] == "yes" else ""

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsjax.geometry.cameras import look_at
 from gsjax.rasterize.binning import bin_gaussians
-from gsjax.rasterize.plan import RENDER_MODES, Plan, rung
+from gsjax.rasterize.plan import DEFAULT_LIMITS, RENDER_MODES, Limits, Plan, rung
 from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
@@ -35,17 +35,19 @@ class Case:
     sh_degree: int | None
     channels: int
     feature_channels: int | None
+    limits: Limits = DEFAULT_LIMITS
 
     @property
     def options(self) -> dict[str, Any]:
         names = ("render_mode", "rasterize_mode", "sh_degree")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in names} | self.limits._asdict()
 
     @property
     def mode(self) -> str:
         paint = f"{self.channels} channels" if self.sh_degree is None else f"SH {self.sh_degree}"
         features = f" + {self.feature_channels} features" if self.feature_channels else ""
-        return f"{self.render_mode}, {self.rasterize_mode}, {paint}{features}"
+        limits = "" if self.limits == DEFAULT_LIMITS else ", other limits"
+        return f"{self.render_mode}, {self.rasterize_mode}, {paint}{features}{limits}"
 
 
 def case(seed: int, num: int | None = None) -> Case:
@@ -63,6 +65,7 @@ def case(seed: int, num: int | None = None) -> Case:
         sh_degree=sh_degree,
         channels=channels,
         feature_channels=(None, 5)[seed // 8 % 2],
+        limits=(DEFAULT_LIMITS, Limits(3 / 255, 0.999, 1e-3))[seed // 16 % 2],
     )
 
 

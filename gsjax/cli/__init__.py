@@ -15,6 +15,7 @@ COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
+    "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
 """Each command's module, which has `Options`, a dataclass or a union of them (subcommands), and
 `run(options)`, which returns the exit code."""

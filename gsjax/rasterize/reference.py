@@ -1,7 +1,7 @@
 """The rasterizer written as slowly and plainly as can be: every Gaussian at every pixel, in float64.
 
 It shares no code with the fast path. Its gradients are plain autodiff. It also marks the pixels whose value
-hangs on a comparison that rounding may turn the other way (the 1/255 and 0.99 thresholds, the early stop,
+hangs on a comparison that rounding may turn the other way (the thresholds of alpha, the early stop,
 the order of nearly equal depths); there, two correct renderings may differ by up to 1/255.
 """
 
@@ -76,7 +76,9 @@ def rasterization_reference(
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
     features: Float[Array, "n f"] | None = None,
+    alpha_min: float = 1 / 255,
     alpha_max: float = 0.99,
+    min_transmittance: float = 1e-4,
 ) -> Reference:
     """One scene in one camera, exactly; arguments as for `gsjax.rasterization`. All rows must be drawable."""
     antialiased = rasterize_mode == "antialiased"
@@ -99,18 +101,19 @@ def rasterization_reference(
         a, b, c, d = (conics[:, i, j, None] for i in range(2) for j in range(2))
         raw = opacities[:, None] * jnp.exp(-0.5 * (a * dx * dx + (b + c) * dx * dy + d * dy * dy))
         alpha = jnp.minimum(raw, alpha_max)
-        drawn = in_range[:, None] & (alpha >= 1 / 255)
+        drawn = in_range[:, None] & (alpha >= alpha_min)
         alpha = jnp.where(drawn, alpha, 0.0)
         # A product from front to back, one Gaussian after the other.
         _, before = jax.lax.scan(lambda t, a: (t * (1 - a), t), jnp.ones(len(pixels)), alpha)
         after = before * (1 - alpha)
-        weights = jnp.where(after > 1e-4, alpha * before, 0.0)
+        weights = jnp.where(after > min_transmittance, alpha * before, 0.0)
 
         def near(value, threshold, where):
             return jnp.any(where & (jnp.abs(value / threshold - 1) < _DOUBT), axis=0)
 
         seen = in_range[:, None] & (before > _VISIBLE)
-        doubtful = near(raw, 1 / 255, seen) | near(raw, alpha_max, seen) | near(after, 1e-4, drawn)
+        doubtful = near(raw, alpha_min, seen) | near(raw, alpha_max, seen)
+        doubtful |= near(after, min_transmittance, drawn)
         doubtful |= jnp.any(gaps[:, None] & drawn[1:] & drawn[:-1] & seen[:-1], axis=0)
         return weights.T @ painted, weights.sum(axis=0), doubtful
 

@@ -9,6 +9,8 @@ from gsjax.methods.object_tracker.region import (
     TrackerPlan,
     near_background,
     near_scene,
+    shift_background,
+    spread,
     tiles_to_pixels,
     touched_tiles,
 )
@@ -53,3 +55,15 @@ def test_a_plan_grows_to_the_lowest_rungs_that_hold_what_was_needed():
     assert not needed.exceeds(grown)
     assert grown.grown(needed, 1.5) == grown
     assert hash(grown) == hash(grown.grown(needed, 1.0))
+
+
+def test_what_belongs_to_the_near_scene_is_given_back_to_the_whole(started):
+    num = started.gaussians.num - started.num_moving
+    near = jnp.arange(num) % 3 == 1
+    around = near_scene(started, near, int(near.sum()) + 7)
+    shifts = jnp.arange(3.0 * (around.gaussians.num - around.num_moving)).reshape(-1, 3)
+    moved = shift_background(started, spread(near, shifts)).gaussians.means - started.gaussians.means
+    moved_near = shift_background(around, shifts).gaussians.means - around.gaussians.means
+    rows = started.num_moving + np.flatnonzero(near)
+    np.testing.assert_allclose(moved[rows], moved_near[around.num_moving : -7], rtol=1e-4)
+    assert not np.delete(np.asarray(moved), rows, axis=0).any()

@@ -73,6 +73,39 @@ def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, start
         np.testing.assert_allclose(again.pose.means, before.pose.means, atol=1e-5)
 
 
+def test_the_background_moves_only_where_it_is_told_to(table, started, tracked, quick):
+    _, frames, _ = table()
+    background = np.asarray(started.gaussians.means)[started.num_moving :]
+    np.testing.assert_array_equal(background_of(tracked[0].scene), background)
+    config = replace(quick, refine=replace(quick.refine, background_rate=1e-4))
+    (result,) = track(started, frames[0], frames[1:2], config)
+    moved = np.linalg.norm(background_of(result.scene) - background, axis=-1)
+    assert 1e-5 < moved.max() < 1e-4 * quick.refine.iterations * 3**0.5 * 1.5
+
+
+def background_of(scene: TrackedScene) -> np.ndarray:
+    return np.asarray(scene.gaussians.means)[scene.num_moving :]
+
+
+def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, centroid_errors):
+    """Without matching nothing is found; without a warm start the last motion changes nothing."""
+    sequence, frames, _ = table()
+    config = replace(quick, warm_start=False, match=replace(quick.match, min_score=1.1))
+    before, last = tracked[0], tracked[1]
+    arguments = {"pose": before.pose, "state": before.state}
+    (result,) = track(before.scene, frames[1], frames[2:3], config, **arguments)
+    assert last.info["found"].any()
+    assert not result.info["found"].any()
+    hurled = eqx.tree_at(
+        lambda s: s.motion, before.state, jax.tree.map(lambda a: a + 0.05, before.state.motion)
+    )
+    arguments["state"] = hurled
+    (again,) = track(before.scene, frames[1], frames[2:3], config, **arguments)
+    jax.tree.map(np.testing.assert_array_equal, again.pose, result.pose)
+    errors = centroid_errors(sequence, started, result.pose, 2)
+    assert max(errors.values()) < 10e-3, errors
+
+
 def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick, monkeypatch):
     """Capacities too small for the scene, in the step alone and then under `track`."""
     _, frames, _ = table()

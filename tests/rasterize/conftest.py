@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes import ARRAYS, Case, case, cast, make_scene
+from gsjax.rasterize.plan import DEFAULT_LIMITS
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def small():
 
     def make(seed: int = 0, dtype=np.float32, **fields) -> tuple[Case, dict]:
         plain = {"width": 33, "height": 17, "render_mode": "RGB", "rasterize_mode": "classic"}
-        plain |= {"sh_degree": None, "channels": 3, "feature_channels": None}
+        plain |= {"sh_degree": None, "channels": 3, "feature_channels": None, "limits": DEFAULT_LIMITS}
         this = dataclasses.replace(case(seed, 40), **plain | fields)
         return this, {k: v for k, v in cast(make_scene(this), dtype).items() if v is not None}
 

@@ -18,7 +18,7 @@ def check(seed: int) -> None:
             assert error <= limit, f"{name} in {dtype}: {error:.1e}"
 
 
-# RGB+ED, antialiased, SH 1, features; ED, classic, 7 channels, features.
+# RGB+ED, antialiased, SH 1, features, other limits; ED, classic, 7 channels, features.
 @pytest.mark.parametrize("seed", [29, 42])
 def test_images_and_gradients_equal_the_reference(seed):
     check(seed)

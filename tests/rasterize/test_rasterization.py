@@ -240,6 +240,21 @@ def test_reads_of_an_earlier_call_change_nothing_but_the_order_of_work(small):
         np.testing.assert_array_equal(again[2].reads, meta.reads)
 
 
+def test_a_cap_on_lists_draws_the_nearest_alone(small):
+    _, scene = small(3)
+    whole = {"width": 32, "height": 16, "tile_size": 32}  # one tile
+    _, _, meta = rasterization(**scene, **whole)
+    inside = np.asarray(meta.radii[0]).all(axis=1)
+    nearest = np.flatnonzero(inside)[np.argsort(np.asarray(meta.depths[0])[inside])][:5]
+    rows = {
+        k: v[nearest] for k, v in scene.items() if k in ("means", "quats", "scales", "opacities", "colors")
+    }
+    want, _, _ = rasterization(**scene | rows, **whole)
+    got, _, meta = rasterization(**scene, **whole, max_per_tile=5)
+    np.testing.assert_allclose(got, want, atol=1e-6)
+    assert int(meta.pairs[0]) == 5
+
+
 def test_a_saturated_tile_is_read_no_further():
     n = 400
     scene = {

@@ -53,7 +53,7 @@ class MatchConfig:
     radius: int = 24
     """How far the template is searched to each side, pixels of the reduced image."""
     min_score: float = 0.3
-    """A correlation below this moves nothing."""
+    """A correlation below this moves nothing; more than 1 leaves matching out."""
     margin: int = 2
     """Pixels by which the object's mask is grown: an outline against its surroundings is texture too."""
     max_residual: float = 0.03
@@ -131,6 +131,8 @@ class RefineConfig:
     """Weight of the mean |delta_i|^2 of a group, in units of delta_scale^2."""
     delta_scale: float = 0.004
     """A displacement of its own that is large for a Gaussian, metres."""
+    background_rate: float = 0.0
+    """Learning rate of displacements of the background's Gaussians, metres; 0 freezes them (the paper)."""
     depth_weight: float = 2.0
     """Weight of the depth difference in metres beside the colour difference (0 to 1)."""
     depth_limit: float = 0.05
@@ -139,7 +141,13 @@ class RefineConfig:
     """Colour differences beyond this are of something else, 0 to 1."""
 
     def __post_init__(self):
-        rates = {"translation_rate": 0, "rotation_rate": 0, "delta_rate": 0, "delta_weight": 0}
+        rates = {
+            "translation_rate": 0,
+            "rotation_rate": 0,
+            "delta_rate": 0,
+            "delta_weight": 0,
+            "background_rate": 0,
+        }
         limits = ("delta_scale", "depth_limit", "color_limit")
         _check(self, above_zero=limits, at_least={"iterations": 1, "depth_weight": 0, **rates})
 
@@ -174,6 +182,8 @@ class TrackerConfig:
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     grow: GrowConfig = field(default_factory=GrowConfig)
+    warm_start: bool = True
+    """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""
 

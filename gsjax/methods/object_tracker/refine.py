@@ -11,6 +11,7 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.losses.photometric import weighted_mean
 from gsjax.methods.object_tracker.config import RefineConfig
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
+from gsjax.methods.object_tracker.region import shift_background
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -62,12 +63,22 @@ def refine_loss(
     return loss, info
 
 
-def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Motion, dict[str, Any]]:
-    """Adam from `motion`, with rates that fall to a tenth over the iterations."""
-    rates = jnp.array([config.translation_rate] * 3 + [config.rotation_rate] * 3)
+def refine(
+    motion: Motion, batch: RefineBatch, config: RefineConfig
+) -> tuple[Motion, Float[Array, "b 3"] | None, dict[str, Any]]:
+    """Adam from `motion`, with rates that fall to a tenth over the iterations.
 
-    def scaled(updates: Motion, _) -> Motion:
-        return Motion(rates * updates.twists, config.delta_rate * updates.delta)
+    Returns:
+        the motion, how far each Gaussian of the batch's background moved (None if that is frozen), info.
+    """
+    rates = jnp.array([config.translation_rate] * 3 + [config.rotation_rate] * 3)
+    still = batch.scene.num_moving
+    shifts = jnp.zeros_like(batch.scene.gaussians.means[still:]) if config.background_rate else None
+
+    def scaled(updates, _):
+        motion, shifts = updates
+        shifts = None if shifts is None else config.background_rate * shifts
+        return Motion(rates * motion.twists, config.delta_rate * motion.delta), shifts
 
     optimizer = optax.chain(
         optax.scale_by_adam(b1=0.8, b2=0.95),
@@ -75,18 +86,21 @@ def refine(motion: Motion, batch: RefineBatch, config: RefineConfig) -> tuple[Mo
         optax.stateless(scaled),
     )
 
-    def loss(motion):
-        return refine_loss(motion, batch, step=0, key=None, config=config)
+    def loss(trained):
+        motion, shifts = trained
+        moved = batch if shifts is None else batch._replace(scene=shift_background(batch.scene, shifts))
+        return refine_loss(motion, moved, step=0, key=None, config=config)
 
     def iterate(carry, _):
-        motion, state = carry
-        (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(motion)
+        trained, state = carry
+        (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
         gradient = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), gradient)
-        updates, state = optimizer.update(gradient, state, motion)
-        return (optax.apply_updates(motion, updates), state), {**info, "loss": value}
+        updates, state = optimizer.update(gradient, state, trained)
+        return (optax.apply_updates(trained, updates), state), {**info, "loss": value}
 
-    start = (motion, optimizer.init(motion))
-    (motion, _), infos = jax.lax.scan(iterate, start, None, length=config.iterations)
+    trained = (motion, shifts)
+    start = (trained, optimizer.init(trained))
+    ((motion, shifts), _), infos = jax.lax.scan(iterate, start, None, length=config.iterations)
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
     info = {name: values[-1] for name, values in infos.items()}
-    return motion, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}
+    return motion, shifts, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}

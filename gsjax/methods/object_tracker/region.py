@@ -110,3 +110,15 @@ def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: i
     gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moving, background)
     labels = jnp.concatenate([scene.labels[: scene.num_moving], jnp.zeros(num_near, jnp.int32)])
     return TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
+
+
+def shift_background(scene: TrackedScene, shifts: Float[Array, "b 3"]) -> TrackedScene:
+    """The scene with its background's Gaussians moved, each by its own."""
+    means = scene.gaussians.means.at[scene.num_moving :].add(shifts)
+    return eqx.tree_at(lambda s: s.gaussians.means, scene, means)
+
+
+def spread(near: Bool[Array, "background"], values: Float[Array, "near 3"]) -> Float[Array, "background 3"]:
+    """What belongs to the rows of `near_scene`, given back to the whole background; 0 elsewhere."""
+    rows = jnp.nonzero(near, size=len(values), fill_value=len(near))[0]
+    return jnp.zeros((len(near), 3), values.dtype).at[rows].set(values, mode="drop")

@@ -28,6 +28,8 @@ from gsjax.methods.object_tracker.region import (
     TrackerPlan,
     near_background,
     near_scene,
+    shift_background,
+    spread,
     tiles_to_pixels,
     touched_tiles,
 )
@@ -139,25 +141,28 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         assert last.features is not None
         seen = seen_from(scene, params, last, frame, config.start.depth_gap)
         visible = group_means(seen.max(0), groups, num_objects) > _MIN_SEEN
-        match = match_templates(
-            last.colors, last.depths, last.features[..., 1:], frame, config.match, reduction
-        )
-        jump, found = lift(match, frame, config.match)
+        jump, found, score = _match(last, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
         points = join(_named(scene, params, seen, config), join(state.pixels, remembered))
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
-        starts = jnp.stack([still, jumped, going, going.at[:, :3].set(jumped[:, :3])])
-        aligned = search(starts, points, centers, frame, config.align)
-        begun = Motion(aligned, state.motion.delta)
+        starts, delta = [still, jumped], jnp.zeros_like(state.motion.delta)
+        if config.warm_start:
+            starts += [going, going.at[:, :3].set(jumped[:, :3])]
+            delta = state.motion.delta
+        aligned = search(jnp.stack(starts), points, centers, frame, config.align)
+        begun = Motion(aligned, delta)
         tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
         near = near_background(scene, last, tiles)
         around = near_scene(scene, near, plan.num_near)
         roi = tiles_to_pixels(tiles, frame)
         refine_batch = RefineBatch(around, frame, plan.near, params, centers, roi)
-        refined, info = refine(begun, refine_batch, config.refine)
+        refined, shifts, info = refine(begun, refine_batch, config.refine)
+        if shifts is not None:
+            shifts = spread(near, shifts)
+            scene = shift_background(scene, shifts)
         # Points know nothing of outlines, which rendered images do, so these are overruled only where they
         # went clearly astray; without depth the points hardly know better at all.
         lead = 0.1 if frame.depths is None else 0.01
@@ -173,7 +178,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         full = jnp.maximum(last.meta.needed.max(), solid.meta.needed.max())
         needed = Needed(full, info["needed"], near.sum())
         overflow = needed.exceeds(plan)
-        sound = all_finite(pose) & ~overflow
+        sound = all_finite((pose, shifts)) & ~overflow
         pixels = _pixels(frame, solid, num_objects, config)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
@@ -183,16 +188,32 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "overflow": overflow,
             "needed": needed,
             "skipped": ~sound,
-            "score": match.score,
+            "score": score,
             "found": found,
             "visible": visible,
             "residual": jnp.where(better, of_refined, of_begun),
             "motion": kept,
             "rendered": solid,
+            "background": shifts,
         }
         return pose, new_state, info
 
     return Step(init, update)
+
+
+def _match(last: Rendered, frame: Frame, num_objects: int, config: TrackerConfig, reduction: int):
+    """Where template matching says that each group has gone, whether it found it, and its scores [C, K]."""
+    if config.match.min_score > 1:  # which no correlation is
+        num_cameras = len(frame.images)
+        return (
+            jnp.zeros((num_objects, 3)),
+            jnp.zeros(num_objects, bool),
+            jnp.zeros((num_cameras, num_objects)),
+        )
+    assert last.features is not None
+    labels = last.features[..., 1:]
+    match = match_templates(last.colors, last.depths, labels, frame, config.match, reduction)
+    return *lift(match, frame, config.match), match.score
 
 
 def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "m"]) -> Motion:

@@ -14,7 +14,7 @@ from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.grow import empty_slots, grow, with_slots
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
-from gsjax.methods.object_tracker.region import TrackerPlan
+from gsjax.methods.object_tracker.region import TrackerPlan, shift_background
 from gsjax.methods.object_tracker.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.methods.object_tracker.tracker import (
     TrackerBatch,
@@ -87,7 +87,9 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
     tracker = object_tracker(config, num_objects, batch, reduction)
     with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
         pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
-    rendered, scene = info.pop("rendered"), batch.scene
+    rendered, background, scene = info.pop("rendered"), info.pop("background"), batch.scene
+    if background is not None:
+        scene = keep_if(~info["skipped"], shift_background(scene, background), scene)
     info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
     if config.grow.slots and frame.depths is not None:
         grown = grow(scene, pose, rendered, frame, state.count, config.grow)

@@ -1,0 +1,91 @@
+"""What no implementation could undercut: exp for every pair, and moving the inputs and outputs once."""
+
+import math
+from collections.abc import Sequence
+from functools import cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.timing import sample
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.projection import project_gaussians
+
+TILE = 16  # of the rectangles, whatever tiles the rasterizer uses
+BLOCK = 2**20  # float32 values in 4 MB, which stay in cache
+PASSES = 32
+COPY = 2**26  # float32 values in 256 MB, which do not
+CALM = 1.25  # a floor that changed by more than this while a workload ran makes it noisy
+
+
+class Floors(NamedTuple):
+    """Of the machine at one moment."""
+
+    exp_ns: float  # nanoseconds of exp for one float32
+    copy_gb_s: float  # gigabytes read, and as many written, in a second
+
+    def exp_ms(self, rectangle_pairs: int) -> float:
+        """Time of exp alone over all pixels of the rectangles' tiles."""
+        return 1e-6 * self.exp_ns * rectangle_pairs * TILE * TILE
+
+    def copy_ms(self, num_bytes: int) -> float:
+        """Time to copy that many bytes."""
+        return 1e-6 * num_bytes / self.copy_gb_s
+
+
+@cache
+def _programs():
+    # Negation, because XLA would leave out a copy that changes nothing; it splits this one over all cores.
+    exp = jax.jit(
+        lambda x: jax.lax.fori_loop(0, PASSES, lambda _, y: jnp.exp(-y), x),
+        compiler_options=host_options() or None,
+    )
+    return exp, jax.jit(jnp.negative)
+
+
+def measure_floors(repeats: int = 9) -> Floors:
+    """Both floors now, on all cores."""
+    exp, copy = _programs()
+    block, large = jnp.linspace(0.0, 1.0, BLOCK), jnp.ones(COPY)
+    exp_s = float(np.median(sample(lambda _: exp(block), repeats)))
+    copy_s = float(np.median(sample(lambda _: copy(large), 3)))
+    return Floors(1e9 * exp_s / (PASSES * BLOCK), 1e-9 * large.nbytes / copy_s)
+
+
+def between(before: Floors, after: Floors) -> Floors:
+    """The geometric mean: what to hold the calls between two measurements against."""
+    return Floors(*(math.sqrt(a * b) for a, b in zip(before, after, strict=True)))
+
+
+def is_calm(before: Floors, after: Floors) -> bool:
+    """Whether the exp floor stayed within 25 % of itself."""
+    return max(before.exp_ns, after.exp_ns) <= CALM * min(before.exp_ns, after.exp_ns)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _project(means, quats, scales, opacities, viewmat, K, plan: Plan):
+    usable = jnp.ones(len(means), bool)
+    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan)
+    return projected.means2d, projected.extents, projected.visible
+
+
+def rectangle_pairs(gaussians: Sequence, viewmat, K, width: int, height: int) -> int:
+    """16x16 tiles in the bounding boxes of all visible Gaussians, added up.
+
+    This counts what a plain rasterizer would draw, so it depends on the scene alone, not on how we cull.
+
+    Args:
+        gaussians: means, quats, scales, opacities.
+        viewmat, K: of one camera, [4, 4] and [3, 3].
+        width, height: of its image.
+    """
+    projected = _project(*gaussians, viewmat, K, Plan(width, height, capacity=0))
+    means2d, extents, visible = map(np.asarray, projected)
+    tiles = -(-np.array([width, height]) // TILE)
+    first = np.clip(np.floor((means2d - extents) / TILE), 0, tiles)
+    last = np.clip(np.ceil((means2d + extents) / TILE), 0, tiles)
+    counts = np.prod((last - first).astype(np.int64), axis=1)
+    return int(counts[visible].sum())

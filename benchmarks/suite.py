@@ -1,0 +1,200 @@
+"""Runs the workloads, prints as it goes, and keeps the results on disk after each one."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks import machine
+from benchmarks.floors import TILE, Floors, is_calm, measure_floors
+from benchmarks.growth import draw_growth, write_growth
+from benchmarks.measure import measure
+from benchmarks.metrics import FAILING, Metric, compare, make_record, merged
+from benchmarks.pages import STEP_COLUMNS, bottom_line, markdown, print_comparison, print_rows
+from benchmarks.programs import BACKWARD, FORWARD, JVP
+from benchmarks.steps import STEPS, measure_step
+from benchmarks.workloads import QUICK, SUITE, Workload, choose
+from gsjax.io.atomic import atomic_write, write_json
+
+RESULTS = Path(__file__).parent / "results"
+PART = Path("runs/bench")
+REPEATS, QUICK_REPEATS = 15, 5
+FLAT_FROM = 10**6  # pixel pairs; smaller calls cost what a call costs
+
+
+class Run:
+    """What a run has found so far, and where it stands on disk."""
+
+    def __init__(self, out: Path, complete: bool, repeats: int):
+        self.out, self.complete, self.repeats = out, complete, repeats
+        self.rows: list[dict[str, Any]] = []
+        self.steps: list[dict[str, Any]] = []
+        self.metrics: list[Metric] = []
+        self.floors: dict[str, list[Floors]] = {}
+        self.notes: list[str] = []
+        self.sweeps: dict[str, tuple[str, ...]] = {}
+
+    def record(self, finished: bool) -> dict[str, Any]:
+        """Everything, as bench.json has it."""
+        flat, complete = flatness(self.rows), self.complete and finished
+        metrics = list(self.metrics)
+        if complete:  # of a part of the suite it would be another figure
+            noisy = any(row["noisy"] for row in self.rows)
+            for program, found in flat.items():
+                metrics.append(Metric(f"flatness/{program}", found["ratio"], "x", "lower", 0.2, True, noisy))
+        return make_record(
+            metrics,
+            rows=self.rows,
+            steps=self.steps,
+            flatness=flat,
+            floors={name: [f._asdict() for f in found] for name, found in self.floors.items()},
+            notes=self.notes,
+            complete=complete,
+            repeats=self.repeats,
+        )
+
+    def write(self, finished: bool = False) -> dict[str, Any]:
+        """Write bench.json, results.md and growth.png, each whole or not at all."""
+        record, drawing = self.record(finished), draw_growth(self.rows, self.sweeps)
+        write_sorted(self.out / "bench.json", record)
+        if drawing is not None:
+            write_growth(drawing, self.out / "growth.png")
+        page = markdown({**record, "has_figure": drawing is not None}, machine.in_words())
+        with atomic_write(self.out / "results.md") as temporary:
+            temporary.write_text(page, encoding="utf-8")
+        return record
+
+
+def flatness(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The dearest rectangle pixel pair over the cheapest, of large calls with plain colours, by program."""
+    found = {}
+    for program in (FORWARD, BACKWARD, JVP):
+        large = [
+            row
+            for row in rows
+            if row["program"] == program
+            and row["channels"] == 3
+            and row["rectangle_pairs"] * TILE * TILE >= FLAT_FROM
+        ]
+        large.sort(key=lambda row: row["ns_per_rectangle_pixel"])
+        if len(large) > 1:
+            cheapest, dearest = large[0], large[-1]
+            found[program] = {
+                "ratio": dearest["ns_per_rectangle_pixel"] / cheapest["ns_per_rectangle_pixel"],
+                "cheapest": cheapest["workload"],
+                "dearest": dearest["workload"],
+            }
+    return found
+
+
+def write_sorted(path: Path, record: dict[str, Any]) -> None:
+    """As JSON with sorted keys, so that two records can be compared line by line."""
+    write_json(path, json.loads(json.dumps(record, sort_keys=True)))
+
+
+def baseline_path(device: str) -> Path:
+    """Each kind of device has its own: ratios do not travel from a CPU to a GPU."""
+    return RESULTS / ("baseline.json" if device == "cpu" else "baseline-gpu.json")
+
+
+def read_baseline(path: Path) -> dict[str, Any] | None:
+    """The committed baseline, or None.
+
+    Raises:
+        ValueError: it is no JSON.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        advice = "restore it from git"
+        raise ValueError(f"{path}: expected a baseline as JSON, found {error}; {advice}") from error
+
+
+def run(options: Any, suite: list[Workload] | None = None) -> int:
+    """The command: see `gsjax.cli.bench.Options`. Returns the exit code.
+
+    Raises:
+        ValueError: what was asked cannot be done.
+    """
+    suite = (QUICK if options.quick else SUITE) if suite is None else suite
+    known = {workload.name: workload for workload in suite}
+    chosen = choose([*known, *STEPS], options.only)
+    usual = QUICK_REPEATS if options.quick else REPEATS
+    repeats = usual if options.repeats is None else options.repeats
+    if repeats < 1:
+        raise ValueError(f"--repeats: expected 1 or more, found {repeats}")
+    complete = not options.quick and not options.only
+    path = baseline_path(machine.describe()["device"])
+    baseline = read_baseline(path)
+    if options.check and baseline is None:
+        raise ValueError(f"--check: there is no baseline at {path}; --update-baseline makes one")
+    out = options.out or (RESULTS if complete else PART)
+    # Not a terminal: lines stay whole, so that other programs can read them.
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
+    console.print(f"{machine.in_words()}; up to {repeats} calls each")
+    found, finished = Run(out, complete, repeats), False
+    try:
+        _run_all(chosen, known, repeats, found, console)
+        finished = True
+    except KeyboardInterrupt:
+        console.print("[bold red]stopped:[/] by Ctrl-C; what was measured until then is kept")
+    record = found.write(finished)
+    console.print("")
+    for line in bottom_line(record):
+        console.print(line.replace("**", ""), markup=False)
+    code = 0 if finished else 130
+    if baseline is not None:
+        rows = compare(record, baseline)
+        print_comparison(console, rows, baseline)
+        if options.check and finished:
+            code = int(any(row.verdict in FAILING for row in rows))
+    if options.update_baseline and finished:
+        write_sorted(path, merged(record, baseline))
+        console.print(f"[bold]baseline[/]  {path}", soft_wrap=True)
+    console.print(f"[bold]results[/]   {out / 'results.md'}", soft_wrap=True)
+    return code
+
+
+def _run_all(
+    chosen: list[str], known: dict[str, Workload], repeats: int, found: Run, console: Console
+) -> None:
+    """Measure what is chosen, in order; disk and screen follow."""
+    floors = None
+    with console.status("") as status:
+        for name in chosen:
+            status.update(name)
+            if name in known:
+                first = not found.rows
+                try:
+                    result = measure(known[name], repeats, say=status.update)
+                except FileNotFoundError as error:
+                    found.notes.append(f"{name}: skipped, {error}")
+                    console.print(f"[yellow]{name}: skipped[/], {error}", soft_wrap=True)
+                    continue
+                rows = result.as_rows()
+                found.rows += rows
+                found.metrics += result.metrics()
+                found.notes += result.notes
+                found.floors[name] = list(result.floors)
+                found.sweeps[name] = known[name].sweeps
+                print_rows(console, rows, head=first)
+                for note in result.notes:
+                    console.print(f"[yellow]{note}[/]", soft_wrap=True)
+            else:
+                before, after = floors or measure_floors(), []
+                row = measure_step(name, repeats, lambda b=before, a=after: _calm_since(b, a))
+                floors = after[0]
+                found.metrics += row.metrics()
+                found.floors[name] = [before, floors]
+                print_rows(console, [row.as_dict()], STEP_COLUMNS, head=not found.steps)
+                found.steps.append(row.as_dict())
+            found.write()
+
+
+def _calm_since(before: Floors, after: list[Floors]) -> bool:
+    after.append(measure_floors())
+    return is_calm(before, after[0])

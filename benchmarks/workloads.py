@@ -1,0 +1,180 @@
+"""What is drawn: gsplat's garden, a trained guitar, and simulated balls that grow."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.io.ply import read_ply
+
+HEAVY_CHANNELS = 64  # from here on three calls must do
+
+
+class Scene(NamedTuple):
+    """Activated Gaussians and one camera, float32."""
+
+    means: jax.Array  # [N, 3]
+    quats: jax.Array  # [N, 4]
+    scales: jax.Array  # [N, 3]
+    opacities: jax.Array  # [N]
+    colors: jax.Array  # [N, 3]
+    features: jax.Array | None  # [N, F]
+    viewmat: jax.Array  # [4, 4]
+    K: jax.Array  # [3, 3]
+
+
+@dataclass(frozen=True)
+class Workload:
+    """One scene and image size.
+
+    Attributes:
+        name: how `--only` calls it.
+        make: makes the scene; raises FileNotFoundError where its data are absent.
+        width, height: of the image.
+        channels: composited: 3 for colours alone, more for that many features beside the colours.
+        repeats: the most timed calls of each program; None leaves it to the run.
+        sweeps: growth plots that it is a point of.
+        variants: also measured under plain `jax.jit`, and without `reads`.
+    """
+
+    name: str
+    make: Callable[[], Scene]
+    width: int
+    height: int
+    channels: int = 3
+    repeats: int | None = None
+    sweeps: tuple[str, ...] = ()
+    variants: bool = False
+
+
+def data_folder() -> Path:
+    """`$GSJAX_DATA`, or `../shared/data` beside the checkout, as the tests have it."""
+    named = os.environ.get("GSJAX_DATA")
+    return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def _data_file(name: str) -> Path:
+    path = data_folder() / name
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no file {path}: point GSJAX_DATA at the folder that holds {Path(name).parent}"
+        )
+    return path
+
+
+def _floats(*arrays) -> list:
+    return [None if a is None else jnp.asarray(a, jnp.float32) for a in arrays]
+
+
+def garden(camera: int) -> Scene:
+    """gsplat's test scene: points of the Mip-NeRF 360 garden, all but places and colours drawn at random."""
+    stored = np.load(_data_file("garden_points/test_garden.npz"))
+    points = stored["means3d"]
+    inside = (np.abs(points) <= 2).all(axis=1)
+    n, rng = int(inside.sum()), np.random.default_rng(42)
+    scales = rng.uniform(1e-4, 0.02, (n, 3))
+    quats = rng.normal(size=(n, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    opacities = rng.uniform(size=n)
+    colors = stored["colors"][inside] / 255
+    view = stored["viewmats"][camera], stored["Ks"][camera]
+    return Scene(*_floats(points[inside], quats, scales, opacities, colors, None, *view))
+
+
+def guitar() -> Scene:
+    """Trained Gaussians (PlayCanvas), seen from 1.5 times their extent; their y points down."""
+    gaussians, _ = read_ply(_data_file("guitar/guitar.compressed.ply"))
+    low, high = np.min(gaussians.means, axis=0), np.max(gaussians.means, axis=0)
+    center, extent = (low + high) / 2, float(np.max(high - low))
+    eye = center + 1.5 * extent * np.array([np.sin(0.5), -0.3, np.cos(0.5)]) / np.hypot(1.0, 0.3)
+    viewmat = look_at(eye, center, up=np.array([0.0, -1.0, 0.0]))
+    colors = jnp.maximum(evaluate_sh(0, gaussians.sh0, gaussians.means), 0.0)
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors)
+    return Scene(*_floats(*arrays, None, viewmat, intrinsics(0.9 * 640, 640, 480)))
+
+
+def ball(num: int, width: int, height: int, channels: int = 3, seed: int = 0) -> Scene:
+    """A ball of small Gaussians that covers much of the image, whatever their number."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(num, 3))
+    radii = rng.uniform(size=(num, 1)) ** (1 / 3)
+    means = directions / np.linalg.norm(directions, axis=1, keepdims=True) * radii
+    scales = np.exp(rng.uniform(np.log(0.3), np.log(1.5), (num, 3))) * 0.7 / num ** (1 / 3)
+    arrays = (means, rng.normal(size=(num, 4)), scales, rng.uniform(0.05, 1, num), rng.uniform(size=(num, 3)))
+    features = rng.normal(size=(num, channels)) if channels > 3 else None
+    viewmat = look_at(np.array([2.2, 0.4, 0.9]), np.zeros(3))
+    return Scene(*_floats(*arrays, features, viewmat, intrinsics(0.9 * width, width, height)))
+
+
+def ball_workload(
+    num: int,
+    size: tuple[int, int],
+    channels: int = 3,
+    sweeps: tuple[str, ...] = (),
+    variants: bool = False,
+) -> Workload:
+    digits = f"{num:.0e}".replace("+0", "")
+    name = f"ball-{digits}-{size[0]}x{size[1]}" + (f"-ch{channels}" if channels > 3 else "")
+    make = partial(ball, num, *size, channels)
+    repeats = 3 if channels >= HEAVY_CHANNELS else None
+    return Workload(name, make, *size, channels, repeats, sweeps, variants)
+
+
+def _sweep(counts, sizes, channels, num: int, size: tuple[int, int], variants: bool) -> list[Workload]:
+    """Counts at one size, sizes at one count, channels at both; the point where they meet comes once."""
+    meeting = ball_workload(num, size, 3, ("gaussians", "pixels", "channels"), variants)
+    return [
+        meeting,
+        *(ball_workload(n, size, 3, ("gaussians",)) for n in counts if n != num),
+        *(ball_workload(num, s, 3, ("pixels",)) for s in sizes if s != size),
+        *(ball_workload(num, size, c, ("channels",)) for c in channels if c != 3),
+    ]
+
+
+VGA, HD = (640, 480), (1920, 1080)
+SUITE = [
+    *(Workload(f"garden-{c}", partial(garden, c), 648, 420, variants=c == 0) for c in range(3)),
+    Workload("guitar", guitar, 640, 480),
+    *_sweep(
+        counts=(1_000, 10_000, 1_000_000),
+        sizes=((160, 120), (320, 240), (1280, 720), HD),
+        channels=(16, 64, 512),
+        num=100_000,
+        size=VGA,
+        variants=True,
+    ),
+    ball_workload(1_000_000, HD),
+]
+QUICK = _sweep(
+    counts=(1_000,),
+    sizes=((160, 120),),
+    channels=(16,),
+    num=10_000,
+    size=(320, 240),
+    variants=False,
+)
+
+
+def choose(names: Sequence[str], patterns: Sequence[str]) -> list[str]:
+    """Those of `names` that `patterns` ask for: a name, its part before the first hyphen, or a glob.
+
+    Raises:
+        ValueError: a pattern fits none.
+    """
+    for pattern in patterns:
+        if not any(_fits(name, pattern) for name in names):
+            raise ValueError(f"--only: no workload is called {pattern!r}; there are {', '.join(names)}")
+    return [n for n in names if not patterns or any(_fits(n, p) for p in patterns)]
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern) or name.split("-")[0] == pattern
