@@ -1,6 +1,6 @@
 """gsjax: moving scenes from 3D Gaussians, in pure JAX.
 
-rasterize   rasterization, plan, Plan, composite_tile
+rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 data        open_sequence, Sequence
 tracking    start_scene, scene_from_shapes, track, object_tracker, TrackerConfig
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
     from gsjax.rasterize.rasterization import plan, rasterization
+    from gsjax.rasterize.sharding import sharded_rasterization
     from gsjax.scene.frame import Frame
     from gsjax.scene.gaussians import Gaussians, Tags
     from gsjax.scene.render import plan_render, render
@@ -45,6 +46,7 @@ _HOMES = {
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),
     "gsjax.rasterize.rasterization": ("plan", "rasterization"),
+    "gsjax.rasterize.sharding": ("sharded_rasterization",),
     "gsjax.scene.frame": ("Frame",),
     "gsjax.scene.gaussians": ("Gaussians", "Tags"),
     "gsjax.scene.render": ("plan_render", "render"),
@@ -68,6 +70,7 @@ __all__ = [
     "read_ply",
     "render",
     "scene_from_shapes",
+    "sharded_rasterization",
     "start_scene",
     "track",
     "write_ply",

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
@@ -163,23 +163,14 @@ def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
 
     The ellipse A dx^2 + 2 B dx dy + C dy^2 = t reaches furthest to the right at dy = -(B/C) h_x, as a
     concave function of dy; so within a band of rows it does so at the nearest dy of the band, and likewise
-    to the left.
+    to the left. At dy it is -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)) wide.
     """
-    u, v = (projected.means2d[:, i][gaussian] for i in range(2))
-    a, b, c = (projected.conics[:, i][gaussian] for i in range(3))
-    half_x, half_y = (projected.extents[:, i][gaussian] for i in range(2))
-    level = 2 * jnp.log(jnp.maximum(projected.opacities / plan.alpha_min, 1.0))
-    level = level[gaussian] * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
-
-    tiny = jnp.finfo(u.dtype).tiny
+    u, v, half_x, half_y, furthest, slope, width = (a[gaussian] for a in _ellipses(projected, plan))
     top = row * plan.tile_size + 0.5 - v
     low, high = jnp.maximum(top, -half_y), jnp.minimum(top + (plan.tile_size - 1), half_y)
-    furthest = -b / jnp.maximum(c, tiny) * half_x
-    slope = -b / jnp.maximum(a, tiny)
 
     def reach(dy):
-        share = jnp.maximum(1 - (dy / half_y) ** 2, 0.0)
-        return jnp.sqrt(level * share / jnp.maximum(a, tiny))
+        return width * jnp.sqrt(jnp.maximum(1 - (dy / half_y) ** 2, 0.0))
 
     at_right, at_left = jnp.clip(furthest, low, high), jnp.clip(-furthest, low, high)
     slack = 1e-3 + 16 * jnp.finfo(u.dtype).eps * (jnp.abs(u) + half_x)
@@ -191,6 +182,17 @@ def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
     empty = (low > high) | (first > last)
     start = _tile_of(first, plan, plan.tiles_x)
     return start, jnp.where(empty, start, _tile_of(last, plan, plan.tiles_x) + 1)
+
+
+def _ellipses(projected: Projected, plan: Plan) -> tuple[Float[Array, "n"], ...]:
+    """u, v, h_x, h_y, -(B/C) h_x, -(B/A) and sqrt(t/A) of every Gaussian, t = 2 ln(o / alpha_min)."""
+    a, b, c = (projected.conics[:, i] for i in range(3))
+    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
+    level = 2 * jnp.log(jnp.maximum(projected.opacities / plan.alpha_min, 1.0))
+    level = level * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
+    (u, v), (half_x, half_y) = projected.means2d.T, projected.extents.T
+    furthest = -b / jnp.maximum(c, tiny) * half_x
+    return u, v, half_x, half_y, furthest, -b / jnp.maximum(a, tiny), jnp.sqrt(level / jnp.maximum(a, tiny))
 
 
 def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):

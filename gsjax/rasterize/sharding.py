@@ -1,4 +1,4 @@
-"""Cameras and scenes over a mesh of devices, or of processes: each device draws its own, Gaussians are shared.
+"""Cameras and scenes over a mesh of devices: each device draws its own, Gaussians are shared.
 
 Every camera's image depends on that camera and its scene alone, so drawing needs no communication. Only the
 backward pass does: a Gaussian that many devices drew receives the sum of what they have to say.
@@ -78,12 +78,12 @@ def sharded_rasterization(
 
 
 def _shape_of(array):
-    """What the checks look at: not how the array is split over an explicit mesh, which their reshapes mind."""
+    """What the checks look at, without how the array is split over an explicit mesh: their reshapes mind."""
     return jax.ShapeDtypeStruct(array.shape, array.dtype) if hasattr(array, "dtype") else array
 
 
 def _placed(array, mesh: Mesh, spec: P):
-    """The array split as `spec` says where types carry that (explicit mesh axes); elsewhere XLA sees to it."""
+    """The array split as `spec` says, where types carry that (explicit mesh axes); else XLA sees to it."""
     if array is None or AxisType.Explicit not in mesh.axis_types:
         return array
     return jax.reshard(array, NamedSharding(mesh, spec))
@@ -99,29 +99,22 @@ def _names(what: str, axes: AxisNames | None, mesh: Mesh) -> tuple[str, ...]:
 
 def _check_divides(arrays: dict[str, Any], mesh: Mesh, cameras, scenes) -> None:
     means, viewmats = arrays["means"], arrays["viewmats"]
-    parts = math.prod(mesh.shape[name] for name in cameras)
-    count = viewmats.shape[-3]
-    if count % parts:
-        raise ValueError(
-            f"viewmats holds {count} cameras, which do not divide evenly over the {parts} devices of mesh axis "
-            f"{_quoted(cameras)}; repeat a camera in viewmats, Ks and all else that has one entry a camera until "
-            f"there are {-(-count // parts) * parts}, and weigh the repeated ones with 0 in the loss, or use a "
-            f"mesh whose axis divides {count}"
-        )
-    if not scenes:
-        return
-    if means.ndim == 2:
+    _check_even("viewmats", "cameras", viewmats.shape[-3], mesh, cameras)
+    if scenes and means.ndim == 2:
         raise ValueError(
             f"means has no leading axis to split over mesh axis {_quoted(scenes)}; got shape {means.shape}, "
             "wanted (B, N, 3). One scene is split by its cameras: cameras=... in place of scenes=..."
         )
-    parts = math.prod(mesh.shape[name] for name in scenes)
-    count = means.shape[0]
+    _check_even("means", "scenes", means.shape[0], mesh, scenes)
+
+
+def _check_even(argument: str, things: str, count: int, mesh: Mesh, axes: tuple[str, ...]) -> None:
+    parts = math.prod(mesh.shape[name] for name in axes)  # 1 where they are not split
     if count % parts:
         raise ValueError(
-            f"means holds {count} scenes, which do not divide evenly over the {parts} devices of mesh axis "
-            f"{_quoted(scenes)}; repeat a scene in every array until there are {-(-count // parts) * parts}, and "
-            f"weigh the repeated ones with 0 in the loss, or use a mesh whose axis divides {count}"
+            f"{argument} holds {count} {things}, which do not divide evenly over the {parts} devices of mesh "
+            f"axis {_quoted(axes)}. Take a mesh whose axis divides {count}; or repeat one of the {things} in "
+            f"every argument until there are {-(-count // parts) * parts}, and leave copies out of the loss"
         )
 
 
@@ -147,7 +140,7 @@ def _draw(arrays: dict[str, Any], mesh: Mesh, cameras, scenes, plan: Plan):
     def own_part(arrays):
         return rasterization(**arrays, width=plan.width, height=plan.height, plan=plan)
 
-    # Loops inside start from constants, which are the same everywhere, and end with what differs; the check of
-    # varying axes refuses that. Without it every gradient of a shared input is summed, which is what we want.
+    # Loops inside start from constants, which are the same everywhere, and end with what differs; the check
+    # of varying axes refuses that. Without it gradients of shared inputs are summed all the same.
     split = jax.shard_map(own_part, mesh=mesh, in_specs=(specs,), out_specs=per_camera, check_vma=False)
     return split({name: _placed(array, mesh, specs[name]) for name, array in arrays.items()})
