@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes, slots
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
 from gsjax.rasterize.sorting import argsort_keys, sort_keys
@@ -32,9 +33,9 @@ class TileLists(NamedTuple):
 class _Spans(NamedTuple):
     """One Gaussian in one row of tiles: the columns it covers there."""
 
-    gaussian_rank: Int[Array, "rows"]
-    first_tile: Int[Array, "rows"]
-    count: Int[Array, "rows"]  # columns; 0 in an unused slot
+    gaussian_rank: Int[Array, "rows lanes"]
+    first_tile: Int[Array, "rows lanes"]
+    count: Int[Array, "rows lanes"]  # columns; 0 in an unused slot
 
 
 def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan) -> TileLists:
@@ -81,7 +82,7 @@ def needed_capacity(
     return jnp.maximum(_total(spans.count), _doubled(rows))
 
 
-def _total(counts: Int[Array, "n"]) -> Int[Array, ""]:
+def _total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
     """Sum that saturates at the largest int32: 2.2e9 pairs have been seen in the wild."""
     estimate = counts.astype(jnp.float32).sum()
     return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
@@ -100,7 +101,7 @@ def _depth_order(projected: Projected, plan: Plan) -> Int[Array, "n"]:
     return argsort_keys(jax.lax.bitcast_convert_type(depths, jnp.uint32), plan.sort)
 
 
-def _tile_of(position: Array, plan: Plan, limit: int) -> Int[Array, "n"]:
+def _tile_of(position: Array, plan: Plan, limit: int) -> Int[Array, "*n"]:
     """Index of the tile at a pixel position, from -1 to `limit`."""
     # Clipped as floats: an int32 cannot hold every float.
     return jnp.clip(jnp.floor(position / plan.tile_size), -1, limit).astype(jnp.int32)
@@ -134,19 +135,19 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
     return jnp.maximum(_total(columns * rows), _doubled(_total(rows)))
 
 
-def _repeat(values: Array, starts: Int[Array, "n"], size: int) -> Array:
+def _repeat(values: Array, starts: Int[Array, "n"], slot: Int[Array, "rows lanes"]) -> Array:
     """`values[i]` in slots from `starts[i]` to the next start; integers, whose differences may wrap."""
     steps = jnp.diff(values, prepend=jnp.zeros(1, values.dtype))
-    return jnp.cumsum(jnp.zeros(size, values.dtype).at[starts].add(steps, mode="drop"), dtype=values.dtype)
+    summed = jnp.zeros(slot.size, values.dtype).at[starts].add(steps, mode="drop")
+    return jnp.cumsum(summed, dtype=values.dtype).reshape(slot.shape)
 
 
 def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:
     """Lay out the rows of all Gaussians, and find the columns that each covers in them."""
-    size = max(1, plan.capacity // 2)
+    slot = slots(plan.capacity // 2)
     ends = jnp.cumsum(num_rows)
     starts = ends - num_rows
-    slot = jnp.arange(size, dtype=jnp.int32)
-    rank = _repeat(jnp.arange(num_rows.shape[0], dtype=jnp.int32), starts, size)
+    rank = _repeat(jnp.arange(num_rows.shape[0], dtype=jnp.int32), starts, slot)
     row = slot + (first_row - starts)[rank]
     low, high = _columns_in_row(projected, by_depth[rank], row, plan)
     count = jnp.where(slot < ends[-1], jnp.maximum(high - low, 0), 0)
@@ -184,23 +185,25 @@ def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
     return start, jnp.where(empty, start, _tile_of(last, plan, plan.tiles_x) + 1)
 
 
-def _ellipses(projected: Projected, plan: Plan) -> tuple[Float[Array, "n"], ...]:
+def _ellipses(projected: Projected, plan: Plan) -> list[Float[Array, "n"]]:
     """u, v, h_x, h_y, -(B/C) h_x, -(B/A) and sqrt(t/A) of every Gaussian, t = 2 ln(o / alpha_min)."""
-    a, b, c = (projected.conics[:, i] for i in range(3))
+    a, b, c = columns_in_lanes(projected.conics)
     tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
-    level = 2 * jnp.log(jnp.maximum(projected.opacities / plan.alpha_min, 1.0))
+    level = 2 * jnp.log(jnp.maximum(in_lanes(projected.opacities) / plan.alpha_min, 1.0))
     level = level * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
-    (u, v), (half_x, half_y) = projected.means2d.T, projected.extents.T
-    furthest = -b / jnp.maximum(c, tiny) * half_x
-    return u, v, half_x, half_y, furthest, -b / jnp.maximum(a, tiny), jnp.sqrt(level / jnp.maximum(a, tiny))
+    (u, v), (half_x, half_y) = (columns_in_lanes(x) for x in (projected.means2d, projected.extents))
+    furthest, slope = -b / jnp.maximum(c, tiny) * half_x, -b / jnp.maximum(a, tiny)
+    width = jnp.sqrt(level / jnp.maximum(a, tiny))
+    n = len(projected.opacities)
+    return [flat(x, n) for x in (u, v, half_x, half_y, furthest, slope, width)]
 
 
 def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
     """(tile, Gaussian) of every pair in order of (tile, depth); unused slots hold the tile past the last."""
-    size, num_tiles, n = plan.capacity, plan.num_tiles, by_depth.shape[0]
-    ends = jnp.cumsum(spans.count)
-    starts = ends - spans.count
-    slot = jnp.arange(size, dtype=jnp.int32)
+    num_tiles, n = plan.num_tiles, by_depth.shape[0]
+    slot, count = slots(plan.capacity), spans.count.ravel()
+    ends = jnp.cumsum(count)
+    starts = ends - count
 
     def is_used(tile):
         used = slot < ends[-1]
@@ -208,18 +211,19 @@ def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
             used &= tile_mask[jnp.minimum(tile, num_tiles - 1)]
         return used
 
-    base = spans.first_tile - starts
+    base = spans.first_tile - starts.reshape(spans.count.shape)
     rank_bits = max(1, (n - 1).bit_length())
     if rank_bits + num_tiles.bit_length() > 32:
-        rank = _repeat(spans.gaussian_rank, starts, size)
-        tile = _repeat(base, starts, size) + slot
-        tile = jnp.where(is_used(tile), tile, num_tiles)
+        rank = _repeat(spans.gaussian_rank.ravel(), starts, slot)
+        tile = _repeat(base.ravel(), starts, slot) + slot
+        tile = jnp.where(is_used(tile), tile, num_tiles).ravel()
         order = argsort_keys(tile.astype(jnp.uint32), plan.sort)
-        return tile[order], by_depth[rank[order]]
+        return tile[order], by_depth[rank.ravel()[order]]
     # One key holds both. Sums modulo 2^32 are exact, since the key itself fits.
     key = (base.astype(jnp.uint32) << rank_bits) + spans.gaussian_rank.astype(jnp.uint32)
-    key = _repeat(key, starts, size) + (slot.astype(jnp.uint32) << rank_bits)
+    key = _repeat(key.ravel(), starts, slot) + (slot.astype(jnp.uint32) << rank_bits)
     used = is_used((key >> rank_bits).astype(jnp.int32))
-    key = sort_keys(jnp.where(used, key, jnp.uint32(num_tiles << rank_bits)), plan.sort)
+    key = jnp.where(used, key, jnp.uint32(num_tiles << rank_bits))
+    key = sort_keys(key.ravel(), plan.sort).reshape(slot.shape)
     rank = key & jnp.uint32((1 << rank_bits) - 1)
-    return (key >> rank_bits).astype(jnp.int32), by_depth[rank.astype(jnp.int32)]
+    return (key >> rank_bits).astype(jnp.int32).ravel(), by_depth[rank.astype(jnp.int32)].ravel()

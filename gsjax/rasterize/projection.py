@@ -11,9 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import MIN_SQUARED_NORM
+from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes
 from gsjax.rasterize.plan import Plan
 
 MIN_COMPENSATION = 0.005  # floor of the antialiasing factor
+HEADROOM = 1e8  # by so much less than the largest float are variances and determinants that are drawn
 
 
 class Projected(NamedTuple):
@@ -28,22 +30,16 @@ class Projected(NamedTuple):
     culled: Int[Array, ""]  # rows refused for their values: not finite, no rotation, no area
 
 
-def _finite_rows(*arrays: Float[Array, "n ..."]) -> Bool[Array, "n"]:
-    flags = [jnp.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays]
-    return jnp.stack(flags).all(axis=0)
+def _all_finite(columns: list[Array]) -> Bool[Array, "rows lanes"]:
+    return jnp.stack([jnp.isfinite(c) for c in columns]).all(axis=0)
 
 
-def _stored(flags: Bool[Array, "n"]) -> Bool[Array, "n"]:
+def _stored(flags: Bool[Array, "rows lanes"]) -> Bool[Array, "rows lanes"]:
     """The same flags, stored: XLA:CPU would work them out again in each of the places where they are used.
 
     It does so with everything but what it deems expensive, such as a square root; barriers it drops.
     """
     return jnp.sqrt(flags.astype(jnp.float32)) > 0.5
-
-
-def _columns(a: Float[Array, "n k"]) -> list[Float[Array, "n"]]:
-    """Columns apart: arithmetic on whole columns is what a CPU vectorises."""
-    return [a[:, i] for i in range(a.shape[1])]
 
 
 def _rotate(matrix: Float[Array, "3 3"], vector: list) -> list:
@@ -55,9 +51,24 @@ def _to_camera(means, viewmat):
     return [c + viewmat[i, 3] for i, c in enumerate(_rotate(viewmat[:3, :3], means))]
 
 
+@jax.custom_jvp
+def _quotient(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """a / b whose derivative does not square b: the determinant of a needle is 1e26."""
+    return a / b
+
+
+@_quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    ratio = a / b
+    return ratio, (da - ratio * db) / b
+
+
 def _rotation_columns(quats):
     """Columns of the rotation matrices of (not necessarily unit) quaternions."""
-    w, x, y, z = quats
+    # Their length first, by a number near to it: the derivative of rsqrt holds its cube.
+    largest = jax.lax.stop_gradient(jnp.stack([jnp.abs(c) for c in quats]).max(axis=0))
+    w, x, y, z = (c / largest for c in quats)
     unit = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * unit, x * unit, y * unit, z * unit
     return (
@@ -81,8 +92,8 @@ def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
     for axis, scale in zip(_rotation_columns(quats), scales, strict=True):
         in_x, in_y, in_z = _rotate(viewmat[:3, :3], axis)
         slope_y = in_y - ty * in_z
-        row_u.append((fx * (in_x - tx * in_z) + skew * slope_y) * scale / z)
-        row_v.append(fy * slope_y * scale / z)
+        row_u.append(_quotient((fx * (in_x - tx * in_z) + skew * slope_y) * scale, z))
+        row_v.append(_quotient(fy * slope_y * scale, z))
 
     def dot(a, b):
         return sum(p * q for p, q in zip(a, b, strict=True))
@@ -93,10 +104,10 @@ def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
     eps = plan.eps2d
     det_blurred = det + eps * (xx + yy) + eps * eps
     xx, yy = xx + eps, yy + eps
-    conics = [yy / det_blurred, -xy / det_blurred, xx / det_blurred]
+    conics = [_quotient(c, det_blurred) for c in (yy, -xy, xx)]
     if plan.rasterize_mode == "antialiased":
-        opacities = opacities * jnp.sqrt(jnp.maximum(det / det_blurred, MIN_COMPENSATION**2))
-    means2d = [(fx * x + skew * y) / z + cx, fy * y / z + cy]
+        opacities = opacities * jnp.sqrt(jnp.maximum(_quotient(det, det_blurred), MIN_COMPENSATION**2))
+    means2d = [_quotient(fx * x + skew * y, z) + cx, _quotient(fy * y, z) + cy]
     return means2d, conics, opacities, [xx, yy], det_blurred
 
 
@@ -118,57 +129,72 @@ def project_gaussians(
     values alone; then the same arithmetic runs on inputs in which such rows were replaced. `usable` marks
     rows whose colours can be drawn.
     """
-    camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & (K[0, 0] * K[1, 1] != 0)
+    n = means.shape[0]
+    # The gradients of x/z's bounds hold 1 / focal^2. A focal length of 0 fails too.
+    slopes = jnp.stack([c / (f * f) for f in (K[0, 0], K[1, 1]) for c in (1.0, K[0, 2], K[1, 2])])
+    camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & jnp.isfinite(slopes).all()
     viewmat = jnp.where(camera_finite, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(camera_finite, K, jnp.eye(3, dtype=K.dtype))
-    sound = _finite_rows(means, quats, scales, opacities) & usable & camera_finite
-    if means2d_offset is not None:
-        sound &= _finite_rows(means2d_offset)
+    means, quats, scales = (columns_in_lanes(a) for a in (means, quats, scales))
+    opacities, usable = in_lanes(opacities), in_lanes(usable)
+    offset = [] if means2d_offset is None else columns_in_lanes(means2d_offset)
+    sound = _all_finite([*means, *quats, *scales, opacities, *offset]) & usable & camera_finite
     # Unlike jnp.clip this hands the whole gradient on at exactly 0 and 1.
     opacities = jnp.where(opacities < 0, 0.0, jnp.where(opacities > 1, 1.0, opacities))
 
-    means, quats, scales = (_columns(a) for a in (means, quats, scales))
-
     # First on values alone: which rows can be drawn, and how far they reach.
-    values = jax.lax.stop_gradient((means, quats, scales, opacities, viewmat, K, means2d_offset))
+    values = jax.lax.stop_gradient((means, quats, scales, opacities, viewmat, K))
     local = _to_camera(values[0], values[4])
-    means2d, conics, alphas, variances, det = _project_local(local, *values[1:6], plan)
-    means2d = jnp.stack(means2d, axis=-1) + (0.0 if means2d_offset is None else values[6])
+    z = local[2]
+    (u, v), conics, alphas, variances, det = _project_local(local, *values[1:], plan)
+    if offset:
+        du, dv = jax.lax.stop_gradient(offset)
+        u, v = u + du, v + dv
     squared = sum(c * c for c in values[1])
     sound &= (squared >= MIN_SQUARED_NORM) & jnp.isfinite(squared)
     # The gradient of 1 / det holds its square. A det of 0, infinity or NaN fails too.
-    finite = [jnp.isfinite(c) for c in (*conics, *variances, det, 1 / (det * det))]
-    has_area = jnp.isfinite(means2d).all(axis=1) & jnp.stack(finite).all(axis=0)
-    z = local[2]
+    large = [HEADROOM * c for c in (*variances, det)]  # and what the gradients multiply them with
+    has_area = _all_finite([u, v, *conics, *large, 1 / (det * det)])
     in_range = (z > plan.near_plane) & (z < plan.far_plane)
-    culled = jnp.sum(~sound | (in_range & ~has_area))
+    culled = flat(~sound | (in_range & ~has_area), n).sum(dtype=jnp.int32)
 
     # The box in which alpha = o exp(-q/2) reaches alpha_min, that is q <= 2 ln(o / alpha_min).
     reach = 2 * jnp.log(jnp.maximum(alphas / plan.alpha_min, 1e-30))
-    half = jnp.sqrt(jnp.maximum(reach, 0.0)[:, None] * jnp.stack(variances, axis=-1))
-    half = half * 1.0001 + 1e-3  # rounding must not shave a pixel off
-    size = jnp.array([plan.width, plan.height], means2d.dtype)
-    in_frame = ((means2d + half > 0) & (means2d - half < size)).all(axis=1)
-    visible = sound & in_range & has_area & (reach > 0) & in_frame
-    visible = _stored(visible)
+    # Rounding must not shave a pixel off.
+    half_x, half_y = (jnp.sqrt(jnp.maximum(reach, 0.0) * c) * 1.0001 + 1e-3 for c in variances)
+    in_frame = (u + half_x > 0) & (u - half_x < plan.width) & (v + half_y > 0) & (v - half_y < plan.height)
+    visible = _stored(sound & in_range & has_area & (reach > 0) & in_frame)
 
     # Then in earnest, on inputs whose other rows are harmless: their gradients are zero, and never 0 * inf.
-    def kept(columns, harmless):
+    # What is harmless depends on the camera: the first row it sees is. One that sees nothing is replaced.
+    sees = visible.any()
+    viewmat = jnp.where(sees, viewmat, jnp.eye(4, dtype=viewmat.dtype))
+    K = jnp.where(sees, K, jnp.eye(3, dtype=K.dtype))
+
+    def kept(columns, harmless, seen=None):
+        if seen is not None and visible.size:
+            first = jnp.argmax(visible)
+            harmless = [jnp.where(sees, c.ravel()[first], h) for c, h in zip(seen, harmless, strict=True)]
         return [jnp.where(visible, c, h) for c, h in zip(columns, harmless, strict=True)]
 
-    quats, scales = kept(quats, (1.0, 0.0, 0.0, 0.0)), kept(scales, (1.0, 1.0, 1.0))
+    quats = kept(quats, (1.0, 0.0, 0.0, 0.0), values[1])
+    scales = kept(scales, (1.0, 1.0, 1.0), values[2])
     opacities = jnp.where(visible, opacities, 0.0)
-    local = kept(_to_camera(kept(means, (0.0, 0.0, 0.0)), viewmat), (0.0, 0.0, 1.0))
+    means = kept(means, (0.0, 0.0, 0.0), values[0])
+    local = kept(_to_camera(means, viewmat), (0.0, 0.0, 1.0), local)
     means2d, conics, opacities, _, _ = _project_local(local, quats, scales, opacities, viewmat, K, plan)
-    means2d = jnp.stack(means2d, axis=-1)
-    if means2d_offset is not None:
-        means2d = means2d + jnp.where(visible[:, None], means2d_offset, 0.0)
+    if offset:
+        means2d = [c + d for c, d in zip(means2d, kept(offset, (0.0, 0.0)), strict=True)]
+
+    def stacked(columns):
+        return jnp.stack([flat(c, n) for c in columns], axis=-1)
+
     return Projected(
-        means2d=means2d,
-        conics=jnp.stack(conics, axis=-1),
-        depths=local[2],
-        opacities=opacities,
-        extents=jnp.where(visible[:, None], half, 0.0),
-        visible=visible,
-        culled=culled.astype(jnp.int32),
+        means2d=stacked(means2d),
+        conics=stacked(conics),
+        depths=flat(local[2], n),
+        opacities=flat(opacities, n),
+        extents=stacked(kept((half_x, half_y), (0.0, 0.0))),
+        visible=flat(visible, n),
+        culled=culled,
     )

@@ -305,7 +305,7 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
     view = jnp.arange(num_views, dtype=jnp.int32)[:, None]
     lists = Lists(
         ids=(binned.ids + view * n).ravel(),
-        starts=(binned.starts + view * plan.capacity).ravel(),
+        starts=(binned.starts + view * binned.ids.shape[1]).ravel(),
         counts=binned.counts.ravel(),
     )
     rows = (projected.means2d, projected.conics, projected.opacities, values)
@@ -333,7 +333,9 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     num_colors = views.colors.shape[-1] if "RGB" in plan.render_mode else 0
     colors = image[..., :num_colors]
     if views.backgrounds is not None and num_colors:
-        backgrounds = jnp.where(jnp.isfinite(views.backgrounds), views.backgrounds, 0.0)
+        # As with colours: one whose square overflows would overflow the gradients too.
+        usable = jnp.isfinite(jax.lax.stop_gradient(views.backgrounds) ** 2)
+        backgrounds = jnp.where(usable, views.backgrounds, 0.0)
         colors = colors + (1 - alphas) * backgrounds[:, :, None, None, :]
     depth = image[..., num_colors : num_colors + depth_channels]
     if "ED" in plan.render_mode:

@@ -1,10 +1,15 @@
 """Values that cannot be drawn, in each input: neighbours do not notice, and nothing turns non-finite."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from benchmarks import fuzz
 from benchmarks.scenes import ARRAYS
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
@@ -91,12 +96,21 @@ def test_a_camera_that_is_not_finite_sees_nothing_and_culls_everything(scene, we
     assert_finite((images, gradient))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_background_that_is_not_finite_counts_as_black(scene, weights, value):
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e38])
+def test_a_background_that_cannot_be_squared_counts_as_black(scene, weights, value):
     images, gradient, _ = run(scene | {"backgrounds": scene["backgrounds"].at[0, 1].set(value)}, weights)
     black, same, _ = run(scene | {"backgrounds": scene["backgrounds"].at[0, 1].set(0.0)}, weights)
     np.testing.assert_array_equal(images[0], black[0])
     np.testing.assert_array_equal(gradient["means"], same["means"])
+    assert_finite((images, gradient))
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [((0, 2), 1e38), ((0, 2), -1e38), ((0,), 1e38), ((0,), 1e-19), ((1, 1), np.finfo(np.float32).tiny)],
+)
+def test_a_camera_beyond_what_can_be_squared_has_finite_gradients(scene, weights, at, value):
+    images, gradient, _ = run(scene | {"Ks": scene["Ks"].at[(0, *at)].set(value)}, weights)
     assert_finite((images, gradient))
 
 
@@ -180,3 +194,34 @@ def _reference(scene):
         render_mode="RGB+ED",
         rasterize_mode="antialiased",
     )
+
+
+@st.composite
+def poisons(draw, modes):
+    mode, name = draw(st.sampled_from(modes)), draw(st.sampled_from(fuzz.INPUTS))
+    shape = fuzz.scene_of(mode, 0)[name].shape
+    shape = shape if name in fuzz.PER_GAUSSIAN else shape[1:]
+    row, column = draw(st.integers(0, shape[0] - 1)), draw(st.integers(-1, math.prod(shape[1:]) - 1))
+    table = fuzz.INTEGERS if name == "reads" else fuzz.POISONS | (fuzz.PLACES if name == "means" else {})
+    poison = draw(st.sampled_from(list(table)))
+    column = -1 if len(shape) == 1 or poison in fuzz.PLACES else column
+    return fuzz.Case(mode, draw(st.integers(0, 3)), name, row, column, poison)
+
+
+def assert_sound(case):
+    _, failure = fuzz.check(case)
+    assert not failure, f"python -m benchmarks.fuzz --case '{case}'  # {failure}"
+
+
+# One mode through matmuls and one pushed forward here; every other in the slow test.
+@settings(max_examples=150)
+@given(poisons(["channels", "forward"]))
+def test_poison_anywhere_is_culled_and_counted_or_drawn_as_the_reference_draws_it(case):
+    assert_sound(case)
+
+
+@pytest.mark.slow
+@settings(max_examples=1500)
+@given(poisons(list(fuzz.MODES)))
+def test_poison_anywhere_in_every_mode(case):
+    assert_sound(case)

@@ -269,3 +269,17 @@ def test_a_saturated_tile_is_read_no_further():
     _, _, meta = rasterization(**scene, width=16, height=16)
     assert int(meta.pairs[0]) == 4 * n
     assert int(meta.reads.max()) <= 8  # 0.1^4 is the early stop
+
+
+def test_any_capacity_serves_many_cameras(small):
+    # Lists are laid out in rows of 256, so the next camera's begin a little after this one's capacity.
+    this, scene = small()
+    twice = scene | {k: jnp.repeat(scene[k], 2, 0) for k in ("viewmats", "Ks", "backgrounds")}
+    images = [
+        rasterization(
+            **twice, width=this.width, height=this.height, plan=Plan(this.width, this.height, size)
+        )[0]
+        for size in (1001, 4096)
+    ]
+    np.testing.assert_array_equal(images[0][1], images[0][0])
+    np.testing.assert_array_equal(images[0], images[1])

@@ -1,0 +1,422 @@
+"""The ends of what floats hold: finite images and gradients, against float64 where defined, or an error.
+
+Poison in every input: test_poison.py and `python -m benchmarks.fuzz`. Figures: docs/numerics.md.
+"""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.scenes import ARRAYS, relative_error
+from gsjax.io.ply import read_ply, write_ply
+from gsjax.rasterize.plan import Plan, rung
+from gsjax.rasterize.rasterization import plan, rasterization
+from gsjax.rasterize.reference import rasterization_reference
+from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
+
+GAUSSIANS = ARRAYS[:5]
+FAINT = 1e-17
+TRAINED = (*GAUSSIANS, "viewmats", "Ks", "backgrounds")
+
+
+@partial(jax.jit, static_argnames="plan")
+def drawn(scene, weights, plan):
+    """Image with expected depth, its gradient against `weights`, and meta."""
+
+    def objective(scene):
+        image, alphas, meta = rasterization(**scene, width=plan.width, height=plan.height, plan=plan)
+        image = jnp.concatenate([image, alphas], axis=-1)[0]
+        return jnp.vdot(image, weights[..., : image.shape[-1]]), (image, meta)
+
+    gradient, (image, meta) = jax.grad(objective, has_aux=True)(scene)
+    return image, gradient, meta
+
+
+@partial(jax.jit, static_argnames="plan")
+def reference(scene, weights, plan):
+    """The same by the float64 reference, and the pixels that hang on a rounding."""
+
+    def objective(scene):
+        result = rasterization_reference(
+            *(scene[name] for name in GAUSSIANS),
+            scene["viewmats"][0],
+            scene["Ks"][0],
+            plan.width,
+            plan.height,
+            background=scene["backgrounds"][0],
+            render_mode=plan.render_mode,
+        )
+        image = jnp.concatenate([result.colors, result.alphas], axis=-1)
+        return jnp.vdot(image, weights), (image, result.doubtful)
+
+    gradient, (image, doubtful) = jax.grad(objective, has_aux=True)(scene)
+    return image, gradient, doubtful
+
+
+def scene_before(width=33, height=17, num=12, focal=30.0, depth=2.0, seed=0):
+    """A camera at the origin that looks along z, and Gaussians of a few pixels before it; float32."""
+    rng = np.random.default_rng(seed)
+    depths = depth * (1 + 0.5 * (rng.permutation(num) + 0.5) / num)
+    pixels = rng.uniform([0, 0], [width, height], (num, 2)) - [width / 2, height / 2]
+    scene = {
+        "means": np.concatenate([pixels * depths[:, None] / focal, depths[:, None]], axis=1),
+        "quats": rng.normal(size=(num, 4)),
+        "scales": rng.uniform(0.5, 3.0, (num, 3)) * depth / focal,
+        "opacities": rng.uniform(0.2, 0.9, num),
+        "colors": rng.uniform(size=(num, 3)),
+        "viewmats": np.eye(4)[None],
+        "Ks": np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]]),
+        "backgrounds": np.full((1, 3), 0.3),
+    }
+    return {k: np.float32(v) for k, v in scene.items()}
+
+
+def plan_for(width=33, height=17, num=12):
+    return Plan(width, height, rung(num * ((width + 7) // 8) * ((height + 7) // 8) * 2), render_mode="RGB+ED")
+
+
+def cotangent(width=33, height=17):
+    return np.float32(np.random.default_rng(1).normal(size=(height, width, 5)))
+
+
+def gradient_error(gradient, slope, names=TRAINED):
+    # Where the true gradient is 1e-20 (the rotation of a point), no digit of float32's means anything.
+    meaningful = [
+        k for k in names if np.abs(slope[k]).max() > FAINT or not np.abs(gradient[k]).max() <= FAINT
+    ]
+    return max(relative_error(gradient[k], slope[k]) for k in meaningful)
+
+
+def errors(scene, weights=None, plan=None, certain=None):
+    """(image, worst gradient) in float32 against float64, and meta; infinity where anything is not finite.
+
+    Both as parts of the array's largest value; a gradient below 1e-17 throughout counts as equal.
+    """
+    plan = plan_for() if plan is None else plan
+    weights = cotangent(plan.width, plan.height) if weights is None else weights
+    exact = {k: np.float64(v) for k, v in scene.items()}
+    with jax.enable_x64(True):
+        if certain is None:
+            certain = ~np.asarray(reference(exact, np.zeros_like(weights, np.float64), plan)[2])[..., None]
+        weights = np.where(certain, weights, np.float32(0))
+        want, slope, _ = jax.tree.map(np.asarray, reference(exact, np.float64(weights), plan))
+    got, gradient, meta = drawn(scene, weights, plan)
+    return relative_error(got, want, certain), gradient_error(gradient, slope), meta
+
+
+def changed(**changes):
+    """A function that sets rows of a scene: {name: (index, value)}."""
+
+    def change(scene):
+        scene = {k: v.copy() for k, v in scene.items()}
+        for name, (index, value) in changes.items():
+            scene[name][index] = value
+        return scene
+
+    return change
+
+
+def with_focal(focal, scene):
+    """The same picture through another lens: the Gaussians come closer to the axis by as much."""
+    scene = changed(Ks=((0, [0, 1], [0, 1]), focal))(scene)
+    scene["means"][:, :2] *= np.float32(30 / focal)
+    scene["scales"] *= np.float32(30 / focal)
+    return scene
+
+
+FULL = {"means": (0, (0, 0, 1.5)), "scales": (0, 1e3)}
+# What is drawn, and how far image and gradients may be off the reference, of their largest value.
+DRAWN = {
+    "one that fills the frame": (changed(**FULL), 1e-5, 3e-4),
+    "a hair in front of the near plane": (changed(means=(0, (0, 0, 0.0100001))), 1e-4, 1e-3),
+    "a camera inside a Gaussian": (changed(means=(0, (0.02, 0.01, 0.05)), scales=(0, 0.5)), 1e-4, 1e-3),
+    "all of scale 1e-12": (changed(scales=(slice(None), 1e-12)), 1e-5, 3e-4),
+    "one of scale 1e-12": (changed(scales=(0, 1e-12)), 1e-5, 3e-4),
+    "one axis 1e-8 of the others": (changed(scales=((slice(None), 0), 1e-9)), 1e-5, 3e-4),
+    "two axes 1e-8 of the third": (changed(scales=((slice(None), [0, 1]), 1e-9)), 1e-5, 1e-3),
+    "quaternions of length 1e-5": (lambda s: s | {"quats": s["quats"] * np.float32(1e-5)}, 1e-5, 3e-4),
+    "quaternions of length 1e15": (lambda s: s | {"quats": s["quats"] * np.float32(1e15)}, 1e-5, 3e-4),
+    "a denormal in each quaternion": (changed(quats=((slice(None), 1), 1e-42)), 1e-5, 3e-4),
+    "opacity 1": (changed(opacities=(slice(None), 1.0)), 1e-5, 3e-4),
+    "opacity 0": (changed(opacities=(slice(6), 0.0)), 1e-5, 3e-4),
+    "a colour of 1e18": (changed(colors=(0, 1e18)), 1e-5, 3e-4),
+    "focal length 1 px": (partial(with_focal, 1.0), 1e-5, 3e-4),
+    "focal length 1e5 px": (partial(with_focal, 1e5), 1e-4, 1e-3),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_what_can_be_drawn_is_drawn_as_the_reference_draws_it(name):
+    change, image_limit, gradient_limit = DRAWN[name]
+    image, gradient, meta = errors(change(scene_before()))
+    assert image <= image_limit
+    assert gradient <= gradient_limit
+    assert int(meta.culled[0]) == 0
+
+
+LEFT_OUT = {
+    "at the near plane": (changed(means=(0, (0, 0, 0.01))), 0),
+    "behind the near plane": (changed(means=(0, (0, 0, 0.0099))), 0),
+    "at the camera": (changed(means=(0, 0.0)), 0),
+    "behind the camera": (changed(means=((0, 2), -2.0)), 0),
+    "scale 1e12": (changed(scales=(0, 1e12)), 1),
+    "a zero quaternion": (changed(quats=(0, 0.0)), 1),
+    "a denormal quaternion": (changed(quats=(0, 1e-42)), 1),
+    "a colour of NaN": (changed(colors=((0, 1), np.nan)), 1),
+    "a colour of infinity": (changed(colors=((0, 1), np.inf)), 1),
+    "a colour of 1e38": (changed(colors=((0, 1), 1e38)), 1),
+    "opacity 0": (changed(opacities=(0, 0.0)), 0),
+}
+
+
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_what_cannot_be_drawn_leaves_the_scene_without_it(name):
+    change, culled = LEFT_OUT[name]
+    scene = scene_before()
+    got, gradient, meta = drawn(change(scene), cotangent(), plan_for())
+    want, clean, _ = drawn(changed(opacities=(0, 0.0))(scene), cotangent(), plan_for())
+    assert int(meta.culled[0]) == culled
+    np.testing.assert_array_equal(got, want)
+    for key in TRAINED:
+        np.testing.assert_array_equal(gradient[key], clean[key], err_msg=key)
+        assert np.isfinite(gradient[key]).all()
+    assert not any(np.any(gradient[key][0]) for key in GAUSSIANS)
+
+
+def test_a_needle_longer_than_float64_can_square_equals_itself_in_float64():
+    # The reference multiplies the covariance out, and 1e24 beside 1e-3 is past its digits too.
+    scene = changed(scales=((0, 0), 1e12))(scene_before())
+    got, gradient, meta = drawn(scene, cotangent(), plan_for())
+    with jax.enable_x64(True):
+        exact = {k: np.float64(v) for k, v in scene.items()}
+        want, slope, _ = jax.tree.map(np.asarray, drawn(exact, np.float64(cotangent()), plan_for()))
+    assert int(meta.culled[0]) == 0
+    assert relative_error(got, want) < 1e-4
+    assert gradient_error(gradient, slope) < 1e-3
+
+
+def test_none_visible_is_the_background_with_zero_gradients():
+    scene = changed(means=((slice(None), 2), -3.0))(scene_before())
+    image, gradient, meta = drawn(scene, cotangent(), plan_for())
+    np.testing.assert_array_equal(image[..., :3], np.float32(0.3))
+    assert not np.any(image[..., 3:])
+    assert not any(np.any(gradient[key]) for key in TRAINED if key != "backgrounds")
+    assert (int(meta.pairs[0]), int(meta.culled[0])) == (0, 0)
+
+
+def test_no_gaussians_is_the_background():
+    scene = {k: v[:0] if k in GAUSSIANS else v for k, v in scene_before().items()}
+    image, gradient, _ = drawn(scene, cotangent(), plan_for())
+    np.testing.assert_array_equal(image[..., :3], np.float32(0.3))
+    assert all(np.isfinite(gradient[key]).all() for key in TRAINED)
+
+
+def test_all_at_equal_depth_are_drawn_in_the_order_of_the_input():
+    scene = changed(means=((slice(None), 2), 2.0))(scene_before())
+    image, gradient, _ = errors(scene, certain=np.ones((17, 33, 1), bool))  # exact ties leave no doubt
+    assert image <= 1e-5
+    assert gradient <= 1e-3
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4096), (17, 33)])
+def test_images_of_any_shape(width, height):
+    scene = scene_before(width, height)
+    image, gradient, meta = errors(scene, plan=plan_for(width, height))
+    assert not bool(meta.overflow[0])
+    # At the ends of the tall one y is 68 times z.
+    assert image <= 1e-4
+    assert gradient <= 1e-3
+
+
+@pytest.mark.parametrize("num", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_a_tile_with_endless_layers_equals_the_reference_on_the_layers_that_light_reaches(num):
+    reached = 6_000
+    scene = scene_before(16, 16, num=num)
+    rng = np.random.default_rng(0)
+    scene["means"][:, 2] = np.sort(np.float32(2 + 2 * (np.arange(num) + rng.uniform(0.2, 0.8, num)) / num))
+    weights = cotangent(16, 16)
+    this = plan_for(16, 16, num)
+    front = {k: v[:reached] if k in GAUSSIANS else v for k, v in scene.items()}
+    exact = {k: np.float64(v) for k, v in front.items()}
+    with jax.enable_x64(True):
+        want, slope, doubtful = reference(exact, np.float64(weights), this)
+        certain = ~np.asarray(doubtful)[..., None]
+        weights = np.where(certain, weights, np.float32(0))
+        want, slope, _ = jax.tree.map(np.asarray, reference(exact, np.float64(weights), this))
+    assert want[..., 4].min() > 0.999  # nothing shines through
+    got, gradient, meta = drawn(scene, weights, this)
+    assert not bool(meta.overflow[0])
+    assert int(meta.pairs[0]) > num
+    assert relative_error(got, want, certain) <= 1e-5
+    for key in GAUSSIANS:
+        assert relative_error(gradient[key][:reached], slope[key]) <= 1e-3, key
+        assert not np.any(gradient[key][reached:])
+
+
+def test_logits_of_100_and_opacities_of_0_and_1_through_gaussians():
+    scene = scene_before()
+    activated = gaussians_from_activated(*(scene[name] for name in GAUSSIANS))
+    ends = gaussians_from_activated(*(scene[k] for k in GAUSSIANS[:3]), np.arange(12.0) % 2, scene["colors"])
+    assert np.isfinite(ends.logit_opacities).all()
+    logits = jnp.where(jnp.arange(12) % 2 == 0, 100.0, -100.0)
+    both = [dataclasses.replace(activated, logit_opacities=logits), ends]
+
+    @jax.jit
+    @jax.grad
+    def slope(gaussians: Gaussians):
+        camera = (jnp.asarray(scene["viewmats"]), jnp.asarray(scene["Ks"]))
+        arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+        this = Plan(33, 17, 4096, sh_degree=0)
+        image, alphas, _ = rasterization(*arrays, *camera, 33, 17, plan=this)
+        return jnp.vdot(image, cotangent()[None, ..., :3]) + alphas.sum()
+
+    for gaussians in both:
+        gradient = slope(gaussians)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        assert np.any(gradient.means[0::2] if gaussians is both[0] else gradient.means[1::2])
+        assert not np.any(gradient.means[1::2] if gaussians is both[0] else gradient.means[0::2])
+
+
+def far_away(distance: float):
+    """(pixel error, image error) of float32 with camera and scene `distance` metres from the origin."""
+    scene = {k: np.float64(v) for k, v in scene_before().items()}
+    offset = distance * np.array([0.6, 0.48, 0.64])
+    scene["means"] = scene["means"] + offset
+    scene["viewmats"][0, :3, 3] -= offset
+    with jax.enable_x64(True):
+        want, _, exact = jax.tree.map(np.asarray, drawn(scene, np.float64(cotangent()), plan_for()))
+    rounded = {k: np.float32(v) for k, v in scene.items()}
+    got, gradient, meta = drawn(rounded, cotangent(), plan_for())
+    assert all(np.isfinite(gradient[key]).all() for key in TRAINED)
+    assert np.isfinite(got).all()
+    # The colours: an expected depth jumps from nothing to metres where a footprint ends.
+    return float(np.abs(meta.means2d - exact.means2d).max()), relative_error(got[..., :3], want[..., :3])
+
+
+# float32 holds a coordinate to 6e-8 of itself: at 1e4 m to half a millimetre, which here is 0.003 pixels.
+@pytest.mark.parametrize(("distance", "pixels"), [(1.0, 1e-4), (1e2, 1e-3), (1e4, 0.1), (1e6, 10.0)])
+def test_the_error_in_pixels_grows_with_the_distance_from_the_origin(distance, pixels):
+    error, _ = far_away(distance)
+    assert pixels / 1e3 < error < pixels
+
+
+def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
+    num = 70_000  # by 32,400 tiles: 2.27e9
+    arrays = {
+        "means": np.tile(np.float32([0, 0, 2]), (num, 1)),
+        "quats": np.tile(np.float32([1, 0, 0, 0]), (num, 1)),
+        "scales": np.full((num, 3), 1e3, np.float32),
+        "opacities": np.full(num, 0.9, np.float32),
+        "viewmats": np.eye(4, dtype=np.float32)[None],
+        "Ks": np.float32([[[1000, 0, 960], [0, 1000, 540], [0, 0, 1]]]),
+    }
+    arrays = jax.tree.map(jnp.asarray, arrays)
+    image, _, meta = rasterization(
+        **arrays, colors=jnp.ones((num, 1)), width=1920, height=1080, plan=Plan(1920, 1080, 4096)
+    )
+    assert bool(meta.overflow[0])
+    assert int(meta.needed[0]) == 2**31 - 1
+    assert int(meta.pairs[0]) == 0
+    assert not np.any(image)
+    with pytest.raises(ValueError, match=r"more than 2\^30 tiles of a 1920x1080 image; prune"):
+        plan(**arrays, width=1920, height=1080)
+
+
+@pytest.mark.slow
+def test_889536_zero_quaternions_in_one_file(tmp_path):
+    # splat-transform #288: so many stood in one real file. The reader counts them, and so does a call.
+    zeros, scene = 889_536, scene_before()
+    few = gaussians_from_activated(*(scene[name] for name in GAUSSIANS))
+    many = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], zeros, axis=0)]), few)
+    many.quats[12:] = 0
+    write_ply(tmp_path / "zeros.ply", many)
+    back, report = read_ply(tmp_path / "zeros.ply")
+    assert back.num == 12
+    assert str(zeros) in str(report).replace(",", "")
+    padded = {
+        k: np.concatenate([v, np.repeat(v[:1], zeros, axis=0)]) if k in GAUSSIANS else v
+        for k, v in scene.items()
+    }
+    padded["quats"][12:] = 0
+    got, gradient, meta = drawn(padded, cotangent(), plan_for())
+    want, clean, _ = drawn(scene, cotangent(), plan_for())
+    assert int(meta.culled[0]) == zeros
+    np.testing.assert_allclose(got, want, atol=1e-6)
+    for key in GAUSSIANS:
+        np.testing.assert_allclose(gradient[key][:12], clean[key], rtol=1e-4, atol=1e-4)
+        assert not np.any(gradient[key][12:])
+
+
+def digest() -> str:
+    """Of an image and all gradients, to the bit."""
+    image, gradient, _ = drawn(scene_before(), cotangent(), plan_for())
+    arrays = [image, *(gradient[key] for key in TRAINED)]
+    return hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in arrays)).hexdigest()
+
+
+def test_five_runs_and_two_processes_are_equal_bit_for_bit():
+    command = "import runpy, sys; print(runpy.run_path(sys.argv[1])['digest']())"
+    root = Path(__file__).resolve().parents[2]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", command, __file__], cwd=root, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    assert len({digest() for _ in range(5)}) == 1
+    outputs = [process.communicate()[0].strip() for process in started]
+    assert outputs[0] == outputs[1]
+    assert len(outputs[0]) == 64
+
+
+def test_a_permutation_of_the_gaussians_changes_no_bit():
+    scene, order = scene_before(), np.random.default_rng(3).permutation(12)
+    want, slope, _ = drawn(scene, cotangent(), plan_for())
+    shuffled = {k: v[order] if k in GAUSSIANS else v for k, v in scene.items()}
+    got, gradient, _ = drawn(shuffled, cotangent(), plan_for())
+    np.testing.assert_array_equal(got, want)
+    for key in GAUSSIANS:
+        np.testing.assert_array_equal(gradient[key], slope[key][order])
+
+
+def half_precision(dtype, scene, this):
+    """(image, colours' gradient, other gradients) off float32, of the largest value, with `dtype` colours."""
+    weights = cotangent(this.width, this.height)
+    halved = scene | {"colors": jnp.asarray(scene["colors"], dtype)}
+    want, slope, _ = drawn(scene, weights, this)
+    got, gradient, _ = drawn(halved, weights, this)
+    assert gradient["colors"].dtype == dtype
+    others = max(relative_error(gradient[k], slope[k]) for k in TRAINED if k != "colors")
+    return relative_error(got, want), relative_error(gradient["colors"], slope["colors"]), others
+
+
+# Half the spacing of values: 2^-9 of a bfloat16, 2^-12 of a float16.
+@pytest.mark.parametrize(("dtype", "spacing"), [(jnp.bfloat16, 2**-9), (jnp.float16, 2**-12)])
+def test_colours_in_half_precision_cost_their_own_rounding_and_no_more(dtype, spacing):
+    scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")
+    image, painted, others = half_precision(dtype, scene, this)
+    assert spacing / 100 < image <= spacing
+    assert painted <= 1.2 * spacing  # their gradient is rounded once more
+    assert others <= 4 * spacing
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_half_precision_is_composited_in_float32(dtype):
+    scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")
+    halved = scene | {"colors": jnp.asarray(scene["colors"], dtype)}
+    rounded = scene | {"colors": halved["colors"].astype(jnp.float32)}
+    got, gradient, _ = drawn(halved, cotangent(64, 48), this)
+    want, slope, _ = drawn(rounded, cotangent(64, 48), this)
+    assert got.dtype == jnp.float32
+    np.testing.assert_array_equal(got, want)
+    for key in set(TRAINED) - {"colors"}:
+        assert relative_error(gradient[key], slope[key]) < 1e-6
+    np.testing.assert_array_equal(gradient["colors"], slope["colors"].astype(dtype))
