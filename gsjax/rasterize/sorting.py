@@ -69,7 +69,7 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArgs))
 
 
-def _view(buffers: _Buffers, dtype) -> np.ndarray:
+def _view(buffers, dtype) -> np.ndarray:
     """The first of these buffers as an array of 4-byte elements, without a copy."""
     buffer = buffers.items[0].contents
     shape = [buffer.dims[i] for i in range(buffer.rank)]
