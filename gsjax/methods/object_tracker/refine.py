@@ -99,9 +99,8 @@ def refine(
         return (optax.apply_updates(trained, updates), state), {**info, "loss": value}
 
     trained = (motion, shifts)
-    start = (trained, optimizer.init(trained))
-    end, infos = jax.lax.scan(iterate, start, None, length=config.iterations)
-    motion, shifts = end[0]
+    start: Any = (trained, optimizer.init(trained))
+    ((motion, shifts), _), infos = jax.lax.scan(iterate, start, None, length=config.iterations)
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
     info = {name: values[-1] for name, values in infos.items()}
     return motion, shifts, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}
