@@ -99,8 +99,9 @@ def refine(
         return (optax.apply_updates(trained, updates), state), {**info, "loss": value}
 
     trained = (motion, shifts)
-    start: Any = (trained, optimizer.init(trained))
-    ((motion, shifts), _), infos = jax.lax.scan(iterate, start, None, length=config.iterations)
+    end: Any  # optax says less of what it returns than it is given
+    end, infos = jax.lax.scan(iterate, (trained, optimizer.init(trained)), None, length=config.iterations)
+    motion, shifts = end[0]
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
     info = {name: values[-1] for name, values in infos.items()}
     return motion, shifts, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}
