@@ -63,7 +63,7 @@ class Config:
 
     claim: str  # one sentence
     source: str  # where it is made: paper and section, or else
-    script: str  # file beside the config, with `run(options, seed, folder)`
+    script: str  # path from the config's folder, with `run(options, seed, folder)`; several may share one
     grid: dict = field(default_factory=dict)  # option: [values]; all combinations, the last option fastest
     cases: list = field(default_factory=list)  # of option: value pairs; the grid is swept in each
     seeds: list = field(default_factory=lambda: [0])
@@ -157,7 +157,7 @@ class Experiment:
         module = ModuleType("gsjax_experiment_" + re.sub(r"\W", "_", self.name))
         module.__file__ = str(self.script)
         sys.modules[module.__name__] = module  # dataclasses and pickle look it up there
-        beside = str(self.folder.resolve())  # helpers may stand there, as with `python script.py`
+        beside = str(self.script.resolve().parent)  # helpers may stand there, as with `python script.py`
         if beside not in sys.path:
             sys.path.insert(0, beside)
         try:
@@ -258,8 +258,9 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
     for key in ("claim", "source", "script"):
         _expect(getattr(config, key).strip(), f"{path}: {key}", "text", "none")
     script = path.parent / config.script
-    _expect(script.name == config.script, f"{path}: script", "the name of a file beside it", config.script)
-    _expect(script.is_file(), f"{path}: script", "a file beside it", f"no {config.script} there")
+    within = script.resolve().is_relative_to(root.resolve())
+    _expect(within, f"{path}: script", f"a path within {root}", config.script)
+    _expect(script.is_file(), f"{path}: script", "a file", f"none at {script}")
     columns = tuple(_column(value, f"{path}: columns[{i}]") for i, value in enumerate(config.columns))
     _expect_unlike([column.key for column in columns], f"{path}: columns")
     figure = _fields(Figure, config.figure, f"{path}: figure")

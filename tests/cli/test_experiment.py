@@ -395,10 +395,13 @@ def test_cells_that_there_are_not(toy, gsjax, options, says):
     [
         ({"without": "claim"}, "config.yaml: claim: expected text, found nothing"),
         ({"source": "  "}, "config.yaml: source: expected text, found none"),
-        ({"script": "gone.py"}, "config.yaml: script: expected a file beside it, found no gone.py there"),
         (
-            {"script": "../sweep.py"},
-            "config.yaml: script: expected the name of a file beside it, found ../sweep.py",
+            {"script": "gone.py"},
+            "config.yaml: script: expected a file, found none at experiments/toy/gone.py",
+        ),
+        (
+            {"script": "../../sweep.py"},
+            "config.yaml: script: expected a path within experiments, found ../../sweep.py",
         ),
         (
             {"without": "grid"},
@@ -500,6 +503,20 @@ def test_what_a_script_must_not_return(toy, gsjax, returned, says):
     code, _, err = gsjax("run", "toy")
     assert code == 1
     assert says in err
+
+
+def test_two_experiments_share_a_script(toy, gsjax):
+    """Its helpers stand beside the script, not beside the config."""
+    folder = toy("from factor import FACTOR\n" + SCRIPT, script="../shared/sweep.py")
+    shared = folder.parent / "shared"
+    shared.mkdir()
+    (folder / "sweep.py").rename(shared / "sweep.py")
+    (shared / "factor.py").write_text("FACTOR = 1\n")
+    other = folder.parent / "other"
+    other.mkdir()
+    (other / "config.yaml").write_text((folder / "config.yaml").read_text())
+    assert [gsjax("run", name)[0] for name in ("toy", "other")] == [0, 0]
+    assert results(folder)["rows"][0]["result"] == results(other)["rows"][0]["result"]
 
 
 def test_what_a_script_does_to_its_options_or_beside_it(toy, gsjax):

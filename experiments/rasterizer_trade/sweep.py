@@ -1,6 +1,6 @@
 """What each knob of the rasterizer buys: error of image and gradient against time, one knob at a time.
 
-The scripts of `real/` are links to these: both measure alike, and their tables stay apart. Every time is
+`simulated/` and `real/` share these scripts: both measure alike, and their tables stay apart. Every time is
 also a ratio to the defaults' time in the same cell, whose calls alternate with the knob's, so that what else
 the machine does falls on both.
 """
