@@ -3,8 +3,15 @@
 import os
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[1]
+
 # Several workers may share one GPU: none of them may take most of its memory at the start.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# Most of the time goes into compiling. So programs are kept on disk, for both workers, the processes that
+# tests start, and the next run; they are found by what they compute, so no change of the code is missed.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "xla"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 from jaxtyping import install_import_hook
 
@@ -18,7 +25,12 @@ import pytest
 hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, derandomize=True, database=None)
 hypothesis.settings.load_profile("gsjax")
 
-ROOT = Path(__file__).resolve().parents[1]
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_compiled():
+    """Each compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

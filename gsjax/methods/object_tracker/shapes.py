@@ -248,9 +248,9 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackerConfig) -> Tracke
     groups = scene.labels[: scene.num_moving]
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
     still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
-    rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0)
+    rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0, background_rate=0.0)
     while True:
-        motion, info = _refine_rigidly()(still, RefineBatch(scene, frame, plan, pose, centers, roi), rates)
+        motion, _, info = _refine_rigidly()(still, RefineBatch(scene, frame, plan, pose, centers, roi), rates)
         if not info["overflow"]:
             break
         plan = plan.grown(int(info["needed"]), config.headroom)

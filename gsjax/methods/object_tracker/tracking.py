@@ -3,7 +3,7 @@
 import time
 import warnings
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -98,6 +98,18 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
     return scene, pose, state, info
 
 
+@lru_cache(maxsize=8)
+def _compiled_update(treedef, shapes, **static):
+    """`_update` for arguments of this form. Kept, so that a second sequence of the same sizes starts at once."""
+    return _update.lower(*jax.tree.unflatten(treedef, shapes), **static).compile(host_options())
+
+
+def _signature(arguments):
+    """What a compiled program is made for: the tree, the plan in it, and each leaf's shape and dtype."""
+    leaves, treedef = jax.tree.flatten(arguments)
+    return treedef, tuple(map(jax.typeof, leaves))
+
+
 def track(
     scene: TrackedScene,
     first: Frame,
@@ -133,6 +145,7 @@ def track(
     if state is None:
         state = _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
     compiled: dict[TrackerPlan, Any] = {}
+    static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
     for index, frame in enumerate(frames):
         _check_alike(frame, first, index + 1)
         jax.block_until_ready(frame)
@@ -142,8 +155,7 @@ def track(
             arguments = (pose, state, batch, index)
             if plan not in compiled:
                 begun = time.perf_counter()
-                static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
-                compiled[plan] = _update.lower(*arguments, **static).compile(host_options())
+                compiled[plan] = _compiled_update(*_signature(arguments), **static)
                 compile_seconds += time.perf_counter() - begun
             begun = time.perf_counter()
             result = jax.block_until_ready(compiled[plan](*arguments))
