@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes, slots
+from gsjax.rasterize.lanes import slots
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import Projected
-from gsjax.rasterize.sorting import argsort_keys, sort_keys
+from gsjax.rasterize.sorting import argsort_keys, repeat, running_sum, sort_keys
 
 _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
 
@@ -135,19 +135,13 @@ def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
     return jnp.maximum(_total(columns * rows), _doubled(_total(rows)))
 
 
-def _repeat(values: Array, starts: Int[Array, "n"], slot: Int[Array, "rows lanes"]) -> Array:
-    """`values[i]` in slots from `starts[i]` to the next start; integers, whose differences may wrap."""
-    steps = jnp.diff(values, prepend=jnp.zeros(1, values.dtype))
-    summed = jnp.zeros(slot.size, values.dtype).at[starts].add(steps, mode="drop")
-    return jnp.cumsum(summed, dtype=values.dtype).reshape(slot.shape)
-
-
 def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan: Plan) -> _Spans:
     """Lay out the rows of all Gaussians, and find the columns that each covers in them."""
     slot = slots(plan.capacity // 2)
-    ends = jnp.cumsum(num_rows)
+    ends = running_sum(num_rows, plan.sort)
     starts = ends - num_rows
-    rank = _repeat(jnp.arange(num_rows.shape[0], dtype=jnp.int32), starts, slot)
+    ranks = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
+    rank = repeat(ranks, starts, slot.size, plan.sort).reshape(slot.shape)
     row = slot + (first_row - starts)[rank]
     low, high = _columns_in_row(projected, by_depth[rank], row, plan)
     count = jnp.where(slot < ends[-1], jnp.maximum(high - low, 0), 0)
@@ -162,11 +156,17 @@ def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan:
 def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
     """First and one past the last column of tiles where alpha reaches alpha_min in a row's pixel centres.
 
-    The ellipse A dx^2 + 2 B dx dy + C dy^2 = t reaches furthest to the right at dy = -(B/C) h_x, as a
-    concave function of dy; so within a band of rows it does so at the nearest dy of the band, and likewise
-    to the left. At dy it is -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)) wide.
+    The ellipse A dx^2 + 2 B dx dy + C dy^2 = t, t = 2 ln(o / alpha_min), reaches furthest to the right at
+    dy = -(B/C) h_x, as a concave function of dy; so within a band of rows it does so at the nearest dy of the
+    band, and likewise to the left. At dy it is -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)) wide.
     """
-    u, v, half_x, half_y, furthest, slope, width = (a[gaussian] for a in _ellipses(projected, plan))
+    u, v, half_x, half_y, a, b, c, opacity = (column[gaussian] for column in _ellipses(projected))
+    # What follows is worked out for each row again: gathers of what is there already are the quick ones.
+    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
+    level = 2 * jnp.log(jnp.maximum(opacity / plan.alpha_min, 1.0))
+    level = level * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
+    furthest, slope = -b / jnp.maximum(c, tiny) * half_x, -b / jnp.maximum(a, tiny)
+    width = jnp.sqrt(level / jnp.maximum(a, tiny))
     top = row * plan.tile_size + 0.5 - v
     low, high = jnp.maximum(top, -half_y), jnp.minimum(top + (plan.tile_size - 1), half_y)
 
@@ -185,25 +185,21 @@ def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
     return start, jnp.where(empty, start, _tile_of(last, plan, plan.tiles_x) + 1)
 
 
-def _ellipses(projected: Projected, plan: Plan) -> list[Float[Array, "n"]]:
-    """u, v, h_x, h_y, -(B/C) h_x, -(B/A) and sqrt(t/A) of every Gaussian, t = 2 ln(o / alpha_min)."""
-    a, b, c = columns_in_lanes(projected.conics)
-    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
-    level = 2 * jnp.log(jnp.maximum(in_lanes(projected.opacities) / plan.alpha_min, 1.0))
-    level = level * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
-    (u, v), (half_x, half_y) = (columns_in_lanes(x) for x in (projected.means2d, projected.extents))
-    furthest, slope = -b / jnp.maximum(c, tiny) * half_x, -b / jnp.maximum(a, tiny)
-    width = jnp.sqrt(level / jnp.maximum(a, tiny))
-    n = len(projected.opacities)
-    return [flat(x, n) for x in (u, v, half_x, half_y, furthest, slope, width)]
+def _ellipses(projected: Projected) -> list[Float[Array, "n"]]:
+    """u, v, h_x, h_y, the conic's A, B, C and the opacity of every Gaussian."""
+    columns = [projected.means2d, projected.extents, projected.conics]
+    return [a[:, i] for a in columns for i in range(a.shape[1])] + [projected.opacities]
 
 
 def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
     """(tile, Gaussian) of every pair in order of (tile, depth); unused slots hold the tile past the last."""
     num_tiles, n = plan.num_tiles, by_depth.shape[0]
     slot, count = slots(plan.capacity), spans.count.ravel()
-    ends = jnp.cumsum(count)
+    ends = running_sum(count, plan.sort)
     starts = ends - count
+
+    def of_slots(values):
+        return repeat(values.ravel(), starts, slot.size, plan.sort).reshape(slot.shape)
 
     def is_used(tile):
         used = slot < ends[-1]
@@ -214,14 +210,13 @@ def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
     base = spans.first_tile - starts.reshape(spans.count.shape)
     rank_bits = max(1, (n - 1).bit_length())
     if rank_bits + num_tiles.bit_length() > 32:
-        rank = _repeat(spans.gaussian_rank.ravel(), starts, slot)
-        tile = _repeat(base.ravel(), starts, slot) + slot
+        rank, tile = of_slots(spans.gaussian_rank), of_slots(base) + slot
         tile = jnp.where(is_used(tile), tile, num_tiles).ravel()
         order = argsort_keys(tile.astype(jnp.uint32), plan.sort)
         return tile[order], by_depth[rank.ravel()[order]]
     # One key holds both. Sums modulo 2^32 are exact, since the key itself fits.
     key = (base.astype(jnp.uint32) << rank_bits) + spans.gaussian_rank.astype(jnp.uint32)
-    key = _repeat(key.ravel(), starts, slot) + (slot.astype(jnp.uint32) << rank_bits)
+    key = of_slots(key) + (slot.astype(jnp.uint32) << rank_bits)
     used = is_used((key >> rank_bits).astype(jnp.int32))
     key = jnp.where(used, key, jnp.uint32(num_tiles << rank_bits))
     key = sort_keys(key.ravel(), plan.sort).reshape(slot.shape)

@@ -111,10 +111,9 @@ def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials
     values = piece.values.astype(dtype)
     if channels <= FEW_CHANNELS:
         toward = sum(values[:, c, None] * d_image[c] for c in range(channels))
-        d_values = (weights[:, None] * d_image).sum(axis=-1)
     else:
         toward = jnp.matmul(values, d_image, precision="highest")
-        d_values = jnp.matmul(weights, d_image.T, precision="highest")
+    d_values = jnp.matmul(weights, d_image.T, precision="highest")
     passed = weights * toward
     d_power = []
     for i in range(0, alphas.shape[0], CHUNK):
@@ -123,7 +122,8 @@ def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials
         slope = suffix * alphas[some] / jnp.maximum(1 - alphas[some], _SMALL)
         moved = (weights[some] > 0) & (alphas[some] < limits.alpha_max * (1 - 0.5 * SATURATION))
         d_power.append(jnp.where(moved, passed[some] - slope, 0.0))
-        behind = behind - passed[some].sum(axis=0)
+        for row in passed[some]:  # not .sum(), for which XLA:CPU calls a library
+            behind = behind - row
     moments = jnp.matmul(jnp.concatenate(d_power), monomials, precision="highest")
     return light, behind, jnp.concatenate([_gradient_rows(piece, moments), d_values], axis=-1)
 

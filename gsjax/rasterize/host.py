@@ -1,0 +1,134 @@
+"""Numpy's functions as XLA custom calls, for what XLA:CPU does with one scalar at a time.
+
+The call hands XLA's own buffers to numpy. It speaks XLA's foreign function interface (xla/ffi/api/c_api.h,
+which jaxlib ships) through ctypes and needs no compiler. Unlike `jax.pure_callback` it copies nothing, and it
+cannot hang on a machine with a single core.
+"""
+
+import ctypes
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+_EXTENSION_METADATA = 1  # XLA asks which version of the interface a handler speaks
+_VERSION = (0, 1)  # the oldest that has what is used here: newer runtimes accept it
+_INTERNAL_ERROR = 13
+
+
+def _struct(name: str, *fields) -> type[ctypes.Structure]:
+    """A C structure; every one of the interface opens with its size and a pointer to extensions."""
+    head = [("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
+    return type(name, (ctypes.Structure,), {"_fields_": head + list(fields)})
+
+
+_Version = _struct("Version", ("major", ctypes.c_int), ("minor", ctypes.c_int))
+_Buffer = _struct(
+    "Buffer",
+    ("dtype", ctypes.c_int),
+    ("data", ctypes.c_void_p),
+    ("rank", ctypes.c_int64),
+    ("dims", ctypes.POINTER(ctypes.c_int64)),
+)
+_Buffers = _struct(
+    "Buffers",
+    ("size", ctypes.c_int64),
+    ("types", ctypes.c_void_p),
+    ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+)
+_Frame = _struct(
+    "Frame",
+    ("api", ctypes.c_void_p),
+    ("context", ctypes.c_void_p),
+    ("stage", ctypes.c_int),
+    ("args", _Buffers),
+    ("rets", _Buffers),
+)
+_ErrorArgs = _struct("ErrorArgs", ("message", ctypes.c_char_p), ("code", ctypes.c_int))
+_Api = _struct("Api", ("version", _Version), ("internal", ctypes.c_void_p), ("create_error", ctypes.c_void_p))
+
+
+class _Metadata(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("version", _Version)]
+
+
+class _Extension(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("type", ctypes.c_int),
+        ("next", ctypes.c_void_p),
+        ("metadata", ctypes.POINTER(_Metadata)),  # there if the type says so
+    ]
+
+
+_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
+_CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArgs))
+
+
+_DTYPES = {4: np.int32, 8: np.uint32}  # XLA's numbers for what is passed here
+
+
+def _views(buffers) -> list[np.ndarray]:
+    """Arrays on the memory of these buffers."""
+    views = []
+    for i in range(buffers.size):
+        buffer = buffers.items[i].contents
+        shape = [buffer.dims[axis] for axis in range(buffer.rank)]
+        dtype, size = _DTYPES[buffer.dtype], 4 * int(np.prod(shape, dtype=np.int64))
+        if size == 0:
+            views.append(np.empty(shape, dtype))
+        else:
+            memory = (ctypes.c_char * size).from_address(buffer.data)
+            views.append(np.frombuffer(memory, dtype).reshape(shape))
+    return views
+
+
+def _handler(work: Callable[..., None]) -> ctypes._CFuncPtr:
+    """`work(*inputs, output)` on numpy views, as a function that XLA can call."""
+
+    def call(pointer):
+        frame = pointer.contents
+        if frame.extension:
+            extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
+            if extension.type == _EXTENSION_METADATA:
+                version = extension.metadata.contents.version
+                version.major, version.minor = _VERSION
+                return None
+        try:
+            work(*_views(frame.args), *_views(frame.rets))
+        except Exception as error:
+            api = ctypes.cast(frame.api, ctypes.POINTER(_Api)).contents
+            message = f"{work.__name__} on the host failed: {type(error).__name__}: {error}".encode()
+            args = _ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message, _INTERNAL_ERROR)
+            return _CreateError(api.create_error)(ctypes.byref(args))
+        return None
+
+    return _Handler(call)
+
+
+_HANDLERS: dict[str, Any] = {}  # kept alive: XLA holds their addresses
+
+
+def register(name: str, work: Callable[..., None]) -> bool:
+    """Make `work(*inputs, output)`, which fills the output, known to XLA:CPU by this name.
+
+    Returns:
+        whether that worked: another version of the interface may refuse it.
+    """
+    capsule = ctypes.pythonapi.PyCapsule_New
+    capsule.restype, capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+    handler = _handler(work)
+    try:
+        address = ctypes.cast(handler, ctypes.c_void_p)
+        jax.ffi.register_ffi_target(name, capsule(address, None, None), platform="cpu")
+    except Exception:
+        return False
+    _HANDLERS[name] = handler
+    return True
+
+
+def call(name: str, result: jax.ShapeDtypeStruct, *arguments: Array) -> Array:
+    """What was registered by this name, of int32 and uint32 arrays. Under vmap it gets leading axes."""
+    return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(*arguments)
