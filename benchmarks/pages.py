@@ -161,7 +161,7 @@ to the next. Results are waited for; two calls warm up; *ms* is the median, *p95
   tangent of the camera's pose pushed through, in turn one of six. Channels beyond 3 are features beside the
   colours.
 - **plain jit**: compiled as a user's `jax.jit` does, without `host_options()`. **no reads**: without the
-  `reads` of the call before.
+  `reads` of the call before. The process keeps freed memory (`keep_freed_memory()`), as every command does.
 - **/ exp**: multiple of the time that exp alone takes over all pixels of the rectangle pairs. Rectangle pairs
   are the {TILE}x{TILE} tiles in the bounding boxes of the visible Gaussians: they belong to the scene, not
   to the rasterizer. exp is of float32, in a block of 4 MB that stays in cache, on all cores.

@@ -5,6 +5,7 @@ scene       Gaussians, Tags, Camera, Frame, render, plan_render
 data        open_sequence, Sequence
 tracking    start_scene, scene_from_shapes, track, object_tracker, TrackerConfig
 files       read_ply, write_ply
+speed       host_options, keep_freed_memory
 """
 
 import importlib
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
         start_scene,
         track,
     )
+    from gsjax.optim.compiler import host_options, keep_freed_memory
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
     from gsjax.rasterize.rasterization import plan, rasterization
@@ -43,6 +45,7 @@ _HOMES = {
         "start_scene",
         "track",
     ),
+    "gsjax.optim.compiler": ("host_options", "keep_freed_memory"),
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),
     "gsjax.rasterize.rasterization": ("plan", "rasterization"),
@@ -62,6 +65,8 @@ __all__ = [
     "Tags",
     "TrackerConfig",
     "composite_tile",
+    "host_options",
+    "keep_freed_memory",
     "object_tracker",
     "open_sequence",
     "plan",

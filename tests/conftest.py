@@ -28,7 +28,7 @@ hypothesis.settings.load_profile("gsjax")
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled():
-    """Each compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
+    """A compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
     yield
     jax.clear_caches()
 

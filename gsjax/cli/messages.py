@@ -38,6 +38,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
             config=(tyro.conf.FlagCreatePairsOff,),
         )
         debug = options.debug
+        import_module("gsjax.optim.compiler").keep_freed_memory()
         with heard_interrupts():
             return chosen.run(options)
     except KeyboardInterrupt:

@@ -1,5 +1,6 @@
-"""Compiler options, for the outermost jit of a host loop only: inside another trace they raise."""
+"""What makes the same program faster on the host: compiler options, and memory that is kept."""
 
+import ctypes
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,34 @@ import jax
 def host_options() -> dict[str, Any]:
     """What makes compositing fast on this machine: the full vector width where the CPU has AVX-512.
 
-    Use it as `jax.jit(f, compiler_options=host_options())`, or with `.lower(...).compile(host_options())`.
+    Use it as `jax.jit(f, compiler_options=host_options())`, or with `.lower(...).compile(host_options())`,
+    and for the outermost jit of a host loop only: inside another trace, options raise.
     """
     if jax.default_backend() != "cpu":
         return {}
     cpuinfo = Path("/proc/cpuinfo")
     has_avx512 = cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
     return {"xla_cpu_prefer_vector_width": 512} if has_avx512 else {}
+
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+_KEPT = 2**30  # bytes: the largest array, and how much freed memory
+
+
+def keep_freed_memory() -> bool:
+    """Have this process keep up to 1 GiB of memory that it has freed, which saves a fifth of a forward call.
+
+    XLA:CPU allocates a program's temporary arrays anew in every call. glibc takes large ones from the kernel
+    and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
+    for 110,000 Gaussians at 648x420. This raises its thresholds, for the whole process and until it ends.
+    The command line does so; call it once in a program of your own. MALLOC_MMAP_THRESHOLD_ and
+    MALLOC_TRIM_THRESHOLD_ in the environment do the same.
+
+    Returns:
+        whether it could: False where the C library is not glibc.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    return bool(mallopt(_MMAP_THRESHOLD, _KEPT)) and bool(mallopt(_TRIM_THRESHOLD, _KEPT))

@@ -36,6 +36,26 @@ class Splats(NamedTuple):
     values: Float[Array, "*list channels"]  # whatever is composited: colours, depth, features
 
 
+class Columns(NamedTuple):
+    """Splats as loops read them: in columns, for a gather of scalars is the quick one, opacities as logs."""
+
+    u: Float[Array, "*list"]  # means2d
+    v: Float[Array, "*list"]
+    a: Float[Array, "*list"]  # conics
+    b: Float[Array, "*list"]
+    c: Float[Array, "*list"]
+    log_opacities: Float[Array, "*list"]  # -inf is an empty slot
+    values: tuple[Float[Array, "*list"], ...] | Float[Array, "*list channels"]  # many stay together
+
+
+def in_columns(splats: Splats, limits: Limits) -> Columns:
+    """The same list. An opacity far below alpha_min is as good as 0, and its logarithm has a derivative."""
+    logs = jnp.log(jnp.maximum(splats.opacities, 0.5 * limits.alpha_min))
+    shapes = (*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.conics, -1, 0))
+    few = splats.values.shape[-1] <= FEW_CHANNELS
+    return Columns(*shapes, logs, tuple(jnp.moveaxis(splats.values, -1, 0)) if few else splats.values)
+
+
 class TileState(NamedTuple):
     """Compositing of P pixels, as far as it has come."""
 
@@ -54,17 +74,14 @@ def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
 
 
 def splat_alphas(
-    splats: Splats, pixels: Float[Array, "pixels 2"], limits: Limits
+    columns: Columns, pixels: Float[Array, "pixels 2"], limits: Limits
 ) -> Float[Array, "list pixels"]:
     """min(alpha_max, o exp(-d^T conic d / 2)) of a list at every pixel; 0 where that is below alpha_min."""
-    dx = pixels[:, 0] - splats.means2d[:, 0, None]
-    dy = pixels[:, 1] - splats.means2d[:, 1, None]
-    a, b, c = (splats.conics[:, i, None] for i in range(3))
+    u, v, a, b, c, log_opacities = (column[:, None] for column in columns[:6])
+    dx, dy = pixels[:, 0] - u, pixels[:, 1] - v
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
     # In logarithms, since what ends in the exponential XLA:CPU stores; the rest it would work out many times.
-    log_alpha = jnp.log(jnp.maximum(splats.opacities, 0.5 * limits.alpha_min))[:, None] + jnp.minimum(
-        power, 0.0
-    )
+    log_alpha = log_opacities + jnp.minimum(power, 0.0)
     ceiling = math.log(limits.alpha_max)
     saturated = log_alpha >= ceiling - SATURATION  # without gradient, there too where both are the same
     clamped = jnp.where(saturated, ceiling, log_alpha)
@@ -135,18 +152,31 @@ def composite_tile(
         state = start_tile(pixels.shape[0], channels, dtype)
     if length == 0:
         return state
-    chunk = chunk_length(channels)
-    if length > chunk:
-        return _composite_long(splats, pixels, state, limits, chunk)
+    columns, chunk = in_columns(splats, limits), chunk_length(channels)
+    if length <= chunk:
+        return composite_columns(columns, pixels, state, limits)
 
-    alphas = splat_alphas(splats, pixels, limits)
-    if channels > FEW_CHANNELS:
+    def chunked(a, empty):
+        a = jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1), constant_values=empty)
+        return a.reshape(-1, chunk, *a.shape[1:])
+
+    pieces = jax.tree.map(partial(chunked, empty=0), columns)
+    pieces = pieces._replace(log_opacities=chunked(columns.log_opacities, -jnp.inf))
+    return jax.lax.scan(
+        lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
+    )[0]
+
+
+def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits) -> TileState:
+    """`composite_tile` of one chunk."""
+    alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
+    if not isinstance(columns.values, tuple):
         weights, light = weights_of_many(alphas, state.light, limits)
-        painted = jnp.matmul(splats.values.astype(dtype).T, weights, precision="highest")
+        painted = jnp.matmul(columns.values.astype(dtype).T, weights, precision="highest")
         return TileState(state.values + painted, light)
     # Every channel goes through the light on its own, which costs less than to store the weights.
     values, light = state.values, jnp.broadcast_to(state.light, state.values.shape)
-    for alpha, value in zip(alphas, splats.values.astype(dtype), strict=True):
+    for alpha, value in zip(alphas, jnp.stack(columns.values).T.astype(dtype), strict=True):
         after = light * (1 - alpha)
         live = after > limits.min_transmittance
         values = values + jnp.where(live, alpha * light, 0.0) * value[:, None]
@@ -157,18 +187,6 @@ def composite_tile(
 def chunk_length(channels: int) -> int:
     """Gaussians that one pass over a tile's pixels takes."""
     return CHUNK if channels <= FEW_CHANNELS else MANY_CHUNK
-
-
-def _composite_long(splats: Splats, pixels, state: TileState, limits: Limits, chunk: int) -> TileState:
-    length = splats.opacities.shape[0]
-
-    def chunked(a):
-        return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1)).reshape(-1, chunk, *a.shape[1:])
-
-    def body(state, piece):
-        return composite_tile(piece, pixels, state, limits=limits), None
-
-    return jax.lax.scan(body, state, jax.tree.map(chunked, splats))[0]
 
 
 class Lists(NamedTuple):
@@ -208,29 +226,17 @@ def tile_pixels(plan: Plan, dtype) -> Float[Array, "pixels 2"]:
     return jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), dtype)
 
 
-def read_chunk(splats: Splats, lists: Lists, batch: Batches, first: Int[Array, ""], chunk: int):
-    """Ids and splats `first .. first + chunk - 1` of each tile of a batch; means from the tile's centre."""
+def read_chunk(columns: Columns, lists: Lists, batch: Batches, first: Int[Array, ""], chunk: int):
+    """Ids and columns `first .. first + chunk - 1` of each tile of a batch; means from the tile's centre."""
     entry = first + jnp.arange(chunk, dtype=jnp.int32)
     ids = lists.ids[jnp.minimum(batch.starts[:, None] + entry, lists.ids.shape[0] - 1)]
-
-    def rows(columns):
-        return jnp.stack([column[ids] for column in columns], axis=-1)
-
-    opacity = jnp.where(entry < batch.counts[:, None], splats.opacities[ids], 0.0)
-    mean = rows(splats.means2d) - batch.centers[:, None, :].astype(opacity.dtype)
-    values = rows(splats.values) if isinstance(splats.values, tuple) else splats.values[ids]
-    return ids, Splats(mean, rows(splats.conics), opacity, values)
-
-
-def in_columns(splats: Splats) -> Splats:
-    """Columns apart, for `read_chunk`: a gather of scalars is the quick one. Many channels stay rows."""
-
-    def columns(a):
-        return tuple(a[:, i] for i in range(a.shape[1]))
-
-    few = splats.values.shape[1] <= FEW_CHANNELS
-    values = columns(splats.values) if few else splats.values
-    return Splats(columns(splats.means2d), columns(splats.conics), splats.opacities, values)
+    piece = jax.tree.map(lambda column: column[ids], columns)
+    centers = batch.centers.astype(piece.u.dtype)
+    return ids, piece._replace(
+        u=piece.u - centers[:, :1],
+        v=piece.v - centers[:, 1:],
+        log_opacities=jnp.where(entry < batch.counts[:, None], piece.log_opacities, -jnp.inf),
+    )
 
 
 def still_read(
@@ -249,23 +255,19 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     length = lists.counts if reads is None else jnp.minimum(lists.counts, reads)
     batches = batch_tiles(lists, length, channels, plan)
-    columns = in_columns(splats)
-    compose = jax.vmap(partial(composite_tile, limits=plan.limits), in_axes=(0, None, 0))
+    columns = in_columns(splats, plan.limits)
+    compose = jax.vmap(partial(composite_columns, limits=plan.limits), in_axes=(0, None, 0))
     fresh = jax.vmap(lambda _: start_tile(plan.tile_pixels, channels, dtype))
 
     def one_batch(_, batch: Batches):
-        def unfinished(carry):
-            first, state, _ = carry
-            return jnp.any(still_read(batch, first, state.light))
-
         def step(carry):
-            first, state, read = carry
-            read = jnp.where(still_read(batch, first, state.light), first + chunk, read)
+            first, state, reading, read = carry
             _, piece = read_chunk(columns, lists, batch, first, chunk)
-            return first + chunk, compose(piece, pixels, state), read
+            first, state = first + chunk, compose(piece, pixels, state)
+            return first, state, still_read(batch, first, state.light), jnp.where(reading, first, read)
 
-        start = (jnp.int32(0), fresh(batch.counts), jnp.zeros_like(batch.counts))
-        _, state, read = jax.lax.while_loop(unfinished, step, start)
+        start = (jnp.int32(0), fresh(batch.counts), batch.counts > 0, jnp.zeros_like(batch.counts))
+        _, state, _, read = jax.lax.while_loop(lambda carry: jnp.any(carry[2]), step, start)
         return None, (state.values, state.transmittance, jnp.minimum(read, batch.counts))
 
     _, outputs = jax.lax.scan(one_batch, None, batches)

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.rasterize.compositing import (
     CHUNK,
-    FEW_CHANNELS,
     SATURATION,
     Batches,
+    Columns,
     Lists,
     Splats,
     batch_tiles,
@@ -70,7 +70,7 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
     behind = jnp.einsum("tcp,tcp->tp", values, d_values) + d_transmittance * transmittance
     constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}
     of_chunk = jax.vmap(partial(_chunk_gradients, **constants))
-    columns = in_columns(splats)
+    columns = in_columns(splats, plan.limits)
 
     def one_batch(total, batch: Batches):
         tile = jnp.maximum(batch.tiles, 0)
@@ -90,10 +90,12 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
         start = (jnp.int32(0), jnp.ones((len(tile), plan.tile_pixels), dtype), behind[tile], total)
         return jax.lax.while_loop(unfinished, step, start)[3], None
 
-    # One row a Gaussian: (u, v, A, B, C, opacity), then its values.
+    # One row a Gaussian: (u, v, A, B, C, log opacity), then its values.
     rows = jnp.zeros((splats.opacities.shape[0], 6 + channels), dtype)
     rows, _ = jax.lax.scan(one_batch, rows, batch_tiles(lists, reads, channels, plan))
-    d_splats = Splats(rows[:, :2], rows[:, 2:5], rows[:, 5], rows[:, 6:].astype(splats.values.dtype))
+    visible = splats.opacities > 0
+    d_opacities = jnp.where(visible, rows[:, 5] / jnp.where(visible, splats.opacities, 1.0), 0.0)
+    d_splats = Splats(rows[:, :2], rows[:, 2:5], d_opacities, rows[:, 6:].astype(splats.values.dtype))
     return d_splats, None, None
 
 
@@ -103,16 +105,16 @@ def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
     return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y, 0 * x, 0 * x], axis=-1)
 
 
-def _chunk_gradients(piece: Splats, d_image, light, behind, *, pixels, monomials, limits: Limits):
+def _chunk_gradients(piece: Columns, d_image, light, behind, *, pixels, monomials, limits: Limits):
     """(light, S) behind one chunk of one tile, and its rows of gradients: geometry, then values."""
-    channels, dtype = piece.values.shape[1], d_image.dtype
     alphas = splat_alphas(piece, pixels, limits)
     weights, light = weights_of_many(alphas, light, limits)
-    values = piece.values.astype(dtype)
-    if channels <= FEW_CHANNELS:
-        toward = sum(values[:, c, None] * d_image[c] for c in range(channels))
+    if isinstance(piece.values, tuple):
+        toward = sum(
+            value.astype(light.dtype)[:, None] * d for value, d in zip(piece.values, d_image, strict=True)
+        )
     else:
-        toward = jnp.matmul(values, d_image, precision="highest")
+        toward = jnp.matmul(piece.values.astype(light.dtype), d_image, precision="highest")
     d_values = jnp.matmul(weights, d_image.T, precision="highest")
     passed = weights * toward
     d_power = []
@@ -139,19 +141,16 @@ def _suffix(
     return suffix
 
 
-def _gradient_rows(piece: Splats, moments: Float[Array, "list 8"]) -> Float[Array, "list 6"]:
-    """Gradients of (u, v, A, B, C, opacity) from the moments of dL/dpower over a tile's pixels."""
-    u, v = piece.means2d[:, 0], piece.means2d[:, 1]
-    a, b, c = (piece.conics[:, i] for i in range(3))
+def _gradient_rows(piece: Columns, moments: Float[Array, "list 8"]) -> Float[Array, "list 6"]:
+    """Gradients of (u, v, A, B, C, log opacity) from the moments of dL/dpower over a tile's pixels."""
+    u, v, a, b, c = piece[:5]
     m, mx, my, mxx, mxy, myy = (moments[:, i] for i in range(6))
     # Moments about the Gaussian's own centre.
     sx, sy = mx - u * m, my - v * m
     sxx = mxx - 2 * u * mx + u * u * m
     sxy = mxy - u * my - v * mx + u * v * m
     syy = myy - 2 * v * my + v * v * m
-    opacity = piece.opacities
-    d_opacity = jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0)
-    return jnp.stack([a * sx + b * sy, b * sx + c * sy, -0.5 * sxx, -sxy, -0.5 * syy, d_opacity], axis=-1)
+    return jnp.stack([a * sx + b * sy, b * sx + c * sy, -0.5 * sxx, -sxy, -0.5 * syy, m], axis=-1)
 
 
 _composite.defvjp(_composite_fwd, _composite_bwd)

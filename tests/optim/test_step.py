@@ -1,5 +1,8 @@
 """Steps: they descend, they refuse what is not finite or overflowed, and they go through scan and vmap."""
 
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,7 @@ import optax
 import pytest
 from jaxtyping import Array, Float
 
-from gsjax.optim.compiler import host_options
+from gsjax import host_options
 from gsjax.optim.step import all_finite, gradient_step, keep_if, per_field_adam
 
 
@@ -165,6 +168,26 @@ def test_all_finite_looks_into_every_leaf_and_keep_if_chooses_whole_trees():
     other = {"a": jnp.full(3, jnp.nan), "b": jnp.ones(())}
     assert_same(keep_if(jnp.array(True), sound, other), sound)
     assert_same(keep_if(jnp.array(False), other, sound), sound)
+
+
+def test_memory_is_kept_between_calls():
+    """In a process of its own: the thresholds of malloc stay as they are until it ends."""
+    program = (
+        "import resource, numpy as np\n"
+        "from gsjax import keep_freed_memory\n"
+        "faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "def a_call():\n"
+        "    for _ in range(3): np.ones(2**23)\n"
+        "    before = faults()\n"
+        "    for _ in range(5): np.ones(2**23)\n"
+        "    return (faults() - before) / 5\n"
+        "print(a_call(), keep_freed_memory(), a_call())\n"
+    )
+    out = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    before, kept, after = out.split()
+    if kept == "False":
+        pytest.skip("this C library is not glibc")
+    assert float(after) < 0.2 * float(before), out
 
 
 def test_host_options_are_taken_by_an_outermost_jit():

@@ -100,7 +100,7 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
 
 @lru_cache(maxsize=8)
 def _compiled_update(treedef, shapes, **static):
-    """`_update` for arguments of this form; kept, so that a second sequence of the same sizes starts at once."""
+    """`_update` for arguments of this form; kept, so that a second sequence like the first starts at once."""
     return _update.lower(*jax.tree.unflatten(treedef, shapes), **static).compile(host_options())
 
 
