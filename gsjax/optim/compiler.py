@@ -22,7 +22,7 @@ def host_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if has_avx512 else {}
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 _KEPT = 2**30  # bytes: the largest array, and how much freed memory
 
 
@@ -31,9 +31,10 @@ def keep_freed_memory() -> bool:
 
     XLA:CPU allocates a program's temporary arrays anew in every call. glibc takes large ones from the kernel
     and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
-    for 110,000 Gaussians at 648x420. This raises its thresholds, for the whole process and until it ends.
-    The command line does so; call it once in a program of your own. MALLOC_MMAP_THRESHOLD_ and
-    MALLOC_TRIM_THRESHOLD_ in the environment do the same.
+    for 110,000 Gaussians at 648x420. This raises its thresholds, and has all threads share one heap, for what
+    threads have of their own ends at 64 MB. It holds for the whole process, but for threads that are there
+    already: call it once, before JAX computes anything. The command line does. MALLOC_MMAP_THRESHOLD_, MALLOC_TRIM_THRESHOLD_ and
+    MALLOC_ARENA_MAX in the environment do the same.
 
     Returns:
         whether it could: False where the C library is not glibc.
@@ -42,4 +43,5 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return False
-    return bool(mallopt(_MMAP_THRESHOLD, _KEPT)) and bool(mallopt(_TRIM_THRESHOLD, _KEPT))
+    wanted = {_MMAP_THRESHOLD: _KEPT, _TRIM_THRESHOLD: _KEPT, _ARENA_MAX: 1}
+    return all([mallopt(option, value) for option, value in wanted.items()])

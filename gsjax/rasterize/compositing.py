@@ -114,6 +114,7 @@ def splat_weights(
     return jnp.where(before * (1 - alphas) > limits.min_transmittance, alphas * before, 0.0)
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
 def weights_of_many(alphas, light, limits: Limits):
     """(`splat_weights` of a longer list, chunk by chunk; the light behind it)."""
     weights = []
@@ -122,6 +123,23 @@ def weights_of_many(alphas, light, limits: Limits):
         weights.append(splat_weights(piece, light, limits))
         light = dimmed(light, piece, limits)
     return jnp.concatenate(weights), light
+
+
+@weights_of_many.defjvp
+def _weights_of_many_jvp(limits: Limits, primals, tangents):
+    """Tangents one Gaussian after the other: those of the products above would be products of products."""
+
+    def step(carry, entry):
+        (light, d_light), (alpha, d_alpha) = carry, entry
+        after, d_after = light * (1 - alpha), d_light * (1 - alpha) - light * d_alpha
+        live = after > limits.min_transmittance
+        d_weight = jnp.where(live, d_alpha * light + alpha * d_light, 0.0)
+        ended = -jnp.abs(light), jnp.where(light > 0, -d_light, d_light)
+        return (jnp.where(live, after, ended[0]), jnp.where(live, d_after, ended[1])), d_weight
+
+    (alphas, light), (d_alphas, d_light) = primals, tangents
+    (_, d_light), d_weights = jax.lax.scan(step, (light, d_light), (alphas, d_alphas))
+    return weights_of_many(alphas, light, limits), (d_weights, d_light)
 
 
 def composite_tile(
