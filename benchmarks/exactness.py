@@ -13,8 +13,8 @@ from pathlib import Path
 
 import jax
 
-from benchmarks import machine
 from benchmarks.scenes import case, compare
+from gsjax.cli import machine
 
 RESULT = Path(__file__).parent / "results" / "exactness.json"
 SCENES = 52
@@ -58,7 +58,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=SCENES)
     count = parser.parse_args().scenes
-    print(f"{machine.in_words()}\nworst relative error of images | of gradients, in float64 and float32")
+    print(machine.in_words(machine.describe()))
+    print("worst relative error of images | of gradients, in float64 and float32")
     began, scenes = time.perf_counter(), []
     with jax.enable_x64(True):
         for seed in range(count):

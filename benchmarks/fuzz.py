@@ -29,9 +29,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import machine
 from benchmarks.scenes import ARRAYS, make_scene, relative_error
 from benchmarks.scenes import case as seeded
+from gsjax.cli import machine
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
@@ -357,7 +357,7 @@ def main() -> None:
         raise SystemExit(
             f"{arguments.case}: {outcome}; {failure}" if failure else f"{outcome}, as it should be"
         )
-    print(machine.in_words())
+    print(machine.in_words(machine.describe()))
     began = time.perf_counter()
     for mode in MODES:
         _error(mode, scene_of(mode, 0), run(mode, scene_of(mode, 0)).images)

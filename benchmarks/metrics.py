@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import machine
+from gsjax.cli import machine
 
 DIRECTIONS = ("lower", "higher", "same")
 DIGITS = 6
@@ -80,7 +80,7 @@ def make_record(metrics: Iterable[Metric], **details: Any) -> dict[str, Any]:
     return rounded(
         {
             "machine": machine.describe(),
-            "machine_name": machine.name(),
+            "machine_name": machine.name(machine.describe()),
             "versions": {name: version(name) for name in ("gsjax", "jax", "jaxlib", "numpy")},
             "commit": _commit(),
             "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M"),

@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import machine
 from benchmarks.floors import TILE, Floors, is_calm, measure_floors
 from benchmarks.growth import draw_growth, write_growth
 from benchmarks.measure import measure
@@ -16,6 +15,7 @@ from benchmarks.pages import STEP_COLUMNS, bottom_line, markdown, print_comparis
 from benchmarks.programs import BACKWARD, FORWARD, JVP
 from benchmarks.steps import STEPS, measure_step
 from benchmarks.workloads import QUICK, SUITE, Workload, choose
+from gsjax.cli import machine
 from gsjax.io.atomic import atomic_write, write_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -61,7 +61,7 @@ class Run:
         write_sorted(self.out / "bench.json", record)
         if drawing is not None:
             write_growth(drawing, self.out / "growth.png")
-        page = markdown({**record, "has_figure": drawing is not None}, machine.in_words())
+        page = markdown({**record, "has_figure": drawing is not None}, machine.in_words(machine.describe()))
         with atomic_write(self.out / "results.md") as temporary:
             temporary.write_text(page, encoding="utf-8")
         return record
@@ -135,7 +135,7 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
     out = options.out or (RESULTS if complete else PART)
     # Not a terminal: lines stay whole, so that other programs can read them.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
-    console.print(f"{machine.in_words()}; up to {repeats} calls each")
+    console.print(f"{machine.in_words(machine.describe())}; up to {repeats} calls each")
     found, finished = Run(out, complete, repeats), False
     try:
         _run_all(chosen, known, repeats, found, console)

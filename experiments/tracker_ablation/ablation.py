@@ -35,13 +35,9 @@ def without_alignment(config: TrackerConfig) -> TrackerConfig:
     return replace(config, align=replace(config.align, iterations=0, reach=0.0, turns=(0.0,)))
 
 
-def without_matching(config: TrackerConfig) -> TrackerConfig:
-    return replace(config, match=replace(config.match, min_score=2.0))
-
-
 VARIANTS = {
     "all on": FULL,
-    "no template matching": without_matching(FULL),
+    "no template matching": replace(FULL, matching=False),
     "translation only": replace(
         FULL, align=replace(FULL.align, max_turn=0.0), refine=replace(FULL.refine, rotation_rate=0.0)
     ),
@@ -50,7 +46,7 @@ VARIANTS = {
     ),
     "no warm start": replace(FULL, warm_start=False),
     "no alignment": without_alignment(FULL),
-    "no alignment, no matching": without_alignment(without_matching(FULL)),
+    "no alignment, no matching": without_alignment(replace(FULL, matching=False)),
 }
 
 

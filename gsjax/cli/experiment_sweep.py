@@ -22,8 +22,8 @@ from typing import Any
 
 import yaml
 
+from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import describe
-from gsjax.cli.summary import machine
 from gsjax.io.atomic import write_json
 
 CONFIG, RESULTS = "config.yaml", "results.json"
@@ -201,7 +201,7 @@ def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bo
         "seconds": perf_counter() - begun,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "script": experiment.fingerprint,
-        "machine": machine(),  # asked after the script ran, which may configure JAX first
+        "machine": describe_machine(),  # asked after the script ran, which may configure JAX first
         "gsjax": import_module("gsjax").__version__,
     }
     write_json(path, record)

@@ -1,11 +1,8 @@
 """A run in words: the tables at the end of the terminal, and the same on the report's page."""
 
-import os
-import platform
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 from rich.console import Console
 from rich.table import Table as Grid
 
@@ -58,24 +55,6 @@ TIMES = (
     ("total", "all of it"),
 )
 _MOVED_MM = 30.0  # an object that moved less says little about a tracker
-
-
-def machine() -> dict[str, Any]:
-    """What ran it: processor, cores, and JAX's device. No name that someone gave it."""
-    cpu, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
-    if info.exists():
-        lines = info.read_text().splitlines()
-        cpu = next((line.split(":", 1)[1].strip() for line in lines if "model name" in line), cpu)
-    devices = jax.devices()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "processor": cpu,
-        "cores": cores,
-        "device": devices[0].device_kind,
-        "devices": len(devices),
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-    }
 
 
 def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
@@ -162,7 +141,7 @@ def write_run_report(
             *_table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
             _time_table(found["seconds"]),
         ],
-        notes=[*found["notes"], _machine_note(found["machine"])],
+        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
 
 
@@ -217,13 +196,6 @@ def _table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], 
 def _time_table(seconds: dict[str, float]) -> Table:
     rows = [[says, seconds.get(name)] for name, says in TIMES]
     return Table("Time", ("what", "time"), rows, ("", "s"), decimals=(None, 2))
-
-
-def _machine_note(machine: dict[str, Any]) -> str:
-    return (
-        f"Machine: {machine['processor']}, {machine['cores']} cores; JAX {machine['jax']} on "
-        f"{machine['devices']} × {machine['device']}; Python {machine['python']}."
-    )
 
 
 def _cameras(ids: list[int]) -> str:

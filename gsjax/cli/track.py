@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from gsjax.cli.loop import Tracking, follow
+from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, describe, say_error
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
 from gsjax.cli.recording import (
@@ -24,7 +25,7 @@ from gsjax.cli.recording import (
 from gsjax.cli.report import format_number
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
-from gsjax.cli.summary import machine, print_summary, write_run_report
+from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
 from gsjax.scene.frame import Frame
@@ -205,7 +206,7 @@ def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores:
         },
         "plans": tracking.plans,
         "updates_skipped": tracking.skipped,
-        "machine": machine(),
+        "machine": describe_machine(),
     }
 
 

@@ -15,11 +15,14 @@ def host_options() -> dict[str, Any]:
     Use it as `jax.jit(f, compiler_options=host_options())`, or with `.lower(...).compile(host_options())`,
     and for the outermost jit of a host loop only: inside another trace, options raise.
     """
-    if jax.default_backend() != "cpu":
-        return {}
+    wide = jax.default_backend() == "cpu" and has_avx512()
+    return {"xla_cpu_prefer_vector_width": 512} if wide else {}
+
+
+def has_avx512() -> bool:
+    """Whether this machine's processor has registers of 512 bits; False where that is not known."""
     cpuinfo = Path("/proc/cpuinfo")
-    has_avx512 = cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
-    return {"xla_cpu_prefer_vector_width": 512} if has_avx512 else {}
+    return cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
@@ -33,8 +36,8 @@ def keep_freed_memory() -> bool:
     and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
     for 110,000 Gaussians at 648x420. This raises its thresholds, and has all threads share one heap, for what
     threads have of their own ends at 64 MB. It holds for the whole process, but for threads that are there
-    already: call it once, before JAX computes anything. The command line does. MALLOC_MMAP_THRESHOLD_, MALLOC_TRIM_THRESHOLD_ and
-    MALLOC_ARENA_MAX in the environment do the same.
+    already: call it once, before JAX computes anything. The command line does. MALLOC_MMAP_THRESHOLD_,
+    MALLOC_TRIM_THRESHOLD_ and MALLOC_ARENA_MAX in the environment do the same.
 
     Returns:
         whether it could: False where the C library is not glibc.

@@ -90,7 +90,7 @@ def background_of(scene: TrackedScene) -> np.ndarray:
 def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, centroid_errors):
     """Without matching nothing is found; without a warm start the last motion changes nothing."""
     sequence, frames, _ = table()
-    config = replace(quick, warm_start=False, match=replace(quick.match, min_score=1.1))
+    config = replace(quick, warm_start=False, matching=False)
     before, last = tracked[0], tracked[1]
     arguments = {"pose": before.pose, "state": before.state}
     (result,) = track(before.scene, frames[1], frames[2:3], config, **arguments)

@@ -53,7 +53,7 @@ class MatchConfig:
     radius: int = 24
     """How far the template is searched to each side, pixels of the reduced image."""
     min_score: float = 0.3
-    """A correlation below this moves nothing; more than 1 leaves matching out."""
+    """A correlation below this moves nothing."""
     margin: int = 2
     """Pixels by which the object's mask is grown: an outline against its surroundings is texture too."""
     max_residual: float = 0.03
@@ -182,6 +182,8 @@ class TrackerConfig:
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     grow: GrowConfig = field(default_factory=GrowConfig)
+    matching: bool = True
+    """Look for each object by template matching first. Without, it is found from where it was."""
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
     headroom: float = 1.5

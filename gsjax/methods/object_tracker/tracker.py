@@ -203,7 +203,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
 def _match(last: Rendered, frame: Frame, num_objects: int, config: TrackerConfig, reduction: int):
     """Where template matching says that each group has gone, whether it found it, and its scores [C, K]."""
-    if config.match.min_score > 1:  # which no correlation is
+    if not config.matching:
         num_cameras = len(frame.images)
         return (
             jnp.zeros((num_objects, 3)),

@@ -1,0 +1,40 @@
+"""What a result was made on. No name that someone gave the machine."""
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from gsjax.optim.compiler import has_avx512
+
+
+def describe() -> dict[str, Any]:
+    """Processor and the cores that this process may use, JAX's devices, and versions."""
+    devices, cpuinfo = jax.devices(), Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    return {
+        "processor": processor or platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "avx512": has_avx512(),
+        "device": devices[0].device_kind,
+        "devices": len(devices),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def name(machine: dict[str, Any]) -> str:
+    """What two runs must share for their milliseconds to be compared: processor, cores and device."""
+    device = "" if machine["device"] == "cpu" else f", {machine['device']}"
+    return f"{machine['processor']}, {machine['cores']} cores{device}"
+
+
+def in_words(machine: dict[str, Any]) -> str:
+    """On one line, for people."""
+    extra = ", AVX-512" if machine["avx512"] else ""
+    devices = f"{machine['devices']} x " if machine["devices"] > 1 else ""
+    versions = f"JAX {machine['jax']}, Python {machine['python']}, {devices}{machine['device']}"
+    return f"{machine['processor']}, {machine['cores']} cores{extra}; {versions}"
