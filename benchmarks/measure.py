@@ -110,17 +110,18 @@ def run_program(compiled: Compiled, pool: list[dict], first_reads, repeats: int)
         RuntimeError: a perturbed scene did not fit the plan, so the times are of a call that drew nothing.
     """
     last: list[Any] = [None, (first_reads, None, None)]
+    overflows = []
 
     def call(i: int):
         reads = None if first_reads is None else last[1][0]
         last[:] = compiled.run(pool[i % len(pool)], reads)
+        overflows.append(last[1][2])
         return last
 
     seconds = sample(call, repeats)
-    _, pairs, overflow = last[1]
-    if bool(overflow.any()):
+    if any(bool(overflow.any()) for overflow in overflows):
         raise RuntimeError("the plan was too small for a perturbed scene; its headroom must grow")
-    return seconds, int(pairs.sum())
+    return seconds, int(last[1][1].sum())
 
 
 def measure(

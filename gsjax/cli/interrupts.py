@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__"})
-"""Functions in which exceptions are dropped: callbacks of the garbage collector, and finalizers. Callbacks of
-weak references are a third kind, known by their file."""
+DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__", "called_by_xla"})
+"""Functions in which exceptions are dropped: callbacks of the garbage collector and of XLA, and finalizers.
+Callbacks of weak references are a fourth kind, known by their file."""
 RETRY_S = 0.01
 
 

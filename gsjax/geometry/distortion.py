@@ -58,11 +58,12 @@ def distort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv")
     """Where a lens moves normalised points. Zero coefficients of "opencv" move nothing by a bit.
 
     Far out the polynomials fold back, and a point that the camera cannot see may land in the image. What is
-    not finite, or so far out that r^6 is not, becomes NaN with gradients of zero.
+    not finite, or so far out that r^6 is not, becomes NaN with gradients of zero; if coefficients are not
+    finite, all points do.
     """
-    c = _padded(coeffs, model)
+    c, sound = _padded(coeffs, model)
     r2 = jnp.sum(points * points, axis=-1, keepdims=True)
-    known = jnp.isfinite(r2 * r2 * r2)
+    known = jnp.isfinite(r2 * r2 * r2) & sound
     flat = jnp.where(known, points, 0.0)
     if model == "opencv_fisheye":
         flat = flat * _atan_over_r(jnp.sum(flat * flat, axis=-1, keepdims=True))
@@ -73,12 +74,13 @@ def undistort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv
     """The inverse of `distort`, by Newton's method, with the exact derivative of the implicit function.
 
     Not valid are points beyond the fold (nothing is distorted to there), those nearer to it than a condition
-    number of 1e4, those 90 degrees off axis, and what is not finite. There the result is finite and its
-    gradients are zero.
+    number of 1e4, those 90 degrees off axis, and what is not finite; no point is if coefficients are not.
+    There the result is finite and its gradients are zero.
     """
-    c = _padded(coeffs, model)
+    c, sound = _padded(coeffs, model)
     dtype = jnp.result_type(points, c)
-    solution, valid = _unbend(points.astype(dtype), c.astype(dtype))
+    points = jnp.where(sound, points, jnp.nan).astype(dtype)
+    solution, valid = _unbend(points, c.astype(dtype))
     if model == "opencv_fisheye":
         t2 = jnp.sum(solution * solution, axis=-1, keepdims=True)
         ahead = t2 < _HORIZON**2
@@ -177,15 +179,19 @@ def sample(image: Image, pixels: Float[Array, "height width 2"]) -> Warped:
     return Warped(jnp.where(valid[..., None], total, 0.0), valid)
 
 
-def _padded(coeffs: Coeffs, model: str) -> Float[Array, "9"]:
-    """Coefficients of `_bend`: the numerator's of r^2 to r^8, the denominator's of r^2 to r^6, p1, p2."""
+def _padded(coeffs: Coeffs, model: str) -> tuple[Float[Array, "9"], Bool[Array, ""]]:
+    """Coefficients of `_bend`: the numerator's of r^2 to r^8, the denominator's of r^2 to r^6, p1, p2.
+
+    Zeros, and False, if one of them is not finite.
+    """
     if model not in MODELS:
         raise ValueError(f"model is one of {', '.join(MODELS)}, not {model!r}")
     counts, coeffs = MODELS[model], jnp.asarray(coeffs)
     if coeffs.ndim != 1 or len(coeffs) not in counts:
         raise ValueError(f"coeffs of {model} are {counts} in number, but have shape {coeffs.shape}")
     order = (0, 1, 2, 3, 8, 8, 8, 8, 8) if model == "opencv_fisheye" else (0, 1, 4, 8, 5, 6, 7, 2, 3)
-    return jnp.pad(coeffs, (0, 9 - len(coeffs)))[np.array(order)]
+    sound = jnp.isfinite(coeffs).all()
+    return jnp.pad(jnp.where(sound, coeffs, 0.0), (0, 9 - len(coeffs)))[np.array(order)], sound
 
 
 def _bend(points: Float[Array, "*n 2"], c: Float[Array, "9"]) -> Float[Array, "*n 2"]:

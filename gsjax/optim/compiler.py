@@ -40,11 +40,12 @@ def keep_freed_memory() -> bool:
     MALLOC_TRIM_THRESHOLD_ and MALLOC_ARENA_MAX in the environment do the same.
 
     Returns:
-        whether it could: False where the C library is not glibc.
+        whether it could: False where the C library is not glibc of 2.35 or later, and nothing is changed.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return False
-    wanted = {_MMAP_THRESHOLD: _KEPT, _TRIM_THRESHOLD: _KEPT, _ARENA_MAX: 1}
-    return all([mallopt(option, value) for option, value in wanted.items()])
+    if not mallopt(_MMAP_THRESHOLD, _KEPT):  # older ones refuse that, and the rest alone would do harm
+        return False
+    return bool(mallopt(_TRIM_THRESHOLD, _KEPT)) and bool(mallopt(_ARENA_MAX, 1))

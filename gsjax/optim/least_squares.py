@@ -72,8 +72,8 @@ def solve(
 ) -> tuple[PyTree, dict[str, Any]]:
     """The parameters that minimise half the sum of squared residuals.
 
-    Compiled once for a residual function (the same object) and its shapes; goes through jit, vmap and scan.
-    It has no derivative.
+    Compiled once for a residual function (the same object), shapes, `jac` and `max_steps`; goes through jit,
+    vmap and scan. It has no derivative.
 
     Args:
         residual: as above. Where `aux["overflow"]` is True its values count as infinite (`reject_overflow`).
@@ -94,7 +94,7 @@ def solve(
         ValueError: `jac` or `damping` is none of these, or `params` has leaves that are not floating.
     """
     _check(jac, damping)
-    params, batch, step = jax.tree.map(_traced, (params, batch, step))
+    params, batch, step, damping = jax.tree.map(_traced, (params, batch, step, damping))
     return _solve(residual, params, batch, solver, jac, damping, max_steps, step, key)
 
 

@@ -1,8 +1,9 @@
 """Which tiles a Gaussian touches, and each tile's list from front to back.
 
 Gaussians are ranked by depth. Each is expanded to the rows of tiles that its ellipse crosses, and in every
-row to the columns between which it lies there; so the list of pairs is exact before it is laid out. Pairs
-are sorted by (tile, rank). Lists have any length: nothing but the total is bounded.
+row to the columns between which it lies there; so the list of pairs is known before it is laid out: every
+tile where it reaches alpha_min at a pixel's centre, and the few between centres or within rounding. Pairs are
+sorted by (tile, rank). Lists have any length: nothing but the total is bounded.
 """
 
 from typing import NamedTuple
@@ -48,7 +49,7 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     first_row, num_rows = _rows(projected, tile_mask, plan)
     first_row, num_rows = first_row[by_depth], num_rows[by_depth]
     rows = _total(num_rows)
-    enough_rows = 2 * rows.astype(jnp.float32) <= plan.capacity
+    enough_rows = rows <= plan.capacity // 2
     num_rows = jnp.where(enough_rows, num_rows, 0)
     spans = _spans(projected, tile_mask, by_depth, first_row, num_rows, plan)
     pairs = _total(spans.count)
@@ -76,7 +77,7 @@ def needed_capacity(
     """What `bin_gaussians` needs: exactly, if the capacity holds twice the rows; else twice the rows."""
     first_row, num_rows = _rows(projected, tile_mask, plan)
     rows = _total(num_rows)
-    num_rows = jnp.where(2 * rows.astype(jnp.float32) <= plan.capacity, num_rows, 0)
+    num_rows = jnp.where(rows <= plan.capacity // 2, num_rows, 0)
     unordered = jnp.arange(num_rows.shape[0], dtype=jnp.int32)
     spans = _spans(projected, tile_mask, unordered, first_row, num_rows, plan)
     return jnp.maximum(_total(spans.count), _doubled(rows))

@@ -47,6 +47,8 @@ def check_inputs(
     """
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     arrays |= {"viewmats": viewmats, "Ks": Ks}
+    more = {"backgrounds": backgrounds, "features": features, "means2d_offset": means2d_offset}
+    arrays |= {name: array for name, array in more.items() if array is not None}
     for name, array in arrays.items():
         if not hasattr(array, "dtype"):
             raise ValueError(f"{name} must be an array; got {type(array).__name__}")
@@ -73,7 +75,7 @@ def check_inputs(
     colors = _check_colors(colors, plan, lead, num_cameras, n)
 
     scenes = math.prod(lead)
-    dtype = jnp.result_type(means, quats, scales, opacities, colors, viewmats, Ks, jnp.float32)
+    dtype = jnp.result_type(*arrays.values(), jnp.float32)
 
     def flat(array, inner, stored=False):
         half = stored and jnp.asarray(array).dtype in (jnp.bfloat16, jnp.float16)

@@ -227,8 +227,7 @@ class Batches(NamedTuple):
 def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: Plan) -> Batches:
     """All tiles by falling `length`, an estimate of how far each is read, of speed alone."""
     order = argsort_keys(jnp.iinfo(jnp.int32).max - length.astype(jnp.uint32), plan.sort)
-    # With many channels it is the values that must stay in cache.
-    size = min(max(1, plan.batch_size * FEW_CHANNELS // max(channels, FEW_CHANNELS)), order.shape[0])
+    size = min(plan.batch_size(channels), order.shape[0])
     order = jnp.pad(order, (0, -order.shape[0] % size), constant_values=-1).reshape(-1, size)
     tile = jnp.maximum(order, 0)
     within = tile % plan.num_tiles

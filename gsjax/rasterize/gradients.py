@@ -67,7 +67,7 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
     d_values, d_transmittance, _ = cotangents
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
-    behind = jnp.einsum("tcp,tcp->tp", values, d_values) + d_transmittance * transmittance
+    behind = (values * d_values).sum(axis=1) + d_transmittance * transmittance
     constants = {"pixels": pixels, "monomials": _monomials(pixels), "limits": plan.limits}
     of_chunk = jax.vmap(partial(_chunk_gradients, **constants))
     columns = in_columns(splats, plan.limits)

@@ -6,6 +6,7 @@ cannot hang on a machine with a single core.
 """
 
 import ctypes
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 _EXTENSION_METADATA = 1  # XLA asks which version of the interface a handler speaks
-_VERSION = (0, 1)  # the oldest that has what is used here: newer runtimes accept it
+_VERSION = (0, 1)  # the oldest that has what is used here: newer runtimes accept it for a year at least
 _INTERNAL_ERROR = 13
 
 
@@ -88,24 +89,24 @@ def _views(buffers) -> list[np.ndarray]:
 def _handler(work: Callable[..., None]) -> ctypes._CFuncPtr:
     """`work(*inputs, output)` on numpy views, as a function that XLA can call."""
 
-    def call(pointer):
+    def called_by_xla(pointer):  # nothing that it raises would be heard: all is caught, Ctrl-C too
         frame = pointer.contents
-        if frame.extension:
-            extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
-            if extension.type == _EXTENSION_METADATA:
-                version = extension.metadata.contents.version
-                version.major, version.minor = _VERSION
-                return None
         try:
+            if frame.extension:
+                extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
+                if extension.type == _EXTENSION_METADATA:
+                    version = extension.metadata.contents.version
+                    version.major, version.minor = _VERSION
+                    return None
             work(*_views(frame.args), *_views(frame.rets))
-        except Exception as error:
+        except BaseException as error:
             api = ctypes.cast(frame.api, ctypes.POINTER(_Api)).contents
             message = f"{work.__name__} on the host failed: {type(error).__name__}: {error}".encode()
             args = _ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message, _INTERNAL_ERROR)
             return _CreateError(api.create_error)(ctypes.byref(args))
         return None
 
-    return _Handler(call)
+    return _Handler(called_by_xla)
 
 
 _HANDLERS: dict[str, Any] = {}  # kept alive: XLA holds their addresses
@@ -123,7 +124,10 @@ def register(name: str, work: Callable[..., None]) -> bool:
     try:
         address = ctypes.cast(handler, ctypes.c_void_p)
         jax.ffi.register_ffi_target(name, capsule(address, None, None), platform="cpu")
-    except Exception:
+    except Exception as error:
+        warnings.warn(
+            f"gsjax sorts without numpy, which is slower: XLA refused {name}: {error}", stacklevel=2
+        )
         return False
     _HANDLERS[name] = handler
     return True

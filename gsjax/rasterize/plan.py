@@ -93,8 +93,15 @@ class Plan:
                 continue
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
-        if not self.near_plane < self.far_plane:
-            raise ValueError(f"near_plane {self.near_plane} must be below far_plane {self.far_plane}")
+        if not isinstance(self.capacity, int) or (self.capacity < 2 and self.capacity != 0):
+            raise ValueError(
+                f"capacity must be a Python int of 2 or more, or 0, which is yet to be planned; "
+                f"got {self.capacity!r}"
+            )
+        if not 0 <= self.near_plane < self.far_plane:
+            raise ValueError(
+                f"near_plane {self.near_plane} must be 0 or more, and below far_plane {self.far_plane}"
+            )
         for name in Limits._fields:
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} must lie between 0 and 1; got {getattr(self, name)}")
@@ -123,10 +130,9 @@ class Plan:
     def tile_pixels(self) -> int:
         return self.tile_size * self.tile_size
 
-    @property
-    def batch_size(self) -> int:
-        """Tiles composited together."""
-        return self.tiles_per_batch or max(1, _BATCH_PIXELS // self.tile_pixels)
+    def batch_size(self, channels: int) -> int:
+        """Tiles composited together. By default as many as stay in cache, with the values of all channels."""
+        return self.tiles_per_batch or max(1, 8 * _BATCH_PIXELS // (max(channels, 8) * self.tile_pixels))
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.

@@ -18,6 +18,7 @@ from gsjax.rasterize.binning import bin_gaussians, needed_capacity
 from gsjax.rasterize.checks import check_inputs, is_concrete
 from gsjax.rasterize.compositing import Lists, Splats
 from gsjax.rasterize.gradients import composite
+from gsjax.rasterize.lanes import LANES
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
 from gsjax.rasterize.projection import Projected, project_gaussians
 
@@ -109,7 +110,7 @@ def rasterization(
         eps2d: variance added on the image, square pixels (default 0.3).
         sh_degree: degree to which coefficients are read, 0 to 3 (default None: colors are values).
         backgrounds: value behind everything, one row a camera, of the colours' dimension; black unless given,
-            and where it is not finite.
+            and where its square is not finite (nothing counts that: it shows).
         render_mode: RGB (default), D (sum of w z), ED (D over alpha), RGB+D or RGB+ED: depth comes last.
         rasterize_mode: classic (default) or antialiased.
         features: more values [N, F], composited in the same pass into `meta.features`, without background. In
@@ -288,7 +289,7 @@ def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
 def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, reads, plan: Plan):
     """Bin and composite all views at once, every view's tiles after the last one's."""
     num_views, n, channels = values.shape
-    if num_views * max(n, plan.capacity) >= 2**31:
+    if num_views * max(n, plan.capacity + LANES) >= 2**31:
         raise ValueError(
             f"{num_views} views of {n} Gaussians and {plan.capacity} pairs each are more than 32-bit indices "
             "reach; draw fewer cameras or scenes at a time"

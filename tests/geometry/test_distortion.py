@@ -245,6 +245,14 @@ def test_what_is_not_finite_spoils_no_neighbour_and_no_gradient(lens):
             points, valid = jitted_undistort(spoilt, coeffs, model)
             np.testing.assert_array_equal(valid, [True, True, False, True, True])
             assert np.isfinite(points).all()
+        for poison in (np.nan, np.inf):
+            broken = coeffs.at[1].set(poison)
+            assert np.isnan(jitted_distort(clean, broken, model)).all()
+            points, valid = jitted_undistort(clean, broken, model)
+            assert np.isfinite(points).all()
+            assert not valid.any()
+            for by in gradient(clean, broken):
+                np.testing.assert_array_equal(by, 0.0)
 
 
 def test_jit_and_vmap_are_the_loop():

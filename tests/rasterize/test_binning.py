@@ -50,8 +50,9 @@ def test_lists_hold_every_pair_that_a_pixel_sees_front_to_back(seed, size, needl
         assert len(set(here)) == len(here)
         assert (np.diff(depths[here]) >= 0).all()
         listed |= {(tile, int(i)) for i in here}
-    missing = seen_pairs(projected) - listed
-    assert not missing
+    seen = seen_pairs(projected)
+    assert not seen - listed
+    assert len(listed - seen) <= 0.1 * len(seen) + 3  # between pixel centres, or within rounding
     assert len(listed) == int(lists.pairs) <= int(lists.needed) == int(needed)
 
 

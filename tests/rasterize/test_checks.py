@@ -55,6 +55,8 @@ def call(**changes):
         ({"means2d_offset": zeros(5, 2)}, r"means2d_offset must have shape \(2, 5, 2\).*got \(5, 2\)"),
         ({"means": [[0.0] * 3] * 5}, "means must be an array; got list"),
         ({"means": jnp.zeros((5, 3), int)}, "means must hold floats; got int32"),
+        ({"features": [[0.0] * 7] * 5}, "features must be an array; got list"),
+        ({"backgrounds": jnp.zeros((2, 3), int)}, "backgrounds must hold floats; got int32"),
     ],
 )
 def test_a_wrong_shape_is_named(changes, says):

@@ -48,6 +48,13 @@ def test_a_plan_grows_and_never_shrinks():
         small.grown(np.iinfo(np.int32).max)
 
 
+@pytest.mark.usefixtures("as_users_run")
+def test_a_capacity_that_holds_nothing_is_refused():
+    for capacity in (-16, 1, 1e5):
+        with pytest.raises(ValueError, match=f"capacity must be a Python int of 2 or more.*got {capacity}"):
+            Plan(32, 32, capacity)
+
+
 @pytest.mark.parametrize(
     ("option", "says"),
     [
@@ -61,7 +68,8 @@ def test_a_plan_grows_and_never_shrinks():
         ({"width": 0}, "width must be a positive Python int"),
         ({"height": 2.5}, "height must be a positive Python int"),
         ({"tiles_per_batch": 0}, "tiles_per_batch must be a positive"),
-        ({"near_plane": 2.0, "far_plane": 1.0}, "near_plane 2.0 must be below far_plane 1.0"),
+        ({"near_plane": 2.0, "far_plane": 1.0}, "near_plane 2.0 must be 0 or more, and below far_plane 1.0"),
+        ({"near_plane": -1.0}, "near_plane -1.0 must be 0 or more"),
         ({"alpha_max": 1.0}, "alpha_max must lie between 0 and 1"),
         ({"eps2d": -0.1}, "eps2d must not be negative"),
     ],

@@ -70,14 +70,18 @@ def test_vmap_repeats_every_row():
     np.testing.assert_array_equal(one_for_all[1], repeat(values[0], starts[1], 40))
 
 
-def test_a_failure_on_the_host_is_an_error_with_its_words():
-    def fail(keys, out):
-        raise MemoryError("no room")
+@pytest.mark.parametrize("error", [MemoryError("no room"), KeyboardInterrupt("no room")])
+def test_a_failure_on_the_host_is_an_error_with_its_words(error):
+    """Ctrl-C too: what a callback of C raises is printed and lost, and its result would be garbage."""
 
-    assert host.register("gsjax_fail", fail)
+    def fail(keys, out):
+        raise error
+
+    name = f"gsjax_{type(error).__name__}"
+    assert host.register(name, fail)
     keys = jnp.zeros(3, jnp.uint32)
-    with pytest.raises(Exception, match="fail on the host failed: MemoryError: no room"):
-        jax.block_until_ready(host.call("gsjax_fail", jax.ShapeDtypeStruct((3,), jnp.uint32), keys))
+    with pytest.raises(Exception, match=f"fail on the host failed: {type(error).__name__}: no room"):
+        jax.block_until_ready(host.call(name, jax.ShapeDtypeStruct((3,), jnp.uint32), keys))
 
 
 def test_without_the_interface_xla_sorts(monkeypatch):
@@ -85,7 +89,8 @@ def test_without_the_interface_xla_sorts(monkeypatch):
         raise RuntimeError("unknown version")
 
     monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
-    assert not host.register("gsjax_sort", sorting._sort_into)
+    with pytest.warns(UserWarning, match="gsjax sorts without numpy.*gsjax_sort: unknown version"):
+        assert not host.register("gsjax_sort", sorting._sort_into)
     monkeypatch.setattr(sorting, "_AVAILABLE", False)
     np.testing.assert_array_equal(sort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 3])
     np.testing.assert_array_equal(argsort_keys(jnp.array([3, 1, 2], jnp.uint32)), [1, 2, 0])
