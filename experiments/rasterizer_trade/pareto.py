@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-SAME = 120.0  # dB
+SAME = 120.0  # dB: more is rounding, and stands as this
 CLOSEST = 1e-7  # 1 - cosine: closer is rounding
 NINES = {
     1e-7: "1",
@@ -69,6 +69,8 @@ def draw_lines(axes: Axes, rows: list[dict[str, Any]], time: str, height) -> Non
             continue
         points = np.array([(1.0 if row["is_default"] else row[time], height(row)) for row in mine])
         axes.plot(*points.T, color=color, marker=marker, label=knob, linewidth=1.2, markersize=7, alpha=0.85)
+        doubts = [0.0 if row["is_default"] else row[time.replace("ratio", "doubt")] for row in mine]
+        axes.errorbar(*points.T, xerr=doubts, fmt="none", ecolor=color, elinewidth=3, alpha=0.35)
         values = [label_of(row) for row in mine]
         axes.labelled += [(p, v, color) for p, v in zip(points, values, strict=True) if v is not None]
     best = height({"psnr": SAME, "gradient_cosine": 1.0})
@@ -97,7 +99,7 @@ def place_labels(axes: Axes) -> None:
     """Each value beside its point, in the first place that no other label or point takes."""
     spots = axes.transData.transform([point for point, *_ in axes.labelled])
     taken = []
-    for (point, text, color), _ in zip(axes.labelled, spots, strict=True):
+    for point, text, color in axes.labelled:
         for offset in OFFSETS:
             label = axes.annotate(
                 text, point, offset, textcoords="offset points", color=color, fontsize=10, ha="center"

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table as Grid
 
+from gsjax.cli.machine import in_words
 from gsjax.cli.report import Media, Table, format_number, write_report
 from gsjax.cli.run_folder import RunFolder
 
