@@ -151,6 +151,10 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
         rows = compare(record, baseline)
         print_comparison(console, rows, baseline)
         if options.check and finished:
+            if all(row.verdict == "new" for row in rows):
+                raise ValueError(
+                    f"--check: {path} has none of what was measured; leave --quick or --only out"
+                )
             code = int(any(row.verdict in FAILING for row in rows))
     if options.update_baseline and finished:
         write_sorted(path, merged(record, baseline))

@@ -113,8 +113,11 @@ class Experiment:
 
     @property
     def fingerprint(self) -> str:
-        """Changes with the script and with the config's version: what was made under another one is stale."""
-        return hashlib.sha256(f"{self.config.version}\n{self.text}".encode()).hexdigest()[:16]
+        """Changes with the script, with what stands beside it and with the config's version: what was made
+        under another one is stale."""
+        beside = sorted(path for path in self.script.parent.glob("*.py") if path.name != self.script.name)
+        texts = [self.text, *(path.read_text(encoding="utf-8") for path in beside)]
+        return hashlib.sha256("\n".join([str(self.config.version), *texts]).encode()).hexdigest()[:16]
 
     def path(self, cell: Cell) -> Path:
         """The file of a cell that ran on this machine."""

@@ -177,8 +177,10 @@ def resolve(plan: Plan | None, width: int, height: int, options: dict[str, Any])
     """The plan a call runs under; without one, a plan of the given options whose capacity is still 0.
 
     Raises:
-        ValueError: an explicit option contradicts the plan.
+        ValueError: an explicit option contradicts the plan, or that is none.
     """
+    if not isinstance(plan, Plan | None):
+        raise ValueError(f"plan must be a gsjax.Plan, from gsjax.plan(...); got {type(plan).__name__}")
     given = {name: value for name, value in options.items() if value is not UNSET}
     if plan is None:
         return Plan(width=width, height=height, capacity=0, **given)

@@ -197,9 +197,10 @@ def _planned(views, bare: Plan, headroom: float) -> Plan:
     values = jax.lax.stop_gradient(views)
     if not is_concrete(values):
         raise ValueError(
-            "rasterization without a plan looks at values, and these are traced (jit, vmap or scan). Call "
-            "plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, "
-            "with typical values, and pass plan=plan inside; meta.overflow tells if it becomes too small"
+            "rasterization without a plan, or with one of capacity 0, looks at values, and these are traced "
+            "(jit, vmap or scan). Call plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, "
+            "width, height, ...) outside, with typical values, and pass plan=plan inside; meta.overflow tells "
+            "if it becomes too small"
         )
     if values[0].shape[1] == 0:
         return bare.grown(0, headroom)

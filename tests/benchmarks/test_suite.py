@@ -262,6 +262,10 @@ def test_a_run_from_end_to_end(bench, tmp_path):
     code, said = bench(only=("ball-1e3-48x32",), check=True)
     assert code == 1
     assert "worse  ball-1e3-48x32/pairs: 1.00 -> " in said
+    stored["metrics"] = {"another/pairs": stored["metrics"]["ball-1e3-48x32/pairs"]}
+    baseline.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"--check: .* has none of what was measured"):
+        bench(only=("ball-1e3-48x32",), check=True)
 
 
 def test_ctrl_c_keeps_what_was_measured(bench, tmp_path, monkeypatch):

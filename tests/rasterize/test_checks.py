@@ -64,6 +64,11 @@ def test_a_wrong_shape_is_named(changes, says):
         call(**changes)
 
 
+def test_what_is_no_plan_is_named():
+    with pytest.raises(ValueError, match=r"plan must be a gsjax.Plan, from gsjax.plan\(...\); got dict"):
+        rasterization(**GOOD, width=20, height=10, plan={})
+
+
 @pytest.mark.parametrize(("degree", "shape"), [(1, (5, 3, 3)), (3, (5, 9, 3))])
 def test_too_few_harmonics_are_counted(degree, shape):
     with pytest.raises(ValueError, match=rf"{shape[1]} SH coefficients; sh_degree={degree} reads"):
