@@ -199,8 +199,8 @@ def _planned(views, bare: Plan, headroom: float) -> Plan:
         raise ValueError(
             "rasterization without a plan, or with one of capacity 0, looks at values, and these are traced "
             "(jit, vmap or scan). Call plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, "
-            "width, height, ...) outside, with typical values, and pass plan=plan inside; meta.overflow tells "
-            "if it becomes too small"
+            "width, height, ...) outside, with typical values, and pass plan=plan inside; meta.overflow "
+            "tells if it becomes too small"
         )
     if values[0].shape[1] == 0:
         return bare.grown(0, headroom)

@@ -209,12 +209,14 @@ def test_when_every_cell_fails_nothing_is_collected(toy, gsjax):
     assert not (folder / "results.json").exists()
 
 
-@pytest.mark.parametrize("change", ["script", "version"])
+@pytest.mark.parametrize("change", ["script", "helper", "version"])
 def test_a_stale_cell_is_reported_and_runs_again(toy, gsjax, change):
     folder = toy()
     gsjax("run", "toy")
     calls()
-    folder = toy(SCRIPT + "# another\n") if change == "script" else toy(version=2)
+    folder = toy(SCRIPT + "# another\n") if change == "script" else toy(version=1 + (change == "version"))
+    if change == "helper":
+        (folder / "helper.py").write_text("FACTOR = 2\n")
     _, out, _ = gsjax("list")
     assert "0 of 4" in out
     assert "4 stale" in out
