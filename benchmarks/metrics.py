@@ -77,10 +77,11 @@ def make_record(metrics: Iterable[Metric], **details: Any) -> dict[str, Any]:
     stored = {metric.key: asdict(metric) for metric in metrics}
     for entry in stored.values():
         del entry["key"]
+    here = machine.describe()
     return rounded(
         {
-            "machine": machine.describe(),
-            "machine_name": machine.name(machine.describe()),
+            "machine": here,
+            "machine_name": machine.name(here),
             "versions": {name: version(name) for name in ("gsjax", "jax", "jaxlib", "numpy")},
             "commit": _commit(),
             "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M"),

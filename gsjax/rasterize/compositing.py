@@ -18,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.rasterize.plan import DEFAULT_LIMITS, Limits, Plan
+from gsjax.rasterize.plan import DEFAULT_LIMITS, FEW_CHANNELS, Limits, Plan
 from gsjax.rasterize.sorting import argsort_keys
 
 SATURATION = 1e-6  # an alpha so close, relatively, to alpha_max is alpha_max
 CHUNK = 8  # Gaussians whose alphas are stored together
 MANY_CHUNK = 32  # the same where many channels are composited, by matmul
-FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
 
 
 class Splats(NamedTuple):
@@ -170,16 +169,15 @@ def composite_tile(
         state = start_tile(pixels.shape[0], channels, dtype)
     if length == 0:
         return state
-    columns, chunk = in_columns(splats, limits), chunk_length(channels)
+    chunk = chunk_length(channels)
     if length <= chunk:
-        return composite_columns(columns, pixels, state, limits)
+        return composite_columns(in_columns(splats, limits), pixels, state, limits)
 
-    def chunked(a, empty):
-        a = jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1), constant_values=empty)
-        return a.reshape(-1, chunk, *a.shape[1:])
+    def filled_up(a):  # with empty slots
+        return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1))
 
-    pieces = jax.tree.map(partial(chunked, empty=0), columns)
-    pieces = pieces._replace(log_opacities=chunked(columns.log_opacities, -jnp.inf))
+    columns = in_columns(jax.tree.map(filled_up, splats), limits)
+    pieces = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), columns)
     return jax.lax.scan(
         lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
     )[0]

@@ -18,6 +18,7 @@ RASTERIZE_MODES = ("classic", "antialiased")
 DERIVATIVES = ("reverse", "forward")
 TILE_SIZES = (4, 8, 16, 32)
 SORTS = ("host", "device")
+FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
 _BATCH_PIXELS = 16384  # pixels composited together: what a step of 8 Gaussians makes of them stays in L2
 
 
@@ -132,7 +133,9 @@ class Plan:
 
     def batch_size(self, channels: int) -> int:
         """Tiles composited together. By default as many as stay in cache, with the values of all channels."""
-        return self.tiles_per_batch or max(1, 8 * _BATCH_PIXELS // (max(channels, 8) * self.tile_pixels))
+        return self.tiles_per_batch or max(
+            1, FEW_CHANNELS * _BATCH_PIXELS // (max(channels, FEW_CHANNELS) * self.tile_pixels)
+        )
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
