@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 SAME = 120.0  # dB: more is rounding, and stands as this
 CLOSEST = 1e-7  # 1 - cosine: closer is rounding
@@ -74,7 +75,8 @@ def draw_lines(axes: Axes, rows: list[dict[str, Any]], time: str, height) -> Non
         values = [label_of(row) for row in mine]
         axes.labelled += [(p, v, color) for p, v in zip(points, values, strict=True) if v is not None]
     best = height({"psnr": SAME, "gradient_cosine": 1.0})
-    axes.plot(1.0, best, "kx", markersize=13, markeredgewidth=2.5, label="defaults")
+    axes.default = (1.0, best)
+    axes.plot(*axes.default, "kx", markersize=13, markeredgewidth=2.5, label="defaults")
     axes.set_xscale("log")
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3) if in_sight(axes, tick)]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -98,7 +100,8 @@ def in_sight(axes: Axes, tick: float) -> bool:
 def place_labels(axes: Axes) -> None:
     """Each value beside its point, in the first place that no other label or point takes."""
     spots = axes.transData.transform([point for point, *_ in axes.labelled])
-    taken = []
+    x, y = axes.transData.transform(axes.default)
+    taken = [Bbox.from_extents(x - 9, y - 9, x + 9, y + 9)]  # the cross
     for point, text, color in axes.labelled:
         for offset in OFFSETS:
             label = axes.annotate(

@@ -155,21 +155,21 @@ def measure(name: str, seed: int, with_sh: bool, variant: Variant) -> dict[str, 
     # What roi leaves out nobody wanted: it is not compared.
     wanted = middle(variant.region, scene.width, scene.height)
     mask, target = jnp.asarray(wanted, jnp.float32), target_of(scene, default, seed)
-    images, pairs, gradients = [], [], []
+    images, pairs, coverage, gradients = [], [], [], []
     for drawer in (default, mine):
-        image, _ = drawer.forward(drawer.gaussians, scene.viewmats)
-        (_, (count, overflow, _)), gradient = drawer.backward(drawer.gaussians, scene.viewmats, target, mask)
+        image, (count, overflow, alphas) = drawer.forward(drawer.gaussians, scene.viewmats)
+        _, gradient = drawer.backward(drawer.gaussians, scene.viewmats, target, mask)
         if overflow:
             raise RuntimeError("the plan overflowed: nothing was drawn")
         images.append(np.asarray(image))
         pairs.append(int(count))
+        coverage.append(np.asarray(alphas))
         gradients.append(gradient)
-    covered = wanted & (np.asarray(default.forward(default.gaussians, scene.viewmats)[1][2]) > FAINTEST)
     ms = timed(scene, (default, mine), target, mask, seed)
     low, ratios, high = np.percentile(ms[:, 1] / ms[:, 0], (25, 50, 75), axis=0)
     doubt = 1.57 * (high - low) / np.sqrt(len(ms))  # of a median (McGill, Tukey and Larsen 1978)
     return {
-        "psnr": min(SAME, psnr(images[1], images[0], covered)),
+        "psnr": min(SAME, psnr(images[1], images[0], wanted & (coverage[0] > FAINTEST))),
         "gradient_cosine": cosine(gradients[1], gradients[0]),
         "forward_ratio": ratios[0],
         "forward_doubt": doubt[0],
