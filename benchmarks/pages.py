@@ -32,6 +32,10 @@ STEP_COLUMNS = (
     ("p95", 8, lambda r: figure(r["p95_ms"])),
     ("compile s", 9, lambda r: figure(r["compile_s"])),
 )
+LEGEND = (
+    "/ exp, / copy: multiples of the least time there is, that of exp for all pixels of the Gaussians' "
+    f"{TILE}x{TILE} tiles and that of moving inputs and outputs once, here and now; ns/pixel: of those pixels"
+)
 TEXT = ("workload", "program", "step", "of")
 GOALS = {FORWARD: 2, BACKWARD: 5}  # exp floors, garden, camera 0
 FLAT_GOAL, MEMORY_GOAL = 1.5, 6

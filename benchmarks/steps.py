@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from benchmarks.floors import Floors, is_calm, measure_floors
 from benchmarks.metrics import Metric
 from benchmarks.timing import compile_program, median_and_p95, sample
 from benchmarks.workloads import ball
@@ -107,10 +108,12 @@ class StepRow:
         return asdict(self)
 
 
-def measure_step(name: str, repeats: int, calm: Callable[[], bool]) -> StepRow:
-    """Run one method's step; `calm` says afterwards whether the machine was left alone meanwhile."""
+def measure_step(name: str, repeats: int, before: Floors) -> tuple[StepRow, Floors]:
+    """Run one method's step; also returns the floors after it. `before` are those that were found last."""
     jax.clear_caches()
     times = STEPS[name](repeats)
     median, p95 = median_and_p95(times.seconds)
-    rate = 1e3 / median
-    return StepRow(name, times.what, len(times.seconds), median, p95, rate, times.compile_s, noisy=not calm())
+    after = measure_floors()
+    noisy = not is_calm(before, after)
+    row = StepRow(name, times.what, len(times.seconds), median, p95, 1e3 / median, times.compile_s, noisy)
+    return row, after

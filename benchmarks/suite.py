@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.floors import TILE, Floors, is_calm, measure_floors
+from benchmarks.floors import TILE, Floors, measure_floors
 from benchmarks.growth import draw_growth, write_growth
 from benchmarks.measure import measure
 from benchmarks.metrics import FAILING, Metric, compare, make_record, merged
-from benchmarks.pages import STEP_COLUMNS, bottom_line, markdown, print_comparison, print_rows
+from benchmarks.pages import LEGEND, STEP_COLUMNS, bottom_line, markdown, print_comparison, print_rows
 from benchmarks.programs import BACKWARD, FORWARD, JVP
 from benchmarks.steps import STEPS, measure_step
 from benchmarks.workloads import QUICK, SUITE, Workload, choose
@@ -136,6 +136,7 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
     # Not a terminal: lines stay whole, so that other programs can read them.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     console.print(f"{machine.in_words(machine.describe())}; up to {repeats} calls each")
+    console.print(LEGEND, soft_wrap=not console.is_terminal)
     found, finished = Run(out, complete, repeats), False
     try:
         _run_all(chosen, known, repeats, found, console)
@@ -189,16 +190,10 @@ def _run_all(
                 for note in result.notes:
                     console.print(f"[yellow]{note}[/]", soft_wrap=True)
             else:
-                before, after = floors or measure_floors(), []
-                row = measure_step(name, repeats, lambda b=before, a=after: _calm_since(b, a))
-                floors = after[0]
+                before = floors or measure_floors()
+                row, floors = measure_step(name, repeats, before)
                 found.metrics += row.metrics()
                 found.floors[name] = [before, floors]
                 print_rows(console, [row.as_dict()], STEP_COLUMNS, head=not found.steps)
                 found.steps.append(row.as_dict())
             found.write()
-
-
-def _calm_since(before: Floors, after: list[Floors]) -> bool:
-    after.append(measure_floors())
-    return is_calm(before, after[0])

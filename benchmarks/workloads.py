@@ -57,7 +57,8 @@ class Workload:
 
 
 def data_folder() -> Path:
-    """`$GSJAX_DATA`, or `../shared/data` beside the checkout, as the tests have it."""
+    """Where recordings are that are not part of the repository: `$GSJAX_DATA`, or `../shared/data` beside the
+    checkout."""
     named = os.environ.get("GSJAX_DATA")
     return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -44,10 +44,11 @@ def x64():
 def shared_data() -> Path:
     """The folder of recordings, which are not part of the repository; without it the test is skipped.
 
-    It is `$GSJAX_DATA`, or `../shared/data` beside the checkout.
+    It is where the benchmarks look for them: `$GSJAX_DATA`, or `../shared/data` beside the checkout.
     """
-    named = os.environ.get("GSJAX_DATA")
-    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    from benchmarks.workloads import data_folder
+
+    folder = data_folder()
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}: point GSJAX_DATA at the folder of tabletop_0, push_t, ...")
     return folder

@@ -10,7 +10,6 @@ docs/images/many-devices.svg; `--plot-only` draws the committed figures again.
 
 import json
 import os
-import platform
 import time
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from jax.sharding import PartitionSpec as P
 from matplotlib.figure import Figure
 
 import gsjax
+from gsjax.cli import machine
 from gsjax.geometry.cameras import intrinsics, look_at
 
 HERE = Path(__file__).resolve().parent
@@ -128,8 +128,7 @@ def measure(num: int, cameras: int, width: int, height: int, rounds: int) -> dic
         "cores": os.cpu_count(),
         "load_before": round(load, 1),
         "load_after": round(os.getloadavg()[0], 1),
-        "machine": f"{platform.machine()}, {platform.system()}",
-        "jax": jax.__version__,
+        "machine": machine.in_words(machine.describe()),
     }
 
 

@@ -9,7 +9,6 @@ moved from its first pose is scored beside it. Writes push_t.json beside this fi
 """
 
 import json
-import platform
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +18,7 @@ import numpy as np
 import tyro
 
 import gsjax
+from gsjax.cli import machine
 from gsjax.methods.object_tracker import Pose, first_pose, render_labels, scene_from_shapes, track
 from gsjax.metrics.segmentation import iou_of_masks
 
@@ -82,7 +82,7 @@ def main(
         "stride": stride,
         "update_s_median": round(float(np.median(updates)), 3),
         "update_s_p95": round(float(np.quantile(updates, 0.95)), 3),
-        "machine": f"{platform.machine()}, {jax.devices()[0].platform}, jax {jax.__version__}",
+        "machine": machine.in_words(machine.describe()),
     }
     (Path(__file__).parent / "push_t.json").write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 from rich.text import Text
 
+from gsjax.cli import machine
 from gsjax.cli.experiment_sweep import (
     RESULTS,
     Cell,
@@ -322,11 +323,10 @@ def remarks(experiment: Experiment, records: list[dict[str, Any]], done: list[di
     returned = dict.fromkeys(chain(["seconds"], *(record["result"] for record in done)))
     if absent := [column.key for column in experiment.columns if column.key not in returned]:
         notes.append(f"No cell returned {', '.join(absent)}; there are {', '.join(returned)}.")
-    made = [(r["machine"] | {"gsjax": r["gsjax"]}).items() for r in done]
-    machines = [", ".join(f"{key} {value}" for key, value in items) for items in made]
-    for machine in dict.fromkeys(machines):
-        some = f" ({machines.count(machine)} of {len(done)} cells)" if len(set(machines)) > 1 else ""
-        notes.append(f"Machine: {machine}{some}.")
+    made_on = [f"{machine.in_words(r['machine'])}, gsjax {r['gsjax']}" for r in done]
+    for where in dict.fromkeys(made_on):
+        some = f" ({made_on.count(where)} of {len(done)} cells)" if len(set(made_on)) > 1 else ""
+        notes.append(f"Machine: {where}{some}.")
     return notes
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import difflib
 import hashlib
 import itertools
 import json
@@ -22,7 +23,7 @@ from typing import Any
 
 import yaml
 
-from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli import machine
 from gsjax.cli.messages import describe
 from gsjax.io.atomic import write_json
 
@@ -204,7 +205,7 @@ def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bo
         "seconds": perf_counter() - begun,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "script": experiment.fingerprint,
-        "machine": describe_machine(),  # asked after the script ran, which may configure JAX first
+        "machine": machine.describe(),  # asked after the script ran, which may configure JAX first
         "gsjax": import_module("gsjax").__version__,
     }
     write_json(path, record)
@@ -247,7 +248,8 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
     names = experiment_names(root)
     # A shell completes the path of the folder, with a slash at its end.
     name = next((n for n in names if Path(name) in (Path(n), root / n)), name)
-    known = ", ".join(names) or f"none; make one as {root}/NAME/{CONFIG}"
+    below = [n for n in names if n.startswith(name.rstrip("/") + "/")]
+    known = ", ".join(below or names) or f"none; make one as {root}/NAME/{CONFIG}"
     if name not in names:
         raise ValueError(f"{root}: no experiment {name!r}; there are: {known}")
     path = root / name / CONFIG
@@ -322,7 +324,9 @@ def _fields(kind: type, value: Any, where: str, separator: str = ".") -> Any:
     fields = {f.name: f for f in dataclasses.fields(kind)}
     _expect(isinstance(value, dict), where, f"the keys {', '.join(fields)}", value)
     for key in value:
-        _expect(key in fields, where, f"the keys {', '.join(fields)}", key)
+        meant = difflib.get_close_matches(str(key), fields, 1)
+        found = f"{key!r}" + (f"; did you mean {meant[0]!r}?" if meant else "")
+        _expect(key in fields, where, f"the keys {', '.join(fields)}", found)
     for key, f in fields.items():
         required = f.default is MISSING and f.default_factory is MISSING
         sound = isinstance(value.get(key), f.type) and not isinstance(value[key], bool)

@@ -4,7 +4,9 @@ import re
 import sys
 import warnings
 from collections import Counter
+from dataclasses import fields
 from importlib import import_module
+from typing import Any
 
 from rich.console import Console
 from rich.text import Text
@@ -38,6 +40,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
             config=(tyro.conf.FlagCreatePairsOff,),
         )
         debug = options.debug
+        _expect_values(options, arguments)
         import_module("gsjax.optim.compiler").keep_freed_memory()
         with heard_interrupts():
             return chosen.run(options)
@@ -53,6 +56,15 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
         say_error(f"{told}. Please report it with what --debug shows")
         return 1
+
+
+def _expect_values(options: Any, arguments: list[str]) -> None:
+    """Raises a ValueError for a list that was begun and left empty: it would mean all there is."""
+    given = {argument.replace("_", "-") for argument in arguments}
+    for field in fields(options):
+        flag = "--" + field.name.replace("_", "-")
+        if getattr(options, field.name) == () and flag in given:
+            raise ValueError(f"{flag}: expected one value or more, found none")
 
 
 def describe(error: BaseException) -> str:

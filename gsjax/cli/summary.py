@@ -55,7 +55,7 @@ TIMES = (
     ("evaluation", "afterwards: rendering, scoring and videos"),
     ("total", "all of it"),
 )
-_MOVED_MM = 30.0  # an object that moved less says little about a tracker
+MOVED_MM = 30.0  # an object that moved less says little about a tracker
 
 
 def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
@@ -170,7 +170,7 @@ def _subtitle(found: dict[str, Any]) -> str:
 
 def _headline(found: dict[str, Any]) -> dict[str, Any]:
     scored = [s for s in found["objects"].values() if s["centroid_error_mm"] is not None]
-    moved = [s["centroid_error_mm"] for s in scored if s["moved_mm"] > _MOVED_MM]
+    moved = [s["centroid_error_mm"] for s in scored if s["moved_mm"] > MOVED_MM]
     cards: dict[str, Any] = {}
     if found["update_hz"]:
         cards["Update rate"] = (format_number(found["update_hz"], 2), "Hz")

@@ -19,8 +19,8 @@ def _expect(name: str, array, want: tuple, meaning: str) -> None:
     shape = jnp.shape(array)
     fits = len(shape) == len(want) and all(w is None or s == w for s, w in zip(shape, want, strict=True))
     if not fits:
-        wanted = ", ".join("any" if w is None else str(w) for w in want)
-        raise ValueError(f"{name} must have shape ({wanted}), {meaning}; got {tuple(shape)}")
+        wanted = str(tuple("any" if w is None else w for w in want)).replace("'", "")
+        raise ValueError(f"{name} must have shape {wanted}, {meaning}; got {tuple(shape)}")
 
 
 def check_inputs(
@@ -96,11 +96,15 @@ def check_inputs(
     tile_mask = None
     if roi is not None:
         inner = (num_cameras, plan.height, plan.width)
-        _expect("roi", roi, (*lead, *inner), "a pixel mask a camera")
+        _expect("roi", roi, (*lead, *inner), "a pixel mask a camera; one camera's is roi[None]")
+        if jnp.issubdtype(jnp.result_type(roi), jnp.inexact):
+            raise ValueError(f"roi must hold booleans, True where a pixel is wanted; got {roi.dtype}")
         tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner), plan.tile_size)
     if reads is not None:
         wanted = (*lead, num_cameras, plan.num_tiles)
         _expect("reads", reads, wanted, "meta.reads of a call under the same plan")
+        if not jnp.issubdtype(jnp.result_type(reads), jnp.integer):
+            raise ValueError(f"reads must hold integers, as meta.reads does; got {reads.dtype}")
         reads = jnp.asarray(reads, jnp.int32).reshape(scenes, num_cameras, plan.num_tiles)
 
     views = (

@@ -7,6 +7,7 @@ scene that grows compiles a few variants in all, and re-planning on a known rung
 
 import dataclasses
 import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 import jax
@@ -99,17 +100,21 @@ class Plan:
                 f"capacity must be a Python int of 2 or more, or 0, which is yet to be planned; "
                 f"got {self.capacity!r}"
             )
+        for name in ("near_plane", "far_plane", "eps2d", *Limits._fields):
+            value = getattr(self, name)
+            if not isinstance(value, Real):
+                raise ValueError(f"{name} must be a Python number (it is static); got {value!r}")
         if not 0 <= self.near_plane < self.far_plane:
             raise ValueError(
                 f"near_plane {self.near_plane} must be 0 or more, and below far_plane {self.far_plane}"
             )
         for name in Limits._fields:
             if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} must lie between 0 and 1; got {getattr(self, name)}")
+                raise ValueError(f"{name} must be above 0 and below 1; got {getattr(self, name)}")
         if not self.alpha_min < self.alpha_max:
             raise ValueError(f"alpha_min {self.alpha_min} must be below alpha_max {self.alpha_max}")
-        if self.eps2d < 0:
-            raise ValueError(f"eps2d must not be negative; got {self.eps2d}")
+        if not self.eps2d >= 0:
+            raise ValueError(f"eps2d must be 0 or more; got {self.eps2d}")
 
     @property
     def tiles_x(self) -> int:
@@ -141,11 +146,13 @@ class Plan:
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
 
         Raises:
-            ValueError: `needed` is 2^31 - 1, which stands for more than can be counted; or `headroom` is
+            ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or `headroom` is
                 below 1, under which re-planning would never end.
         """
         if not headroom >= 1:
             raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom}")
+        if needed < 0:
+            raise ValueError(f"needed must be 0 or more, as meta.needed is; got {needed}")
         if needed >= 2**31 - 1:
             raise ValueError(
                 f"these Gaussians touch more than 2^30 tiles of a {self.width}x{self.height} image; "

@@ -43,6 +43,8 @@ def test_a_plan_grows_and_never_shrinks():
     small = Plan(64, 48, 4096)
     assert small.grown(5000).capacity == rung(5000)
     assert small.grown(10) == small
+    with pytest.raises(ValueError, match="needed must be 0 or more.*got -1"):
+        small.grown(-1)
     assert small.grown(4000, headroom=1.25).capacity == rung(5000)
     with pytest.raises(ValueError, match=r"more than 2\^30 tiles of a 64x48 image; prune"):
         small.grown(np.iinfo(np.int32).max)
@@ -70,8 +72,12 @@ def test_a_capacity_that_holds_nothing_is_refused():
         ({"tiles_per_batch": 0}, "tiles_per_batch must be a positive"),
         ({"near_plane": 2.0, "far_plane": 1.0}, "near_plane 2.0 must be 0 or more, and below far_plane 1.0"),
         ({"near_plane": -1.0}, "near_plane -1.0 must be 0 or more"),
-        ({"alpha_max": 1.0}, "alpha_max must lie between 0 and 1"),
-        ({"eps2d": -0.1}, "eps2d must not be negative"),
+        ({"near_plane": "1"}, "near_plane must be a Python number \\(it is static\\); got '1'"),
+        ({"far_plane": None}, "far_plane must be a Python number"),
+        ({"alpha_max": 1.0}, "alpha_max must be above 0 and below 1; got 1.0"),
+        ({"alpha_min": 0.0}, "alpha_min must be above 0 and below 1; got 0.0"),
+        ({"eps2d": -0.1}, "eps2d must be 0 or more; got -0.1"),
+        ({"eps2d": float("nan")}, "eps2d must be 0 or more; got nan"),
     ],
 )
 @pytest.mark.usefixtures("as_users_run")
