@@ -146,8 +146,8 @@ class Plan:
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
 
         Raises:
-            ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or `headroom` is
-                below 1, under which re-planning would never end.
+            ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or
+                `headroom` is below 1, under which re-planning would never end.
         """
         if not headroom >= 1:
             raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom}")

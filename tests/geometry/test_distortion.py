@@ -466,6 +466,7 @@ def of_lens(params, batch, *, step, key):
     return seen.image - batch["photo"], {"overflow": meta.overflow, "valid": seen.valid.all()}
 
 
+@pytest.mark.slow
 def test_a_lens_is_calibrated_from_one_photograph():
     means = np.random.default_rng(1).uniform(-1.0, 1.0, (150, 3)) * [0.5, 1.0, 0.8]
     scene, p = scene_and_plan(means, 0.06, derivative="forward")

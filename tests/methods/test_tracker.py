@@ -40,6 +40,7 @@ def test_objects_are_followed(table, started, tracked, centroid_errors):
     assert tracked[-1].compile_seconds == 0
 
 
+@pytest.mark.slow
 def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_errors):
     """Frames in which the gripper carries the carton while the can rolls and the ball flies."""
     sequence, frames, _ = table(11)
@@ -73,6 +74,7 @@ def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, start
         np.testing.assert_allclose(again.pose.means, before.pose.means, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_background_moves_only_where_it_is_told_to(table, started, tracked, quick):
     _, frames, _ = table()
     background = np.asarray(started.gaussians.means)[started.num_moving :]
@@ -162,6 +164,7 @@ def test_a_few_broken_pixels_are_counted_and_change_little(table, started, track
     assert np.median(moved[: started.num_moving]) < 1e-3
 
 
+@pytest.mark.slow
 def test_the_first_frame_may_have_broken_pixels(table, quick):
     _, frames, mask = table()
     depths = frames[0].depths.at[0, 3, 4].set(jnp.inf).at[1, 5, 6].set(jnp.nan)
@@ -171,6 +174,7 @@ def test_the_first_frame_may_have_broken_pixels(table, quick):
     assert jnp.isfinite(scene.gaussians.means).all()
 
 
+@pytest.mark.slow
 def test_going_on_works_when_every_slot_is_taken(table, started, quick):
     _, frames, _ = table()
     config = replace(quick, grow=replace(quick.grow, slots=2))

@@ -484,6 +484,7 @@ def of_gaussians(params, batch, *, step, key):
     return image[::4, ::4] - batch["image"][::4, ::4], {"overflow": meta.overflow}
 
 
+@pytest.mark.slow
 def test_gaussians_are_refined_with_the_reverse_plan(scene):
     reverse = planned(scene, headroom=2.0)
     rng = np.random.default_rng(1)

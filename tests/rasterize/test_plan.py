@@ -43,7 +43,7 @@ def test_a_plan_grows_and_never_shrinks():
     small = Plan(64, 48, 4096)
     assert small.grown(5000).capacity == rung(5000)
     assert small.grown(10) == small
-    with pytest.raises(ValueError, match="needed must be 0 or more.*got -1"):
+    with pytest.raises(ValueError, match=r"needed must be 0 or more.*got -1"):
         small.grown(-1)
     assert small.grown(4000, headroom=1.25).capacity == rung(5000)
     with pytest.raises(ValueError, match=r"more than 2\^30 tiles of a 64x48 image; prune"):
