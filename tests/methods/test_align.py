@@ -14,7 +14,6 @@ from gsjax.methods.object_tracker.align import (
     align,
     bilinear,
     disagreement,
-    tones,
 )
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.points import (
@@ -27,6 +26,8 @@ from gsjax.methods.object_tracker.points import (
     pixels_of_groups,
     renewed,
     sample_groups,
+    sight_of,
+    tones,
 )
 from gsjax.methods.object_tracker.search import ball, principal_axes, search, turned
 
@@ -41,12 +42,16 @@ def moved(table):
     sequence, frames, _ = table(8, 2, **SIZE)
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
     labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
-    points = pixels_of_groups(frames[6], labels, frames[6].depths, 1, CONFIG)
+    points = pixels_of_groups(see(frames[6]), labels, frames[6].depths, 1, CONFIG)
     k = sequence.truth.names.index("carton")
     motion = sequence.truth.poses[7, k] @ np.linalg.inv(sequence.truth.poses[6, k])
     then = np.asarray(points.means[0], np.float64) @ motion[:3, :3].T + motion[:3, 3]
-    seen = np.asarray(points.seen[0]).any(0)
-    return points, points.means[0, seen].mean(0)[None], frames[7], then, labels
+    seen = np.asarray(points.seen[0]) > 0
+    return points, points.means[0, seen].mean(0)[None], see(frames[7]), then, labels
+
+
+def see(frame):
+    return sight_of(frame, CONFIG.shading)
 
 
 def run(points, center, frame, config=CONFIG):
@@ -56,7 +61,7 @@ def run(points, center, frame, config=CONFIG):
 
 
 def error(points, means, then):
-    seen = np.asarray(points.seen[0]).any(0)
+    seen = np.asarray(points.seen[0]) > 0
     return np.linalg.norm(means - then, axis=-1)[seen].mean()
 
 
@@ -85,9 +90,12 @@ def test_something_in_front_does_not_pull(moved):
     row, column = np.argwhere(np.asarray(moved[4][0]) == 1).mean(0).astype(int)
     patch = (0, slice(row, row + 6), slice(column - 20, column + 20))
     hidden = eqx.tree_at(
-        lambda f: (f.images, f.depths),
+        lambda f: (f.tones, f.depths),
         frame,
-        (frame.images.at[patch].set(jnp.array([0.1, 0.9, 0.1])), frame.depths.at[patch].set(0.4)),
+        (
+            frame.tones.at[patch].set(tones(jnp.array([0.1, 0.9, 0.1]), CONFIG.shading)),
+            frame.depths.at[patch].set(0.4),
+        ),
     )
     found = search(jnp.zeros((1, 1, 6)), points, center, hidden, CONFIG)
     assert error(points, np.asarray(carry(points, found, center).means[0]), then) < 2e-3
@@ -105,9 +113,9 @@ def test_a_group_that_nobody_sees_stands_still(moved, depth):
 def test_disagreement_is_nothing_for_a_perfect_fit_and_half_outside_the_picture(moved, table):
     points = moved[0]
     _, frames, _ = table(8, 2, **SIZE)
-    assert disagreement(points, frames[6], CONFIG)[0] < 1e-3
+    assert disagreement(points, see(frames[6]), CONFIG)[0] < 1e-3
     away = points._replace(means=points.means + jnp.array([0.0, 50.0, 0.0]))
-    np.testing.assert_allclose(disagreement(away, frames[6], CONFIG), 0.5, atol=1e-6)
+    np.testing.assert_allclose(disagreement(away, see(frames[6]), CONFIG), 0.5, atol=1e-6)
 
 
 def test_only_pixels_of_the_group_are_picked(moved, table):
@@ -116,17 +124,19 @@ def test_only_pixels_of_the_group_are_picked(moved, table):
     for c in range(2):
         chosen = np.asarray(points.seen[0, c]) > 0
         assert chosen.sum() == min(CONFIG.pixels, (labels[c] == 1).sum())
-        colors = np.asarray(frames[6].images[c])[labels[c] == 1]
-        assert {tuple(row) for row in np.asarray(points.colors[0])[chosen]} <= {tuple(row) for row in colors}
+        theirs = np.asarray(see(frames[6]).tones[c])[labels[c] == 1]
+        found = np.asarray(points.tones[0, c])[chosen]
+        assert {tuple(row) for row in found} <= {tuple(row) for row in theirs}
+        assert len(np.unique(np.asarray(points.means[0, c])[chosen], axis=0)) == chosen.sum()  # none twice
 
 
 def test_samples_are_capped_and_never_strangers():
     groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
     means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
     few = sample_groups(means, means, jnp.ones((2, 40)), groups, 4, 8)
-    assert few.means.shape == (4, 8, 3)
-    real = np.asarray(few.seen[:, 0]) > 0
-    np.testing.assert_array_equal(real.sum(1), [8, 3, 0, 7])
+    assert few.means.shape == (4, 2, 8, 3)
+    real = np.asarray(few.seen) > 0
+    np.testing.assert_array_equal(real.sum(2), [[8, 8], [3, 3], [0, 0], [7, 7]])
     np.testing.assert_array_equal(few.means[real, 0], np.nonzero(real)[0] + 1)
 
 
@@ -146,7 +156,7 @@ def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
     _, frames, _ = table(8, 2, **SIZE)
     labels = moved[4]
     blind = eqx.tree_at(lambda f: f.depths, frames[6], frames[6].depths.at[1].set(0.0))
-    points = pixels_of_groups(blind, labels, frames[6].depths, 1, CONFIG)
+    points = pixels_of_groups(see(blind), labels, frames[6].depths, 1, CONFIG)
     np.testing.assert_array_equal(points.seen, moved[0].seen)
     np.testing.assert_allclose(points.means, moved[0].means)
 
@@ -154,25 +164,25 @@ def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
 def test_join_holds_the_points_of_both(moved):
     points = moved[0]
     both = join(points, points._replace(means=points.means + 1))
-    count = points.means.shape[1]
+    count = points.num_points
     assert both.seen.shape == (1, 2, 2 * count)
-    np.testing.assert_array_equal(both.means[:, :count] + 1, both.means[:, count:])
+    np.testing.assert_array_equal(both.means[:, :, :count] + 1, both.means[:, :, count:])
 
 
 def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
     def pixels(value):
-        return Points(jnp.full((2, 3, 3), value), jnp.full((2, 3, 3), value), jnp.ones((2, 1, 3)))
+        return Points(jnp.full((2, 1, 3, 3), value), jnp.full((2, 1, 3, 3), value), jnp.ones((2, 1, 3)))
 
     keyframe, centers = first_keyframe(pixels(1.0)), jnp.ones((2, 3))
     twists = jnp.zeros((2, 6)).at[:, 0].set(0.1).at[0, 5].set(0.3)  # the first group turns by 0.3
     for turn, expected in ((0.3, [1.0, 1.0]), (0.6, [2.0, 1.0])):
         keyframe = renewed(carry_keyframe(keyframe, twists, centers), pixels(2.0), 0.5)
-        np.testing.assert_allclose(keyframe.points.colors[:, 0, 0], expected, err_msg=str(turn))
+        np.testing.assert_allclose(keyframe.points.tones[:, 0, 0, 0], expected, err_msg=str(turn))
         count = faded(keyframe, 0.5).seen[:, 0, 0]
         np.testing.assert_allclose(count, [0.4 if turn == 0.3 else 1.0, 1.0], rtol=1e-5)
     # Not renewed, so carried twice; renewed, so new, and unturned.
-    np.testing.assert_allclose(keyframe.points.means[1, 0], [1.2, 1.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(keyframe.points.means[0, 0], [2.0, 2.0, 2.0])
+    np.testing.assert_allclose(keyframe.points.means[1, 0, 0], [1.2, 1.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(keyframe.points.means[0, 0, 0], [2.0, 2.0, 2.0])
     np.testing.assert_allclose(keyframe.turned, [[1, 0, 0, 0], [1, 0, 0, 0]], atol=1e-6)
 
 
@@ -197,7 +207,7 @@ def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
     points, _, frame, _, _ = moved
     frame = frame if depth else without_depth(frame)
     # Off the centres of pixels, where a bilinear image has its kinks.
-    one = Points(points.means[0, :40] + 1.3e-3, points.colors[0, :40], points.seen[0, :, :40])
+    one = Points(points.means[0, :, :20] + 1.3e-3, points.tones[0, :, :20], points.seen[0, :, :20])
     found = _residuals(one, frame, CONFIG)
     small = 2e-5
     for axis in range(3):
@@ -250,7 +260,7 @@ def test_turned_holds_the_start_and_turns_about_its_own_axes():
 
 def test_principal_axes_are_those_of_a_rod():
     along = jnp.linspace(-1, 1, 50)[:, None] * jnp.array([0.6, 0.8, 0.0])
-    points = Points(along[None], jnp.zeros((1, 50, 3)), jnp.ones((1, 1, 50)))
+    points = Points(along[None, None], jnp.zeros((1, 1, 50, 3)), jnp.ones((1, 1, 50)))
     axes = principal_axes(points, jnp.zeros((1, 3)))
     np.testing.assert_allclose(jnp.abs(axes[0, 2]), [0.6, 0.8, 0.0], atol=1e-4)
 
@@ -261,11 +271,11 @@ def test_search_finds_a_jump_that_alignment_alone_misses(moved, table):
     _, frames, _ = table(8, 2, **SIZE)
     shift = jnp.array([0.03, -0.025, 0.01])
     behind = points._replace(means=points.means - shift)
-    seen = np.asarray(points.seen[0]).any(0)
+    seen = np.asarray(points.seen[0]) > 0
     center = behind.means[0, seen].mean(0)[None]
     still = jnp.zeros((1, 1, 6))
-    found = search(still, behind, center, frames[6], CONFIG)
-    alone = align(still[0], behind, center, frames[6], CONFIG)
+    found = search(still, behind, center, see(frames[6]), CONFIG)
+    alone = align(still[0], behind, center, see(frames[6]), CONFIG)
     miss = lambda twist: float(jnp.linalg.norm(twist[0, :3] - shift))  # noqa: E731
     assert miss(found) < 1e-3
     assert miss(alone) > 5e-3

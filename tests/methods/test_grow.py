@@ -11,7 +11,7 @@ import pytest
 from gsjax.methods.object_tracker import first_pose, render_labels
 from gsjax.methods.object_tracker.config import GrowConfig
 from gsjax.methods.object_tracker.grow import EMPTY, empty_slots, grow, unexplained, with_slots
-from gsjax.methods.object_tracker.motion import place
+from gsjax.methods.object_tracker.layers import shown_by
 from gsjax.metrics.tracking import true_labels
 from gsjax.scene.render import plan_render, render
 
@@ -40,8 +40,8 @@ def grown(scene, frame, plan, steps=1, config=CONFIG):
 
     @jax.jit
     def once(scene, pose, step):
-        rendered = render_labels(scene, pose, frame, plan)
-        return grow(scene, pose, rendered, frame, step, config)
+        shown = shown_by(render_labels(scene, pose, frame, plan))
+        return grow(scene, pose, shown, frame, step, config)
 
     for step in range(steps):
         scene, pose = once(scene, pose, step)
@@ -82,8 +82,8 @@ def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
 def test_a_scene_that_explains_all_grows_little(table, started, plan):
     frame = table()[1][0]
     scene, _ = grown(with_slots(started, 256), frame, plan)
-    rendered = render(place(started, first_pose(started)), frame.cameras, plan)
-    assert np.asarray(unexplained(rendered, frame, CONFIG)).mean() < 0.02
+    shown = shown_by(render_labels(started, first_pose(started), frame, plan))
+    assert np.asarray(unexplained(shown, frame, CONFIG)).mean() < 0.02
     assert 256 - int(empty_slots(scene).sum()) <= 32
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at, project
 from gsjax.methods.object_tracker.config import MatchConfig
-from gsjax.methods.object_tracker.matching import Match, correlate, lift, match_templates
+from gsjax.methods.object_tracker.matching import Match, Template, correlate, lift, match_templates
 from gsjax.scene.frame import Frame
 
 WIDTH, HEIGHT = 64, 48
@@ -86,10 +86,13 @@ def test_the_peak_of_a_shifted_blob_is_sub_pixel(shift):
     color, value = blob(start)
     image, _ = blob(start + shift)
     depths = np.full((1, HEIGHT, WIDTH), 1.1, np.float32)
-    match = match_templates(
+    template = Template(
         jnp.asarray(color)[None],
         jnp.asarray(depths),
         jnp.asarray(value > 0.1, jnp.float32)[None, ..., None],
+    )
+    match = match_templates(
+        template,
         frame(image[None], depths + 0.02),
         CONFIG,
     )
@@ -104,7 +107,9 @@ def test_an_object_that_no_pixel_shows_is_not_found():
     color, _ = blob((30.0, 20.0))
     nothing = jnp.zeros((1, HEIGHT, WIDTH, 1))
     now = frame(color[None])
-    match = match_templates(jnp.asarray(color)[None], jnp.ones((1, HEIGHT, WIDTH)), nothing, now, CONFIG)
+    match = match_templates(
+        Template(jnp.asarray(color)[None], jnp.ones((1, HEIGHT, WIDTH)), nothing), now, CONFIG
+    )
     move, found = lift(match, now, CONFIG)
     assert match.score[0, 0] == 0
     assert not found[0]
@@ -183,5 +188,7 @@ def test_what_the_picture_does_not_show_of_a_template_does_not_count():
     (color, value), (image, _) = blob(start), blob(start + shift)
     depths = jnp.full((1, HEIGHT, WIDTH), 1.1)
     weights = jnp.asarray(value > 0.1, jnp.float32)[None, ..., None]
-    match = match_templates(jnp.asarray(color)[None], depths, weights, frame(image[None]), CONFIG)
+    match = match_templates(
+        Template(jnp.asarray(color)[None], depths, weights), frame(image[None]), CONFIG
+    )
     np.testing.assert_allclose(match.shift[0, 0], shift, atol=0.3)

@@ -113,7 +113,7 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     _, frames, _ = table()
     scene = with_slots(started, quick.grow.slots)  # as track would
     pose = first_pose(scene)
-    plan = plan_tracker(scene, pose, frames[0], quick.headroom)
+    plan = plan_tracker(scene, pose, frames[0], quick)
     small = replace(plan, num_near=16, full=replace(plan.full, capacity=4096))
     step = object_tracker(quick, scene.num_objects, TrackerBatch(scene, frames[0], plan))
     state = jax.jit(step.init)(pose)

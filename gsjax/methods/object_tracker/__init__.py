@@ -1,7 +1,7 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
-Read the files as the data flows: config, scene, fit, shapes, motion, matching, points, align, search,
-region, refine, tracker, grow, tracking.
+Read the files as the data flows: config, scene, fit, shapes, motion, layers, matching, points, align,
+search, region, refine, tracker, grow, tracking.
 """
 
 from gsjax.methods.object_tracker.config import (
@@ -13,6 +13,7 @@ from gsjax.methods.object_tracker.config import (
     TrackerConfig,
 )
 from gsjax.methods.object_tracker.grow import EMPTY, with_slots
+from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
 from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene
@@ -22,7 +23,6 @@ from gsjax.methods.object_tracker.tracker import (
     TrackerState,
     object_tracker,
     plan_tracker,
-    render_labels,
 )
 from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
 

@@ -5,10 +5,10 @@ Each has a colour and a depth to agree with at the pixel it falls on:
 
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
-with I and c as tones, which see little of shading, and weighted by 1 / (1 + r^2)^2 (Geman-McClure), which
-forgets what is hidden by something else. The groups' normal equations are independent of each other. An
-iteration costs a fraction of a rendered one, and depth pulls from further away than colour does, so groups
-arrive, large turns included, where rendering can finish.
+with I and c as tones (see `points`), which see little of shading, and weighted by 1 / (1 + r^2)^2
+(Geman-McClure), which forgets what is hidden by something else. The groups' normal equations are independent
+of each other. An iteration costs a fraction of a rendered one, and depth pulls from further away than colour
+does, so groups arrive, large turns included, where rendering can finish.
 """
 
 from typing import NamedTuple
@@ -20,8 +20,7 @@ from jaxtyping import Array, Float
 
 from gsjax.geometry.cameras import project
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, carry, of_groups
-from gsjax.scene.frame import Frame
+from gsjax.methods.object_tracker.points import Points, Sight, carry, of_groups
 
 
 def bilinear(
@@ -40,16 +39,6 @@ def bilinear(
     return upper + down * (lower - upper), jnp.stack([across, lower - upper], axis=-1)
 
 
-def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
-    """Logarithms of the three channels, halved to span about 0 to 1, their mean reduced to a share `shading`.
-
-    Light scales all channels alike, so it moves the mean of the logarithms only. Without this, a can that
-    rolls under a lamp looks more like one that stands still, lit as before.
-    """
-    logs = 0.5 * jnp.log(jnp.maximum(colors, 0.0) + 0.1)  # the offset keeps the noise of dark pixels down
-    return logs - (1 - shading) * logs.mean(-1, keepdims=True)
-
-
 class Residuals(NamedTuple):
     """How points differ from the images: red, green, blue and, where the frame has it, depth."""
 
@@ -58,19 +47,19 @@ class Residuals(NamedTuple):
     gradients: Float[Array, "c p d 3"]  # with respect to the point, a metre
 
 
-def _residuals(points: Points, frame: Frame, config: AlignConfig) -> Residuals:
-    """Of one group's points, in every camera."""
-    height, width = frame.images.shape[1:3]
+def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
+    """Of one group's points."""
+    height, width = sight.tones.shape[1:3]
 
-    def one(viewmat, K, image, depth):
-        pixels, z = project(points.means, viewmat, K)
+    def one(points, tones, viewmat, K, image, depth):
+        pixels, z = project(points, viewmat, K)
         # d pixel / d point = (K - pixel e_z^T) / z, turned into the world's axes.
         axis = viewmat[2, :3]
         moves = (K[:2] @ viewmat[:3, :3] - pixels[:, :, None] * axis) / jnp.maximum(z, 1e-6)[:, None, None]
         inside = (pixels > 0.5).all(-1) & (pixels < jnp.array([width, height]) - 0.5).all(-1)
         inside &= z > 1e-3
-        colors, slopes = bilinear(image, pixels)
-        values = (colors - tones(points.colors, config.shading)) / config.color_scale
+        found, slopes = bilinear(image, pixels)
+        values = (found - tones) / config.color_scale
         gradients = slopes @ moves / config.color_scale
         counts = jnp.broadcast_to(inside[:, None], values.shape)
         if depth is None:
@@ -88,8 +77,9 @@ def _residuals(points: Points, frame: Frame, config: AlignConfig) -> Residuals:
             jnp.concatenate([gradients, pull[:, None]], axis=1),
         )
 
-    views = (frame.cameras.viewmat, frame.cameras.K, tones(frame.images, config.shading), frame.depths)
-    return jax.vmap(one, in_axes=(0, 0, 0, None if frame.depths is None else 0))(*views)
+    over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, None if sight.depths is None else 0))
+    cameras = sight.cameras
+    return over_cameras(points.means, points.tones, cameras.viewmat, cameras.K, sight.tones, sight.depths)
 
 
 def _of_color(residuals: Residuals) -> Float[Array, "c p d"]:
@@ -99,14 +89,14 @@ def _of_color(residuals: Residuals) -> Float[Array, "c p d"]:
     return jnp.concatenate([jnp.broadcast_to(mean, (*mean.shape[:-1], 3)), squared[..., 3:]], axis=-1)
 
 
-def _normal_equations(points: Points, center: Float[Array, "3"], frame: Frame, config: AlignConfig):
+def _normal_equations(points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig):
     """(cost, J^T W J, J^T W r) of one group, for a small twist about `center`."""
-    residuals = _residuals(points, frame, config)
+    residuals = _residuals(points, sight, config)
     squared = _of_color(residuals)
     weights = points.seen[..., None]
     # What falls outside the picture, or is truncated, costs as much as a bad fit.
     cost = jnp.sum(weights * jnp.where(residuals.counts > 0, squared / (1 + squared), 0.5))
-    arms = jnp.cross((points.means - center)[None, :, None], residuals.gradients)
+    arms = jnp.cross((points.means - center)[:, :, None], residuals.gradients)
     jacobian = jnp.concatenate([residuals.gradients, arms], axis=-1)
     robust = weights * residuals.counts / (1 + squared) ** 2
     weighted = jacobian * robust[..., None]
@@ -127,7 +117,7 @@ def align(
     twists: Float[Array, "k 6"],
     points: Points,
     centers: Float[Array, "k 3"],
-    frame: Frame,
+    sight: Sight,
     config: AlignConfig,
 ) -> Float[Array, "k 6"]:
     """Levenberg-Marquardt from `twists` (translation, rotation vector) on all groups at once.
@@ -136,7 +126,7 @@ def align(
         twists: where to start.
         points: where they were in the last frame.
         centers: the groups' centroids in the last frame.
-        frame: what the cameras see now.
+        sight: what the cameras see now.
     """
 
     longest = jnp.array([config.max_step] * 3 + [config.max_turn] * 3)
@@ -144,7 +134,7 @@ def align(
     def fit(twists) -> _Fit:
         over_groups = jax.vmap(_normal_equations, in_axes=(0, 0, None, None))
         moved = carry(points, twists, centers)
-        return _Fit(twists, *over_groups(moved, centers + twists[:, :3], frame, config))
+        return _Fit(twists, *over_groups(moved, centers + twists[:, :3], sight, config))
 
     def iterate(carried, _):
         best, trial, damping = carried
@@ -173,14 +163,14 @@ def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float
     return jnp.concatenate([twists[..., :3] + change[..., :3], rotation.log()], axis=-1)
 
 
-def disagreement(points: Points, frame: Frame, config: AlignConfig) -> Float[Array, "k"]:
+def disagreement(points: Points, sight: Sight, config: AlignConfig) -> Float[Array, "k"]:
     """How badly each group's points agree with the images: 0 perfect, 1 not at all.
 
     Colour and depth count the same; what falls outside the picture counts half.
     """
 
     def one(points):
-        residuals = _residuals(points, frame, config)
+        residuals = _residuals(points, sight, config)
         squared, counts = _of_color(residuals)[..., 2:], residuals.counts[..., 2:]
         known = jnp.maximum(counts.sum(-1), 1)
         cost = jnp.sum(counts * squared / (1 + squared), axis=-1) / known

@@ -1,7 +1,7 @@
 """The settings of the object-aware tracker, with their units and what they trade."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 
 def _check(
@@ -91,6 +91,8 @@ class AlignConfig:
     """How far a group is looked for by shifting it as it is, metres ..."""
     spacing: float = 0.015
     """... in steps of this length, metres."""
+    every_start: bool = True
+    """Align from every place where a group may have gone, or only from the one that agrees best as it is."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Turns by which the best start is varied, to either side about each principal axis, radians."""
     max_step: float = 0.1
@@ -120,7 +122,7 @@ class RefineConfig:
     """Photometric refinement of the group displacements D_k and the individual ones delta_i."""
 
     iterations: int = 10
-    """Adam iterations a frame."""
+    """Adam iterations a frame; 0 leaves refinement out."""
     translation_rate: float = 7e-4
     """Learning rate of D_k's translation, metres."""
     rotation_rate: float = 1e-2
@@ -149,7 +151,7 @@ class RefineConfig:
             "background_rate": 0,
         }
         limits = ("delta_scale", "depth_limit", "color_limit")
-        _check(self, above_zero=limits, at_least={"iterations": 1, "depth_weight": 0, **rates})
+        _check(self, above_zero=limits, at_least={"iterations": 0, "depth_weight": 0, **rates})
 
 
 @dataclass(frozen=True)
@@ -186,8 +188,17 @@ class TrackerConfig:
     """Look for each object by template matching first. Without, it is found from where it was."""
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
+    redraw: Literal["all", "moving"] = "all"
+    """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""
 
     def __post_init__(self):
         _check(self, at_least={"headroom": 1})
+        if self.redraw not in ("all", "moving"):
+            raise ValueError(f"TrackerConfig.redraw: expected all or moving, found {self.redraw!r}")
+        if self.redraw == "moving" and self.refine.iterations:
+            raise ValueError(
+                "TrackerConfig.redraw: expected all where refine.iterations is above 0, found moving; set "
+                "refine.iterations to 0, or draw all"
+            )

@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.cameras import pixel_grid, unproject
 from gsjax.geometry.spherical_harmonics import SH_C0, rgb_to_sh0
 from gsjax.methods.object_tracker.config import GrowConfig
+from gsjax.methods.object_tracker.layers import Shown
 from gsjax.methods.object_tracker.motion import Pose
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, take
-from gsjax.scene.render import Rendered
 
 EMPTY = -30.0  # logit of an empty slot's opacity
 _BORN = 2.0  # and of a new Gaussian
@@ -45,20 +45,20 @@ def empty_slots(scene: TrackedScene) -> Bool[Array, "m"]:
     return scene.labels[: scene.num_moving] > scene.num_objects
 
 
-def unexplained(rendered: Rendered, frame: Frame, config: GrowConfig) -> Bool[Array, "c h w"]:
+def unexplained(shown: Shown, frame: Frame, config: GrowConfig) -> Bool[Array, "c h w"]:
     """Pixels measured in front of the model, or where there is none; every second one each way."""
     assert frame.depths is not None
     known = frame.depths > 0
-    in_front = (rendered.alphas > 0.5) & (rendered.depths - frame.depths > config.min_gap)
+    in_front = shown.covered & (shown.depths - frame.depths > config.min_gap)
     height, width = frame.depths.shape[1:]
     lattice = (jnp.arange(height) % 2 == 0)[:, None] & (jnp.arange(width) % 2 == 0)[None, :]
-    return known & (in_front | (rendered.alphas < 0.5)) & lattice
+    return known & (in_front | ~shown.covered) & lattice
 
 
 def grow(
     scene: TrackedScene,
     pose: Pose,
-    rendered: Rendered,
+    shown: Shown,
     frame: Frame,
     step: Int[Array, ""],
     config: GrowConfig,
@@ -67,18 +67,17 @@ def grow(
 
     Args:
         scene, pose: with slots (see `with_slots`), as they stand.
-        rendered: both, drawn solid with label shares, in the frame's cameras.
+        shown: what they show in the frame's cameras.
         frame: what the cameras saw at this pose, with depth.
         step: any number that differs from frame to frame: it picks which pixels are looked at.
     """
     assert frame.depths is not None
-    assert rendered.features is not None
     height, width = frame.depths.shape[1:]
     # Only pixels near an object can continue it; other places wait until one comes by.
-    objects = rendered.features[..., 1:].sum(-1)
-    reach = (1, 2 * config.reach + 1, 2 * config.reach + 1)
-    near = jax.lax.reduce_window(objects, -jnp.inf, jax.lax.max, reach, (1, 1, 1), "SAME") > 0.5
-    chosen = (unexplained(rendered, frame, config) & near).ravel()
+    near = shown.labels > 0
+    for reach in ((1, 2 * config.reach + 1, 1), (1, 1, 2 * config.reach + 1)):
+        near = jax.lax.reduce_window(near, False, jnp.logical_or, reach, (1, 1, 1), "SAME")
+    chosen = (unexplained(shown, frame, config) & near).ravel()
     order = jax.random.uniform(jax.random.fold_in(jax.random.key(2), step), chosen.shape)
     priority, rows = jax.lax.top_k(jnp.where(chosen, 1.0 + order, 0.0), config.candidates)
 

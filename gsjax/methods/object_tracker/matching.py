@@ -20,6 +20,14 @@ from gsjax.methods.object_tracker.config import MatchConfig
 from gsjax.scene.frame import Frame
 
 
+class Template(NamedTuple):
+    """What is looked for: the last scene, or the last images, with the share of each object in each pixel."""
+
+    colors: Float[Array, "c h w 3"]
+    depths: Float[Array, "c h w"]
+    weights: Float[Array, "c h w k"]
+
+
 class Match(NamedTuple):
     """Where one object's template was found in one camera."""
 
@@ -80,9 +88,7 @@ def correlate(
 
 
 def match_templates(
-    colors: Float[Array, "c h w 3"],
-    depths: Float[Array, "c h w"],
-    weights: Float[Array, "c h w k"],
+    template: Template,
     frame: Frame,
     config: MatchConfig,
     reduction: int = 1,
@@ -90,13 +96,12 @@ def match_templates(
     """Match every object in every camera: fields [C, K].
 
     Args:
-        colors, depths: the last scene, rendered into the new frame's cameras.
-        weights: how much of each pixel is object k.
+        template: the last scene in the new frame's cameras.
         frame: what the cameras see now.
         reduction: images are averaged down by this factor first, for objects larger than the template.
     """
     shrink = jax.vmap(lambda a: _reduce(a, reduction))
-    images = frame.images
+    (colors, depths, weights), images = template, frame.images
     rendered_small, image_small, weight_small = shrink(colors), shrink(images), shrink(weights)
 
     def one(color, image, weight, full_weight, depth, measured_depth):

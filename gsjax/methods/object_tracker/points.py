@@ -1,4 +1,4 @@
-"""What is aligned of each group: coloured points, as many for each, that cameras may look for.
+"""What is aligned of each group: points with tones, as many for each, that a camera looks for.
 
 They are pixels of the last frame, which look most like the new one; pixels of a keyframe, carried along since
 then; and centres of the Gaussians that the first mask named. The last frame alone would drift, and what once
@@ -10,25 +10,54 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.cameras import pixel_grid, unproject
+from gsjax.geometry.cameras import Camera, pixel_grid, unproject
 from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.rasterize.sorting import sort_keys
 from gsjax.scene.frame import Frame
 
 
 class Points(NamedTuple):
-    """Points of the groups 1..K, one group a row."""
+    """Points of the groups 1..K that each of C cameras looks for."""
 
-    means: Float[Array, "*k p 3"]
-    colors: Float[Array, "*k p 3"]
-    seen: Float[Array, "*k c p"]  # what a point counts in each camera, 0 to 1; 0 fills up a row
+    means: Float[Array, "*k c p 3"]
+    tones: Float[Array, "*k c p 3"]
+    seen: Float[Array, "*k c p"]  # what a point counts, 0 to 1; 0 fills up a row
+
+    @property
+    def num_points(self) -> int:
+        """How many there are of a group in a camera, those that count nothing included."""
+        return self.seen.shape[-1]
 
 
-def join(a: Points, b: Points) -> Points:
-    """The points of both."""
-    rows = (jnp.concatenate([x, y], axis=1) for x, y in zip(a[:2], b[:2], strict=True))
-    return Points(*rows, jnp.concatenate([a.seen, b.seen], axis=2))
+def join(*several: Points) -> Points:
+    """The points of all."""
+    return Points(*(jnp.concatenate(rows, axis=2) for rows in zip(*several, strict=True)))
+
+
+class Sight(NamedTuple):
+    """A frame as points are compared with it."""
+
+    cameras: Camera
+    tones: Float[Array, "c height width 3"]
+    depths: Float[Array, "c height width"] | None
+
+
+def sight_of(frame: Frame, shading: float) -> Sight:
+    """The frame in tones."""
+    return Sight(frame.cameras, tones(frame.images, shading), frame.depths)
+
+
+def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
+    """Logarithms of the three channels, halved to span about 0 to 1, their mean reduced to a share `shading`.
+
+    Light scales all channels alike, so it moves the mean of the logarithms only. Without this, a can that
+    rolls under a lamp looks more like one that stands still, lit as before.
+    """
+    logs = 0.5 * jnp.log(jnp.maximum(colors, 0.0) + 0.1)  # the offset keeps the noise of dark pixels down
+    return logs - (1 - shading) * logs.mean(-1, keepdims=True)
 
 
 def of_groups(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array, "k *d"]):
@@ -38,32 +67,48 @@ def of_groups(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array,
 
 def carry(points: Points, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Points:
     """Each group's points after its twist (translation, rotation vector) about its centre."""
-    center = centers[:, None]
-    turned = jnp.einsum("kij,kpj->kpi", jaxlie.SO3.exp(twists[:, 3:]).as_matrix(), points.means - center)
-    return points._replace(means=center + turned + twists[:, None, :3])
+    center = centers[:, None, None]
+    turned = jnp.einsum("kij,kcpj->kcpi", jaxlie.SO3.exp(twists[:, 3:]).as_matrix(), points.means - center)
+    return points._replace(means=center + turned + twists[:, None, None, :3])
 
 
 def sample_groups(
     means: Float[Array, "m 3"],
-    colors: Float[Array, "m 3"],
+    tones: Float[Array, "m 3"],
     seen: Float[Array, "c m"],
     groups: Int[Array, "m"],
     num_groups: int,
     per_group: int,
 ) -> Points:
     """Up to `per_group` members of each group, spread over it; a large one needs no more."""
-    shuffle = 1.0 + jax.random.permutation(jax.random.key(1), groups.shape[0]).astype(jnp.float32)
-    size = min(per_group, groups.shape[0])
+    rows, real = first_members(groups, num_groups, min(per_group, groups.shape[0]))
+    in_all = (num_groups, seen.shape[0], *rows.shape[1:], 3)
+    weights = jnp.moveaxis(seen[:, rows], 0, 1) * real[:, None]
+    return Points(*(jnp.broadcast_to(a[rows][:, None], in_all) for a in (means, tones)), weights)
 
-    def one(group):
-        priority, rows = jax.lax.top_k(jnp.where(groups == group, shuffle, 0.0), size)
-        return Points(means[rows], colors[rows], seen[:, rows] * (priority > 0))
 
-    return jax.vmap(one)(jnp.arange(1, num_groups + 1))
+def first_members(
+    groups: Int[Array, "n"], num_groups: int, per_group: int
+) -> tuple[Int[Array, "k p"], Bool[Array, "k p"]]:
+    """Up to `per_group` places of each group 1..K, in a fixed random order, and which of them are real.
+
+    Other values than 1..K belong to nobody. One sort finds the members of all groups.
+    """
+    count = groups.shape[0]
+    visit = np.random.default_rng(0).permutation(count).astype(np.int32)
+    bits = max(1, (count - 1).bit_length())
+    group = jnp.where((groups >= 1) & (groups <= num_groups), groups, num_groups + 1)[visit]
+    keys = (group.astype(jnp.uint32) << bits) | jnp.arange(count, dtype=jnp.uint32)
+    keys = sort_keys(keys, "host")
+    firsts = jnp.arange(1, num_groups + 1, dtype=jnp.uint32) << bits
+    places = jnp.searchsorted(keys, firsts)[:, None] + jnp.arange(per_group)
+    found = keys[jnp.minimum(places, count - 1)]
+    real = (places < count) & ((found >> bits) == jnp.arange(1, num_groups + 1, dtype=jnp.uint32)[:, None])
+    return jnp.asarray(visit)[found & jnp.uint32((1 << bits) - 1)], real
 
 
 def pixels_of_groups(
-    frame: Frame,
+    sight: Sight,
     labels: Int[Array, "c h w"],
     depths: Float[Array, "c h w"],
     num_groups: int,
@@ -72,38 +117,26 @@ def pixels_of_groups(
     """Up to `config.pixels` pixels of each group in each camera, as points that this camera looks for.
 
     Args:
-        frame: what the cameras saw; for a camera without depth, the model's depth stands in.
+        sight: what the cameras saw; for a camera without depth, the model's depth stands in.
         labels: the group of each pixel, 0 for none.
         depths: of the model at that pixel. What is measured further off
             than a group is thick is something else.
     """
-    num_cameras, height, width = labels.shape
+    height, width = labels.shape[1:]
     grid = pixel_grid(width, height).reshape(-1, 2)
-    # A fixed shuffle: any first few of the chosen pixels are spread over the whole group.
-    shuffle = jax.random.permutation(jax.random.key(0), height * width).astype(jnp.float32)
     measured = depths
-    if frame.depths is not None:
-        with_depth = (frame.depths > 0).any((1, 2))[:, None, None]
-        measured = jnp.where(with_depth, frame.depths, depths)
+    if sight.depths is not None:
+        with_depth = (sight.depths > 0).any((1, 2))[:, None, None]
+        measured = jnp.where(with_depth, sight.depths, depths)
     usable = (measured > 0) & (jnp.abs(measured - depths) < config.max_thickness)
 
-    def one(group, camera):
-        chosen = (labels[camera].ravel() == group) & usable[camera].ravel()
-        priority, rows = jax.lax.top_k(jnp.where(chosen, 1.0 + shuffle, 0.0), config.pixels)
-        view = (frame.cameras.viewmat[camera], frame.cameras.K[camera])
-        means = unproject(grid[rows], measured[camera].ravel()[rows], *view)
-        return means, frame.images[camera].reshape(-1, 3)[rows], priority > 0
+    def one(viewmat, K, groups, depth, image):
+        rows, real = first_members(groups.ravel(), num_groups, config.pixels)
+        points = unproject(grid[rows], depth.ravel()[rows], viewmat, K)
+        return points, image.reshape(-1, 3)[rows], real.astype(points.dtype)
 
-    groups, cameras = jnp.arange(1, num_groups + 1), jnp.arange(num_cameras)
-    over_cameras = jax.vmap(one, in_axes=(None, 0))
-    means, colors, real = jax.vmap(over_cameras, in_axes=(0, None))(groups, cameras)
-    # Only the camera that saw a pixel looks for it.
-    seen = jnp.einsum("kcp,cd->kdcp", real.astype(means.dtype), jnp.eye(num_cameras))
-    return Points(
-        means.reshape(num_groups, -1, 3),
-        colors.reshape(num_groups, -1, 3),
-        seen.reshape(num_groups, num_cameras, -1),
-    )
+    views = (sight.cameras.viewmat, sight.cameras.K, jnp.where(usable, labels, 0), measured, sight.tones)
+    return Points(*jax.vmap(one, out_axes=1)(*views))
 
 
 class Keyframe(NamedTuple):

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 
 from gsjax.methods.object_tracker.align import align, disagreement
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, carry
-from gsjax.scene.frame import Frame
+from gsjax.methods.object_tracker.points import Points, Sight, carry
 
 
 def widened(config: AlignConfig) -> AlignConfig:
@@ -24,11 +23,11 @@ def judge(
     twists: Float[Array, "k 6"],
     points: Points,
     centers: Float[Array, "k 3"],
-    frame: Frame,
+    sight: Sight,
     config: AlignConfig,
 ) -> Float[Array, "k"]:
     """How badly each group agrees with the images after its twist: 0 perfect, 1 not at all."""
-    return disagreement(carry(points, twists, centers), frame, config)
+    return disagreement(carry(points, twists, centers), sight, config)
 
 
 def least(residuals: Float[Array, "h k"], twists: Float[Array, "h k 6"]) -> Float[Array, "k 6"]:
@@ -53,9 +52,9 @@ def turned(
 
 def principal_axes(points: Points, centers: Float[Array, "k 3"]) -> Float[Array, "k 3 3"]:
     """Axes of each group, one a row: a bottle rolls about its own, whichever way it lies."""
-    weights = (points.seen > 0).any(1).astype(points.means.dtype)
-    away = (points.means - centers[:, None]) * weights[..., None]
-    _, vectors = jnp.linalg.eigh(jnp.einsum("kpi,kpj->kij", away, away))
+    weights = (points.seen > 0).astype(points.means.dtype)
+    away = (points.means - centers[:, None, None]) * weights[..., None]
+    _, vectors = jnp.linalg.eigh(jnp.einsum("kcpi,kcpj->kij", away, away))
     return jnp.swapaxes(vectors, -1, -2)
 
 
@@ -66,19 +65,19 @@ def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
     return grid[np.linalg.norm(grid, axis=1) <= radius]
 
 
-def _shifted(points: Points, centers: Float[Array, "k 3"], frame: Frame, config: AlignConfig):
+def _shifted(points: Points, centers: Float[Array, "k 3"], sight: Sight, config: AlignConfig):
     """The pure translation of each group, of a coarse grid, that agrees best: of some of its points."""
-    some = Points(points.means[:, ::4], points.colors[:, ::4], points.seen[:, :, ::4])
+    some = jax.tree.map(lambda a: a[:, :, ::4], points)
     shifts = jnp.asarray(ball(config.reach, config.spacing), points.means.dtype)
     twists = jnp.zeros((len(shifts), len(centers), 6), points.means.dtype).at[..., :3].set(shifts[:, None])
-    return least(jax.lax.map(lambda t: judge(t, some, centers, frame, widened(config)), twists), twists)
+    return least(jax.lax.map(lambda t: judge(t, some, centers, sight, widened(config)), twists), twists)
 
 
 def search(
     starts: Float[Array, "h k 6"],
     points: Points,
     centers: Float[Array, "k 3"],
-    frame: Frame,
+    sight: Sight,
     config: AlignConfig,
 ) -> Float[Array, "k 6"]:
     """The twist of each group that agrees best with the images; no worse than the first start.
@@ -92,19 +91,20 @@ def search(
         starts: hypotheses: translation, metres, and rotation vector, radians, of each group.
         points: of each group in the last frame.
         centers: what groups turn about.
-        frame: what the cameras see now.
+        sight: what the cameras see now.
     """
 
     def best_of(twists):
-        residuals = jax.lax.map(lambda t: judge(t, points, centers, frame, config), twists)
+        residuals = jax.lax.map(lambda t: judge(t, points, centers, sight, config), twists)
         return least(residuals, twists)
 
     def aligned(twists):
-        return jax.lax.map(lambda t: align(t, points, centers, frame, widened(config)), twists)
+        return jax.lax.map(lambda t: align(t, points, centers, sight, widened(config)), twists)
 
-    if frame.depths is not None:  # by colour alone, a plain thing would slide about within its outline
-        starts = jnp.concatenate([starts, _shifted(points, centers, frame, config)[None]])
-    best = best_of(aligned(starts))
-    if config.max_turn:
+    # By colour alone, a plain thing would slide about within its outline.
+    if sight.depths is not None and config.reach:
+        starts = jnp.concatenate([starts, _shifted(points, centers, sight, config)[None]])
+    best = best_of(aligned(starts) if config.every_start else starts)
+    if config.max_turn and config.turns:
         best = best_of(aligned(turned(best, principal_axes(points, centers), config.turns)))
-    return best_of(jnp.stack([starts[0], best, align(best, points, centers, frame, config)]))
+    return best_of(jnp.stack([starts[0], best, align(best, points, centers, sight, config)]))

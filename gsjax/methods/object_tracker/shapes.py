@@ -25,11 +25,11 @@ from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.methods.object_tracker.align import bilinear
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
+from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Motion, first_pose, move
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import tiles_to_pixels, touched_tiles
 from gsjax.methods.object_tracker.scene import TrackedScene, assemble
-from gsjax.methods.object_tracker.tracker import render_labels
 from gsjax.optim.compiler import host_options
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated

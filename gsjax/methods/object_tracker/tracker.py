@@ -6,11 +6,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.cameras import camera_centers, project
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import TrackerConfig
-from gsjax.methods.object_tracker.matching import lift, match_templates
-from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
+from gsjax.methods.object_tracker.layers import (
+    Backdrop,
+    Shown,
+    background_of,
+    draw_backdrop,
+    keep_backdrop,
+    moving_of,
+    render_labels,
+    seen_from,
+    show_moving,
+    shown_by,
+)
+from gsjax.methods.object_tracker.matching import Template, lift, match_templates
+from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
 from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
@@ -21,6 +32,8 @@ from gsjax.methods.object_tracker.points import (
     pixels_of_groups,
     renewed,
     sample_groups,
+    sight_of,
+    tones,
 )
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import (
@@ -36,7 +49,7 @@ from gsjax.methods.object_tracker.region import (
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.search import judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
-from gsjax.rasterize.plan import Plan, rung
+from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered, plan_render, render
 
@@ -50,6 +63,9 @@ class TrackerState(NamedTuple):
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
     count: Int[Array, ""]  # frames so far
+    shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
+    backdrop: Backdrop | None
+    images: Float[Array, "c height width 3"] | None  # of the last frame, where templates are taken from them
 
 
 class TrackerBatch(NamedTuple):
@@ -60,44 +76,6 @@ class TrackerBatch(NamedTuple):
     plan: TrackerPlan
 
 
-def render_labels(
-    scene: TrackedScene, pose: Pose, frame: Frame, plan: Plan, *, one_sided: bool = False
-) -> Rendered:
-    """The scene as it stands, with the share of each label in each pixel as features [C, H, W, K+1].
-
-    `one_sided` leaves out what a camera sees from behind: right for comparing with images, while for
-    silhouettes the far side of an object stands in for a near side that no camera has seen yet.
-    """
-    one_hot = jax.nn.one_hot(scene.labels, scene.num_objects + 1)
-    visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat)) if one_sided else None
-    return render(place(scene, pose), frame.cameras, plan, features=one_hot, visibility=visibility)
-
-
-def seen_from(
-    scene: TrackedScene, pose: Pose, rendered: Rendered, frame: Frame, gap: float
-) -> Float[Array, "c m"]:
-    """1 for each moving Gaussian that a camera sees: its label is on top there and its depth agrees."""
-    groups = scene.labels[: scene.num_moving]
-    height, width = frame.images.shape[1:3]
-
-    def one(viewmat, K, depth, weights):
-        pixels, z = project(pose.means, viewmat, K)
-        column, row = jnp.floor(pixels).astype(jnp.int32).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
-        column, row = jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1)
-        on_top = (weights[row, column, groups] > 0.5) & (jnp.abs(depth[row, column] - z) < gap)
-        return (inside & on_top).astype(depth.dtype)
-
-    return jax.vmap(one)(frame.cameras.viewmat, frame.cameras.K, rendered.depths, rendered.features)
-
-
-def _pixels(frame: Frame, rendered: Rendered, num_objects: int, config: TrackerConfig) -> Points:
-    """The pixels of a frame that show each group, as the scene rendered solid says."""
-    assert rendered.features is not None
-    shown = jnp.where(rendered.alphas > 0.5, jnp.argmax(rendered.features, axis=-1), 0)
-    return pixels_of_groups(frame, shown, rendered.depths, num_objects, config.align)
-
-
 def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
     """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
     # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
@@ -106,7 +84,16 @@ def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: T
     colors = scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
     groups = scene.labels[: scene.num_moving]
     seen = config.align.center_weight * seen * named
-    return sample_groups(pose.means, colors, seen, groups, scene.num_objects, config.align.centers)
+    of_colors = tones(colors, config.align.shading)
+    return sample_groups(pose.means, of_colors, seen, groups, scene.num_objects, config.align.centers)
+
+
+class _Last(NamedTuple):
+    """The last scene, before it has moved."""
+
+    seen: Float[Array, "c m"]  # 1 for each moving Gaussian that a camera saw
+    template: Template | None
+    rendered: Rendered | None  # where the whole scene was drawn
 
 
 def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch, reduction: int = 1) -> Step:
@@ -114,10 +101,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
     params: the `Pose` of the moving Gaussians. state: `TrackerState`. batch: `TrackerBatch`.
 
-    A frame goes through: render the last scene with its labels; match each object's template in every camera
-    and lift the match to a translation; from standing still, going on as before and the match, align
-    each object with the images and take what agrees best; refine D_k and delta_i photometrically; and keep
-    the refinement of an object only where it agrees better still. What no camera sees stays where it is.
+    A frame goes through: see what the last scene shows of each object; match each object's template in every
+    camera and lift the match to a translation; from standing still, going on as before and the match, align
+    each object with the images and take what agrees best; refine D_k and delta_i photometrically; keep
+    the refinement of an object only where it agrees better still; and draw what the scene shows now. What no
+    camera sees stays where it is. With `config.redraw` "moving", what is drawn are the moving Gaussians.
 
     Args:
         config: see `TrackerConfig`.
@@ -125,64 +113,103 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         first: the frame that the first pose shows, with the scene, for `init`.
         reduction: factor by which images shrink for template matching (objects larger than the template).
     """
+    keep = config.redraw == "moving"
 
     def init(params: Pose) -> TrackerState:
         nowhere = Motion(jnp.zeros((num_objects, 6), params.means.dtype), jnp.zeros_like(params.means))
-        rendered = render_labels(first.scene, params, first.frame, first.plan.full)
-        pixels = _pixels(first.frame, rendered, num_objects, config)
-        return TrackerState(nowhere, pixels, first_keyframe(pixels), jnp.int32(0))
+        scene, frame, plan = first
+        backdrop = draw_backdrop(scene, frame.cameras, plan.full)[0] if keep else None
+        shown, _ = show(scene, params, frame, backdrop, plan)
+        pixels = pixels_of_groups(
+            sight_of(frame, config.align.shading), shown.labels, shown.depths, num_objects, config.align
+        )
+        remembered = (shown, backdrop, frame.images if config.matching else None) if keep else (None,) * 3
+        return TrackerState(nowhere, pixels, first_keyframe(pixels), jnp.int32(0), *remembered)
+
+    def show(scene: TrackedScene, pose: Pose, frame: Frame, backdrop: Backdrop | None, plan: TrackerPlan):
+        """What the scene shows, and what capacities that took (`near`, `full`)."""
+        if backdrop is None:
+            rendered = render_labels(scene, pose, frame, plan.full)
+            return shown_by(rendered), rendered.meta.needed.max()
+        return show_moving(scene, pose, backdrop, plan.near)
+
+    def look_back(params: Pose, state: TrackerState, batch: TrackerBatch) -> _Last:
+        """What the last scene shows."""
+        scene, frame, plan = batch
+        gap = config.start.depth_gap
+        if keep:
+            assert state.shown is not None
+            assert state.backdrop is not None
+            seen = seen_from(scene, params, state.shown, state.backdrop.cameras, gap)
+            if state.images is None:
+                return _Last(seen, None, None)
+            weights = jax.nn.one_hot(state.shown.labels - 1, num_objects)
+            return _Last(seen, Template(state.images, state.shown.depths, weights), None)
+        last = render_labels(scene, params, frame, plan.full, one_sided=True)
+        assert last.features is not None
+        mostly = last.features.max(-1) > 0.5
+        labels = jnp.where(mostly, jnp.argmax(last.features, axis=-1), 0).astype(jnp.int32)
+        seen = seen_from(scene, params, Shown(labels, last.depths, mostly), frame.cameras, gap)
+        return _Last(seen, Template(last.colors, last.depths, last.features[..., 1:]), last)
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan = batch
         groups = scene.labels[: scene.num_moving]
         centers = group_means(params.means, groups, num_objects)
+        sight = sight_of(frame, config.align.shading)
 
-        last = render_labels(scene, params, frame, plan.full, one_sided=True)
-        assert last.features is not None
-        seen = seen_from(scene, params, last, frame, config.start.depth_gap)
-        visible = group_means(seen.max(0), groups, num_objects) > _MIN_SEEN
-        jump, found, score = _match(last, frame, num_objects, config, reduction)
+        last = look_back(params, state, batch)
+        visible = group_means(last.seen.max(0), groups, num_objects) > _MIN_SEEN
+        jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
-        points = join(_named(scene, params, seen, config), join(state.pixels, remembered))
+        points = join(_named(scene, params, last.seen, config), state.pixels, remembered)
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
-        starts, delta = [still, jumped], jnp.zeros_like(state.motion.delta)
+        starts, delta = [still], jnp.zeros_like(state.motion.delta)
+        if config.matching:
+            starts += [jumped]
         if config.warm_start:
-            starts += [going, going.at[:, :3].set(jumped[:, :3])]
+            starts += [going]
             delta = state.motion.delta
-        aligned = search(jnp.stack(starts), points, centers, frame, config.align)
-        begun = Motion(aligned, delta)
-        tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
-        near = near_background(scene, last, tiles)
-        around = near_scene(scene, near, plan.num_near)
-        roi = tiles_to_pixels(tiles, frame)
-        refine_batch = RefineBatch(around, frame, plan.near, params, centers, roi)
-        refined, shifts, info = refine(begun, refine_batch, config.refine)
-        if shifts is not None:
-            shifts = spread(near, shifts)
-            scene = shift_background(scene, shifts)
-        # Points know nothing of outlines, which rendered images do, so these are overruled only where they
-        # went clearly astray; without depth the points hardly know better at all.
-        lead = 0.1 if frame.depths is None else 0.01
-        of_refined, of_begun = (
-            judge(m.twists, points, centers, frame, config.align) for m in (refined, begun)
-        )
-        better = of_refined - lead <= of_begun
-        nowhere = jax.tree.map(jnp.zeros_like, begun)
-        kept = _select(visible, _select(better, refined, begun, groups), nowhere, groups)
+        if config.matching and config.warm_start:
+            starts += [going.at[:, :3].set(jumped[:, :3])]
+        aligned = search(jnp.stack(starts), points, centers, sight, config.align)
+        kept = begun = Motion(aligned, delta)
+        residual = judge(begun.twists, points, centers, sight, config.align)
+        needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
+        if config.refine.iterations:
+            assert last.rendered is not None
+            refined, shifts, needed, info = _refine(begun, params, centers, last.rendered, batch, config)
+            if shifts is not None:
+                scene = shift_background(scene, shifts)
+            # Points know nothing of outlines, which rendered images do, so these are overruled only where
+            # they went clearly astray; without depth the points hardly know better at all.
+            lead = 0.1 if frame.depths is None else 0.01
+            of_refined = judge(refined.twists, points, centers, sight, config.align)
+            better = of_refined - lead <= residual
+            kept = _select(better, refined, begun, groups)
+            residual = jnp.where(better, of_refined, residual)
+        kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
 
         pose = move(params, kept, centers, groups)
-        solid = render_labels(scene, pose, frame, plan.full)
-        full = jnp.maximum(last.meta.needed.max(), solid.meta.needed.max())
-        needed = Needed(full, info["needed"], near.sum())
+        backdrop, drawn = state.backdrop, jnp.int32(0)
+        if backdrop is not None:
+            backdrop, drawn = keep_backdrop(backdrop, scene, frame.cameras, plan.full)
+        shown, shown_needed = show(scene, pose, frame, backdrop, plan)
+        if last.rendered is not None:
+            drawn = jnp.maximum(last.rendered.meta.needed.max(), shown_needed)
+            needed = needed._replace(full=drawn)
+        else:
+            needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, shown_needed))
         overflow = needed.exceeds(plan)
         sound = all_finite((pose, shifts)) & ~overflow
-        pixels = _pixels(frame, solid, num_objects, config)
+        pixels = pixels_of_groups(sight, shown.labels, shown.depths, num_objects, config.align)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
-        new_state = TrackerState(kept, pixels, keyframe, state.count + 1)
+        memory = (shown, backdrop, frame.images if config.matching else None) if keep else (None,) * 3
+        new_state = TrackerState(kept, pixels, keyframe, state.count + 1, *memory)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
@@ -191,9 +218,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "score": score,
             "found": found,
             "visible": visible,
-            "residual": jnp.where(better, of_refined, of_begun),
+            "residual": residual,
             "motion": kept,
-            "rendered": solid,
+            "shown": shown,
             "background": shifts,
         }
         return pose, new_state, info
@@ -201,7 +228,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
     return Step(init, update)
 
 
-def _match(last: Rendered, frame: Frame, num_objects: int, config: TrackerConfig, reduction: int):
+def _match(template: Template | None, frame: Frame, num_objects: int, config: TrackerConfig, reduction: int):
     """Where template matching says that each group has gone, whether it found it, and its scores [C, K]."""
     if not config.matching:
         num_cameras = len(frame.images)
@@ -210,10 +237,23 @@ def _match(last: Rendered, frame: Frame, num_objects: int, config: TrackerConfig
             jnp.zeros(num_objects, bool),
             jnp.zeros((num_cameras, num_objects)),
         )
-    assert last.features is not None
-    labels = last.features[..., 1:]
-    match = match_templates(last.colors, last.depths, labels, frame, config.match, reduction)
+    assert template is not None
+    match = match_templates(template, frame, config.match, reduction)
     return *lift(match, frame, config.match), match.score
+
+
+def _refine(begun: Motion, params: Pose, centers, last: Rendered, batch: TrackerBatch, config: TrackerConfig):
+    """Refined motion, shifts of the background (None if that is frozen), capacities needed, and info."""
+    scene, frame, plan = batch
+    groups = scene.labels[: scene.num_moving]
+    tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
+    near = near_background(scene, last, tiles)
+    around = near_scene(scene, near, plan.num_near)
+    roi = tiles_to_pixels(tiles, frame)
+    refine_batch = RefineBatch(around, frame, plan.near, params, centers, roi)
+    refined, shifts, info = refine(begun, refine_batch, config.refine)
+    needed = Needed(jnp.int32(0), info.pop("needed"), near.sum())
+    return refined, None if shifts is None else spread(near, shifts), needed, info
 
 
 def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "m"]) -> Motion:
@@ -224,8 +264,13 @@ def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "
     )
 
 
-def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, headroom: float) -> TrackerPlan:
-    """Capacities for a step from `pose` with cameras as in `frame`, with `headroom` for what motion adds."""
+def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackerConfig) -> TrackerPlan:
+    """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds."""
+    headroom = config.headroom
+    if config.redraw == "moving":
+        full = plan_render(background_of(scene), frame.cameras, headroom=headroom)
+        near = plan_render(moving_of(scene, pose), frame.cameras, headroom=headroom, sh_degree=None)
+        return TrackerPlan(full, near, 0)
     full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
     rendered = render(place(scene, pose), frame.cameras, full)
     near = near_background(scene, rendered, touched_tiles([pose.means], frame))

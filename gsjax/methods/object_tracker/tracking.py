@@ -87,12 +87,12 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
     tracker = object_tracker(config, num_objects, batch, reduction)
     with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
         pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
-    rendered, background, scene = info.pop("rendered"), info.pop("background"), batch.scene
+    shown, background, scene = info.pop("shown"), info.pop("background"), batch.scene
     if background is not None:
         scene = keep_if(~info["skipped"], shift_background(scene, background), scene)
     info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
     if config.grow.slots and frame.depths is not None:
-        grown = grow(scene, pose, rendered, frame, state.count, config.grow)
+        grown = grow(scene, pose, shown, frame, state.count, config.grow)
         scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
         info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
@@ -140,7 +140,7 @@ def track(
             scene = with_slots(scene, config.grow.slots)
         pose = first_pose(scene)
     first, _ = without_broken(first)
-    plan = plan_tracker(scene, pose, first, config.headroom)
+    plan = plan_tracker(scene, pose, first, config)
     reduction = _reduction(scene, first, config)
     if state is None:
         state = _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)

@@ -1,0 +1,140 @@
+"""What a scene shows: which label is on top in each pixel, and how deep it lies.
+
+Two ways. The whole scene is drawn, or what moves is drawn over what stands: the background is drawn once and
+kept, and drawn again only when a camera has moved. The second is exact where the background is opaque and a
+pixel's moving Gaussians lie all in front of it or all behind; else a pixel belongs to what is nearer.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.geometry.cameras import Camera, camera_centers, project
+from gsjax.methods.object_tracker.motion import Pose, facing, place
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.rasterization import rasterization
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import Rendered, render
+
+
+class Shown(NamedTuple):
+    """What each pixel of C cameras shows."""
+
+    labels: Int[Array, "c height width"]  # the group on top; 0 for background and for nothing
+    depths: Float[Array, "c height width"]  # metres; 0 where nothing is drawn
+    covered: Bool[Array, "c height width"]  # more than half opaque
+
+
+class Backdrop(NamedTuple):
+    """The background alone, and the cameras that it was drawn for."""
+
+    cameras: Camera
+    colors: Float[Array, "c height width 3"]
+    depths: Float[Array, "c height width"]
+    alphas: Float[Array, "c height width"]
+
+
+def render_labels(
+    scene: TrackedScene, pose: Pose, frame: Frame, plan: Plan, *, one_sided: bool = False
+) -> Rendered:
+    """The scene as it stands, with the share of each label in each pixel as features [C, H, W, K+1].
+
+    `one_sided` leaves out what a camera sees from behind: right for comparing with images, while for
+    silhouettes the far side of an object stands in for a near side that no camera has seen yet.
+    """
+    one_hot = jax.nn.one_hot(scene.labels, scene.num_objects + 1)
+    visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat)) if one_sided else None
+    return render(place(scene, pose), frame.cameras, plan, features=one_hot, visibility=visibility)
+
+
+def shown_by(rendered: Rendered) -> Shown:
+    """Of the whole scene, drawn by `render_labels`."""
+    assert rendered.features is not None
+    covered = rendered.alphas > 0.5
+    labels = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
+    return Shown(labels.astype(jnp.int32), rendered.depths, covered)
+
+
+def background_of(scene: TrackedScene) -> Gaussians:
+    """What does not move."""
+    return jax.tree.map(lambda a: a[scene.num_moving :], scene.gaussians)
+
+
+def moving_of(scene: TrackedScene, pose: Pose) -> Gaussians:
+    """What moves, where `pose` says."""
+    moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
+    return eqx.tree_at(lambda g: (g.means, g.quats), moving, (pose.means, pose.quats))
+
+
+def draw_backdrop(scene: TrackedScene, cameras: Camera, plan: Plan) -> tuple[Backdrop, Int[Array, ""]]:
+    """The background in these cameras, and what capacity that needed."""
+    drawn = render(background_of(scene), cameras, plan)
+    return Backdrop(cameras, drawn.colors, drawn.depths, drawn.alphas), drawn.meta.needed.max()
+
+
+def keep_backdrop(
+    backdrop: Backdrop, scene: TrackedScene, cameras: Camera, plan: Plan
+) -> tuple[Backdrop, Int[Array, ""]]:
+    """The backdrop for these cameras: the one there is, unless a camera has moved."""
+    same = jnp.array_equal(backdrop.cameras.viewmat, cameras.viewmat)
+    same &= jnp.array_equal(backdrop.cameras.K, cameras.K)
+    return jax.lax.cond(
+        same, lambda: (backdrop, jnp.int32(0)), lambda: draw_backdrop(scene, cameras, plan)
+    )
+
+
+def show_moving(
+    scene: TrackedScene, pose: Pose, backdrop: Backdrop, plan: Plan
+) -> tuple[Shown, Int[Array, ""]]:
+    """What moves, drawn alone, over the backdrop; and what capacity that needed.
+
+    Labels are drawn as their binary digits, which are few channels: where one label has more than half of a
+    pixel's weight, so has each of its digits.
+    """
+    moving, cameras = moving_of(scene, pose), backdrop.cameras
+    powers = np.left_shift(1, np.arange(max(1, scene.num_objects.bit_length())))
+    digits = ((scene.labels[: scene.num_moving, None] & powers) > 0).astype(pose.means.dtype)
+    images, alphas, meta = rasterization(
+        moving.means,
+        moving.quats,
+        moving.scales,
+        moving.opacities,
+        digits,
+        cameras.viewmat,
+        cameras.K,
+        cameras.width,
+        cameras.height,
+        plan=plan,
+        render_mode="RGB+ED",
+    )
+    alphas, depths = alphas[..., 0], images[..., -1]
+    labels = ((images[..., :-1] > 0.5 * alphas[..., None]) * powers).sum(-1).astype(jnp.int32)
+    behind = (backdrop.alphas > 0.5) & (backdrop.depths < depths)
+    on_top = (alphas > 0.5) & ~behind
+    labels = jnp.where(on_top & (labels <= scene.num_objects), labels, 0)
+    depths = jnp.where(on_top, depths, backdrop.depths)
+    return Shown(labels, depths, on_top | (backdrop.alphas > 0.5)), meta.needed.max()
+
+
+def seen_from(
+    scene: TrackedScene, pose: Pose, shown: Shown, cameras: Camera, gap: float
+) -> Float[Array, "c m"]:
+    """1 for each moving Gaussian that a camera sees: its label is on top there and its depth agrees."""
+    groups = scene.labels[: scene.num_moving]
+    width, height = cameras.width, cameras.height
+
+    def one(viewmat, K, labels, depths):
+        pixels, z = project(pose.means, viewmat, K)
+        column, row = jnp.floor(pixels).astype(jnp.int32).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
+        column, row = jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1)
+        on_top = (labels[row, column] == groups) & (jnp.abs(depths[row, column] - z) < gap)
+        return (inside & on_top).astype(depths.dtype)
+
+    return jax.vmap(one)(cameras.viewmat, cameras.K, shown.labels, shown.depths)
