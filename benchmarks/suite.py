@@ -148,7 +148,9 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
     for line in bottom_line(record):
         console.print(line.replace("**", ""), markup=False)
     code = 0 if finished else 130
-    if baseline is not None:
+    if not record["metrics"] and (options.check or options.update_baseline):
+        raise ValueError("--check and --update-baseline: expected figures, found none that was measured")
+    if baseline is not None and record["metrics"]:
         rows = compare(record, baseline)
         print_comparison(console, rows, baseline)
         if options.check and finished:

@@ -102,7 +102,7 @@ def list_experiments(options: List) -> int:
             continue
         done = f"{sum(map(experiment.is_done, records))} of {len(experiment.cells)}"
         failed = sum(record["error"] is not None for record in records)
-        stale = sum(record["script"] != experiment.fingerprint for record in records)
+        stale = sum(r["error"] is None and r["script"] != experiment.fingerprint for r in records)
         counts = ", ".join(f"{n} {word}" for n, word in ((failed, "failed"), (stale, "stale")) if n)
         when = max((r["finished"][:16].replace("T", " ") for r in records), default="–")
         grid.add_row(*map(Text, (name, experiment.config.claim.strip(), done, counts, when)))

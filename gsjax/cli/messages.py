@@ -6,6 +6,7 @@ import warnings
 from collections import Counter
 from dataclasses import fields
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +17,7 @@ from gsjax.data.errors import DataWarning
 
 # ValueError covers DataError and PlyError, and whatever an argument is checked for.
 USER_ERRORS = (ValueError, OSError)
+_PACKAGE = Path(__file__).parents[1]
 
 
 def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
@@ -125,7 +127,7 @@ class Notes:
 
         def showwarning(message, category, filename, lineno, file=None, line=None):
             if issubclass(category, DataWarning) or (
-                issubclass(category, UserWarning) and "gsjax" in filename
+                issubclass(category, UserWarning) and Path(filename).is_relative_to(_PACKAGE)
             ):
                 self.warn(" ".join(str(message).split()))
             elif sys.warnoptions:  # who asked Python for warnings gets the others too

@@ -76,7 +76,8 @@ def solve(
     vmap and scan. It has no derivative.
 
     Args:
-        residual: as above. Where `aux["overflow"]` is True its values count as infinite (`reject_overflow`).
+        residual: as above; aux is a dict, which may be empty. Where `aux["overflow"]` is True its values
+            count as infinite (`reject_overflow`).
         params: where to start: floating arrays and jaxlie groups.
         batch: what is given: observations, frozen scene, plan.
         solver: of optimistix, with its rtol and atol.
@@ -89,6 +90,9 @@ def solve(
     Returns:
         (params, info). `info` is aux at the solution with `loss`, `steps`, `result` (optimistix.RESULTS),
         `converged`, and `skipped`: the outcome was not finite or had overflowed, and params are the start's.
+        `overflow` and `needed`, where aux has them, tell of the next move too: where that overflows, the plan
+        is what ended the search, and `converged` is False. What nothing depends on (an object that no camera
+        sees) converges where it starts.
 
     Raises:
         ValueError: `jac` or `damping` is none of these, or `params` has leaves that are not floating.
@@ -132,15 +136,33 @@ def _solve(residual, params, batch, solver, jac, damping, max_steps, step, key):
     )
     values, aux = fn(solution.value)
     loss = damping * _half_sum_of_squares(values)
-    sound = all_finite((solution.value, loss))
+    found = from_coordinates(params, narrow(solution.value))
+    sound = all_finite((found, loss))
+    # Where trials overflowed the solver stops short of them, and calls that an end. The next move would tell.
+    ahead = _move(solution.state.f_info, solution.value)
+    told = _joined(aux, fn(jax.tree.map(jnp.add, solution.value, ahead))[1])
+    stuck = jnp.asarray(told.get("overflow", False)).any()
     info = {
         "loss": loss,
         "steps": solution.stats["num_steps"],
         "result": solution.result,
-        "converged": (solution.result == optx.RESULTS.successful) & sound,
+        "converged": (solution.result == optx.RESULTS.successful) & sound & ~stuck,
         "skipped": ~sound,
     }
-    return keep_if(sound, from_coordinates(params, narrow(solution.value)), params), {**aux, **info}
+    return keep_if(sound, found, params), {**aux, **told, **info}
+
+
+def _move(there, y: PyTree) -> PyTree:
+    """What Levenberg-Marquardt would try first from y."""
+    descent = optx.DampedNewtonDescent()
+    move, _ = descent.step(jnp.array(1.0), descent.query(y, there, descent.init(y, there)))
+    return jax.tree.map(lambda a: jnp.where(jnp.isfinite(a), a, 0.0), move)
+
+
+def _joined(aux: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """What two evaluations say of the plan, where they say it: did any overflow, and what did they need."""
+    joins = (("overflow", jnp.logical_or), ("needed", jnp.maximum))
+    return {name: join(aux[name], other[name]) for name, join in joins if name in aux}
 
 
 def least_squares_step(
@@ -184,15 +206,11 @@ def least_squares_step(
         there = optx.FunctionInfo.Residual(values)
         _, accepted, _, search = solver.search.step(jnp.array(False), y, moved, here, there, search)
 
-        sound = jnp.isfinite(here.as_min())
+        sound = all_finite((params, here.as_min()))
         accepted &= sound & all_finite((moved, there.as_min()))
         # Factors of 3.5 and 1/4 over many frames must not end where no factor leads back from (0, infinity).
         search = jax.tree.map(lambda new, old: jnp.clip(new, 1e-6, 1e6).astype(old.dtype), search, state)
-        told = {
-            name: join(aux[name], moved_aux[name])
-            for name, join in (("overflow", jnp.logical_or), ("needed", jnp.maximum))
-            if name in aux
-        }
+        told = _joined(aux, moved_aux)
         info = {
             "loss": damping * jnp.where(accepted, there.as_min(), here.as_min()),
             "accepted": accepted,
@@ -217,7 +235,20 @@ def difference(
     """`rendered - observed` where the observation is finite, else 0; and how many were left out.
 
     Mark what was not measured (depth 0, a mask) by NaN in `observed`.
+
+    Raises:
+        ValueError: they differ in shape, or are not floating.
     """
+    if jnp.shape(rendered) != jnp.shape(observed):
+        raise ValueError(
+            f"observed must have the shape of rendered, {jnp.shape(rendered)}; got {jnp.shape(observed)}"
+        )
+    for name, array in (("rendered", rendered), ("observed", observed)):
+        if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
+            raise ValueError(
+                f"{name} must hold floats, colours from 0 to 1; got {jnp.result_type(array)}: of 8 bits, "
+                "divide by 255"
+            )
     known = jnp.isfinite(observed)
     return jnp.where(known, rendered - jnp.where(known, observed, 0.0), 0.0), jnp.sum(~known)
 
@@ -284,7 +315,13 @@ def _scaled(residual: Residual, params, batch, damping, step, key):
     """y -> (residual / sqrt(damping), aux): optimistix starts at lambda = 1, this makes it `damping`."""
 
     def fn(y):
-        values, aux = residual(from_coordinates(params, y), batch, step=step, key=key)
+        returned = residual(from_coordinates(params, y), batch, step=step, key=key)
+        if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], dict)):
+            raise ValueError(
+                "residual(params, batch, *, step, key) must return (pytree of arrays, dict, which may be "
+                f"empty); got {type(returned).__name__}"
+            )
+        values, aux = returned
         values = reject_overflow(values, jnp.asarray(aux.get("overflow", False)))
         return jax.tree.map(lambda a: a * damping**-0.5, values), aux
 

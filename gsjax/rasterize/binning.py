@@ -65,7 +65,7 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
         ids=ids,
         starts=edges[:-1],
         counts=counts,
-        pairs=counts.sum(),
+        pairs=counts.sum(dtype=jnp.int32),
         needed=needed,
         overflow=overflow,
     )

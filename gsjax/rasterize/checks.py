@@ -49,9 +49,10 @@ def check_inputs(
     arrays |= {"viewmats": viewmats, "Ks": Ks}
     more = {"backgrounds": backgrounds, "features": features, "means2d_offset": means2d_offset}
     arrays |= {name: array for name, array in more.items() if array is not None}
-    for name, array in arrays.items():
-        if not hasattr(array, "dtype"):
+    for name, array in {**arrays, "roi": roi, "reads": reads}.items():
+        if array is not None and not hasattr(array, "dtype"):
             raise ValueError(f"{name} must be an array; got {type(array).__name__}")
+    for name, array in arrays.items():
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"{name} must hold floats; got {array.dtype}")
     if means.ndim < 2 or means.shape[-1] != 3:
@@ -97,7 +98,7 @@ def check_inputs(
     if roi is not None:
         inner = (num_cameras, plan.height, plan.width)
         _expect("roi", roi, (*lead, *inner), "a pixel mask a camera; one camera's is roi[None]")
-        if jnp.issubdtype(jnp.result_type(roi), jnp.inexact):
+        if roi.dtype != bool:
             raise ValueError(f"roi must hold booleans, True where a pixel is wanted; got {roi.dtype}")
         tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner), plan.tile_size)
     if reads is not None:
@@ -139,6 +140,8 @@ def _check_colors(colors, plan: Plan, lead: tuple[int, ...], num_cameras: int, n
             f"colors holds {colors.shape[-2]} SH coefficients; sh_degree={plan.sh_degree} "
             f"reads {num_sh_bases(plan.sh_degree)}"
         )
+    if colors.shape[-1] == 0 and "RGB" in plan.render_mode:
+        raise ValueError(f"colors must have at least one channel in render_mode {plan.render_mode!r}; got 0")
     return colors if per_camera else jnp.expand_dims(colors, len(lead))
 
 

@@ -5,6 +5,7 @@ which jaxlib ships) through ctypes and needs no compiler. Unlike `jax.pure_callb
 cannot hang on a machine with a single core.
 """
 
+import contextlib
 import ctypes
 import warnings
 from collections.abc import Callable
@@ -133,6 +134,29 @@ def register(name: str, work: Callable[..., None]) -> bool:
     return True
 
 
+def _let_checkpoints_repeat_calls() -> None:
+    """`jax.checkpoint` refuses effects that it was not told of. Ours may happen twice; JAX has no public way
+    to say so, and where its private one is another, `jax.checkpoint` says that it cannot."""
+    with contextlib.suppress(ImportError, AttributeError):
+        from jax._src import effects, ffi
+
+        effects.remat_allowed_effects.add_type(ffi.FfiEffect)
+
+
+_let_checkpoints_repeat_calls()
+
+
 def call(name: str, result: jax.ShapeDtypeStruct, *arguments: Array) -> Array:
     """What was registered by this name, of int32 and uint32 arrays. Under vmap it gets leading axes."""
-    return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(*arguments)
+    # The work needs the interpreter. An effect is waited for before Python ends; else a program that leaves
+    # while a call is under way would hang. XLA cannot split effects over devices: there, programs must wait.
+    return jax.ffi.ffi_call(
+        name, result, vmap_method="broadcast_all", has_side_effect=_num_cpu_devices() == 1
+    )(*arguments)
+
+
+def _num_cpu_devices() -> int:
+    try:
+        return jax.device_count("cpu")
+    except RuntimeError:  # JAX was told to do without
+        return 0

@@ -87,13 +87,13 @@ class Plan:
             ("sort", SORTS),
         ):
             value = getattr(self, name)
-            if value not in allowed:
+            if type(value) not in map(type, allowed) or value not in allowed:  # True equals 1, and 8.0 is 8
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {value!r}")
         for name in ("width", "height", "tiles_per_batch", "max_per_tile"):
             value = getattr(self, name)
             if value is None and name in ("tiles_per_batch", "max_per_tile"):
                 continue
-            if not isinstance(value, int) or value < 1:
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
         if not isinstance(self.capacity, int) or (self.capacity < 2 and self.capacity != 0):
             raise ValueError(
@@ -149,8 +149,8 @@ class Plan:
             ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or
                 `headroom` is below 1, under which re-planning would never end.
         """
-        if not headroom >= 1:
-            raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom}")
+        if not isinstance(headroom, Real) or not headroom >= 1:
+            raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom!r}")
         if needed < 0:
             raise ValueError(f"needed must be 0 or more, as meta.needed is; got {needed}")
         if needed >= 2**31 - 1:

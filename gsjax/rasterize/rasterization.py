@@ -142,7 +142,7 @@ def rasterization(
     others = (backgrounds, features, roi, means2d_offset, reads)
     views, batch = check_inputs(plan, *gaussians, viewmats, Ks, *others)
     if plan.capacity == 0:
-        plan = _planned(views, plan, headroom=1.0)
+        plan = planned_for(views, plan, headroom=1.0)
     return _rasterize(_Views(*views), plan, batch)
 
 
@@ -186,21 +186,21 @@ def plan(
     colors = jnp.zeros((*np.shape(means)[:-1], *bases, 1))
     gaussians = (means, quats, scales, opacities, colors)
     views, _ = check_inputs(bare, *gaussians, viewmats, Ks, None, None, roi, None, None)
-    return _planned(views, bare, headroom)
+    return planned_for(views, bare, headroom)
 
 
 def _options(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: arguments[name] for name in OPTION_NAMES if name in arguments}
 
 
-def _planned(views, bare: Plan, headroom: float) -> Plan:
+def planned_for(views, bare: Plan, headroom: float) -> Plan:
+    """`bare` with a capacity that holds what these checked inputs need, times `headroom`."""
     values = jax.lax.stop_gradient(views)
     if not is_concrete(values):
         raise ValueError(
-            "rasterization without a plan, or with one of capacity 0, looks at values, and these are traced "
-            "(jit, vmap or scan). Call plan = gsjax.plan(means, quats, scales, opacities, viewmats, Ks, "
-            "width, height, ...) outside, with typical values, and pass plan=plan inside; meta.overflow "
-            "tells if it becomes too small"
+            "planning looks at values, and these are traced (jit, vmap or scan). Call plan = "
+            "gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, with "
+            "typical values, and pass plan=plan inside; meta.overflow tells if it becomes too small"
         )
     if values[0].shape[1] == 0:
         return bare.grown(0, headroom)

@@ -16,8 +16,7 @@ from jax.sharding import PartitionSpec as P
 
 from gsjax.rasterize.checks import check_inputs
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
-from gsjax.rasterize.rasterization import plan as make_plan
-from gsjax.rasterize.rasterization import rasterization
+from gsjax.rasterize.rasterization import planned_for, rasterization
 
 AxisNames = str | tuple[str, ...]
 
@@ -69,9 +68,8 @@ def sharded_rasterization(
         jax.eval_shape(functools.partial(check_inputs, plan), *map(shapes.get, _ARRAYS))
         _check_divides(arrays, mesh, cameras, scenes)
         if plan.capacity == 0:
-            names = (*_ARRAYS[:4], "viewmats", "Ks", "roi")
-            *geometry, roi = (_placed(arrays.get(name), mesh, P()) for name in names)
-            plan = make_plan(*geometry, width, height, headroom=1.0, roi=roi, **options)
+            views, _ = check_inputs(plan, *(_placed(arrays.get(name), mesh, P()) for name in _ARRAYS))
+            plan = planned_for(views, plan, headroom=1.0)
         return _draw(arrays, mesh, cameras, scenes, plan)
 
     return draw

@@ -5,6 +5,7 @@ million takes it 2 ms, numpy 0.3. Binning is mostly that. Both ways give the sam
 to numpy (`host.py`) cannot be made, XLA's ways are used on the CPU too.
 """
 
+import math
 from collections.abc import Callable
 
 import jax
@@ -34,7 +35,7 @@ def _sum_into(counts: np.ndarray, out: np.ndarray) -> None:
 
 
 def _repeat_into(values: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
-    rows = (a.reshape(-1, a.shape[-1]) for a in (values, starts, out))
+    rows = (a.reshape(math.prod(a.shape[:-1]), a.shape[-1]) for a in (values, starts, out))
     for row, begins, filled in zip(*rows, strict=True):
         steps = np.diff(row, prepend=row.dtype.type(0))
         inside = np.searchsorted(begins, len(filled))  # starts do not fall

@@ -213,7 +213,8 @@ def test_a_move_into_overflow_is_rejected_said_and_tried_shorter():
     assert (infos["needed"][rejected] >= 60).all()
     solved, info = solve(curve, start(), batch, solver=SOLVERS["LM"], damping=0.1)
     assert 0.5 < solved["b"] <= 0.6
-    assert not info["overflow"].any()
+    assert info["overflow"].any()
+    assert not info["converged"]
 
 
 def test_gauss_newton_stands_still_before_what_overflows():
@@ -273,6 +274,54 @@ def test_what_cannot_be_asked_for_is_named():
         solve(curve, {"a": jnp.array(1), "b": jnp.array(0.1)}, points())
     with pytest.raises(RuntimeError, match="has no derivative"):
         jax.grad(lambda y: solve(curve, start(), points() | {"y": y})[0]["a"])(points()["y"])
+
+
+@pytest.mark.parametrize("damping", [1.0, 1e-3])
+def test_a_search_that_the_plan_ended_has_not_converged(damping):
+    """The optimum, 3, lies behind 1, where the plan overflows: the search stops short of that and says so."""
+
+    def residual(x, batch, *, step, key):
+        full = jnp.any(x > batch)
+        return x - 3.0, {"overflow": full, "needed": jnp.where(full, 99, 1)}
+
+    x, info = solve(residual, jnp.zeros(2), 1.0, damping=damping)
+    assert (np.asarray(x) < 1.0).all()
+    assert not info["converged"]
+    assert info["overflow"]
+    assert info["needed"] == 99
+    x, info = solve(residual, jnp.zeros(2), 5.0, damping=damping)
+    np.testing.assert_allclose(x, 3.0, atol=1e-3)
+    assert info["converged"]
+    assert not info["overflow"]
+    assert info["needed"] == 1
+
+
+def test_a_start_that_is_no_number_is_said_where_residuals_do_not_show_it():
+    """As of a camera that is not finite: it sees nothing, so the image is finite."""
+
+    def residual(x, batch, *, step, key):
+        return jnp.where(jnp.isfinite(x), x, 1.0), {}
+
+    bad = jnp.array([jnp.nan, 1.0])
+    _, info = solve(residual, bad, None)
+    assert info["skipped"]
+    assert not info["converged"]
+    step = least_squares_step(residual)
+    _, _, info = step.update(bad, step.init(bad), None, step=0, key=None)
+    assert info["skipped"]
+    assert not info["accepted"]
+
+
+def test_a_residual_of_another_form_is_named():
+    with pytest.raises(ValueError, match=r"must return \(pytree of arrays, dict.*got "):
+        solve(lambda x, batch, *, step, key: x, jnp.ones(2), None)
+
+
+def test_observations_have_the_form_of_images():
+    with pytest.raises(ValueError, match=r"the shape of rendered, \(2, 4, 5, 3\); got \(4,"):
+        difference.__wrapped__(jnp.zeros((2, 4, 5, 3)), jnp.zeros((4, 5, 3)))
+    with pytest.raises(ValueError, match=r"observed must hold floats.*got uint8: of 8 bits, divide by 255"):
+        difference.__wrapped__(jnp.zeros((4, 3)), jnp.zeros((4, 3), jnp.uint8))
 
 
 def test_reject_overflow_and_difference():

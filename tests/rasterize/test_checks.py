@@ -53,6 +53,8 @@ def call(**changes):
         ({"features": zeros(4, 7)}, r"features must have shape \(5, any\).*got \(4, 7\)"),
         ({"roi": jnp.ones((10, 20), bool)}, r"roi must have shape \(2, 10, 20\).*roi\[None\]; got"),
         ({"roi": zeros(2, 10, 20)}, r"roi must hold booleans.*got float32"),
+        ({"roi": [[[True] * 20] * 10] * 2}, r"roi must be an array; got list"),
+        ({"colors": zeros(5, 0)}, r"colors must have at least one channel in render_mode 'RGB'; got 0"),
         ({"reads": zeros(2, 6)}, r"reads must hold integers, as meta.reads does; got float32"),
         ({"means2d_offset": zeros(5, 2)}, r"means2d_offset must have shape \(2, 5, 2\).*got \(5, 2\)"),
         ({"means": [[0.0] * 3] * 5}, "means must be an array; got list"),

@@ -309,6 +309,15 @@ def test_one_device_is_the_plain_call(one_device_mesh):
     )
 
 
+def test_a_plan_without_a_capacity_keeps_its_options(one_device_mesh):
+    scene = jax.tree.map(jnp.asarray, a_scene((), 2, extras=False))
+    scene["means2d_offset"] = jnp.full((2, N, 2), 5.0)
+    draw = gsjax.sharded_rasterization(one_device_mesh, cameras="cameras")
+    plan = gsjax.Plan(WIDTH, HEIGHT, 0, near_plane=1.4, render_mode="RGB+ED", tile_size=16)
+    options = {"width": WIDTH, "height": HEIGHT, "plan": plan}
+    assert difference(whole(draw(**scene, **options)), gsjax.rasterization(**scene, **options)) <= 1e-6
+
+
 @pytest.mark.usefixtures("as_users_run")
 class TestErrors:
     """Every message names the argument and what to do."""

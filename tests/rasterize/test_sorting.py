@@ -32,7 +32,7 @@ def test_both_ways_sort_as_numpy_does(seed, length, top):
         np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
 
 
-@given(st.integers(0, 2**32), st.sampled_from([1, 2, 17, 1000]), st.sampled_from([1, 3, 2**32]))
+@given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 17, 1000]), st.sampled_from([1, 3, 2**32]))
 def test_both_ways_sum_and_repeat_as_numpy_does(seed, length, top):
     rng = np.random.default_rng(seed)
     counts = rng.integers(0, min(top, 5), length).astype(np.int32)
@@ -109,3 +109,25 @@ def test_one_core_does_not_hang():
         "jax.block_until_ready([run(keys + i) for i in range(3)])\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_a_program_may_end_while_a_call_is_under_way():
+    # The host's work needs the interpreter, which is gone by then unless it is waited for.
+    program = (
+        "import jax, jax.numpy as jnp\n"
+        "from gsjax.rasterize.sorting import sort_keys\n"
+        "keys = jnp.arange(2_000_000, dtype=jnp.uint32)\n"
+        "step = lambda i, k: sort_keys(k * jnp.uint32(747796405) + 1)\n"
+        "run = jax.jit(lambda k: jax.lax.fori_loop(0, 20, step, k))\n"
+        "run.lower(keys).compile()(keys)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_a_checkpoint_may_repeat_the_call():
+    def last(x):
+        return x * sort_keys((x * 7919).astype(jnp.uint32) % 101)[-1].astype(x.dtype)
+
+    x = jnp.arange(50.0)
+    wanted = jax.grad(lambda x: last(x).sum())(x)
+    np.testing.assert_array_equal(jax.jit(jax.grad(jax.checkpoint(lambda x: last(x).sum())))(x), wanted)
