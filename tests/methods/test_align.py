@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsjax.methods.object_tracker.align import (
     _normal_equations,
@@ -22,6 +24,7 @@ from gsjax.methods.object_tracker.points import (
     carry_keyframe,
     faded,
     first_keyframe,
+    first_members,
     join,
     pixels_of_groups,
     renewed,
@@ -97,7 +100,7 @@ def test_something_in_front_does_not_pull(moved):
             frame.depths.at[patch].set(0.4),
         ),
     )
-    found = search(jnp.zeros((1, 1, 6)), points, center, hidden, CONFIG)
+    found = search(jnp.zeros((1, 1, 6)), points, center, hidden, CONFIG).twists
     assert error(points, np.asarray(carry(points, found, center).means[0]), then) < 2e-3
 
 
@@ -130,6 +133,18 @@ def test_only_pixels_of_the_group_are_picked(moved, table):
         assert len(np.unique(np.asarray(points.means[0, c])[chosen], axis=0)) == chosen.sum()  # none twice
 
 
+@given(
+    st.lists(st.integers(-1, 6), min_size=1, max_size=300), st.integers(1, 5), st.integers(1, 40)
+)
+def test_the_first_members_of_a_group_are_distinct_members_and_as_many_as_there_are(groups, num, per_group):
+    rows, real = map(np.asarray, first_members(jnp.asarray(groups), num, per_group))
+    assert rows.shape == real.shape == (num, per_group)
+    for group in range(1, num + 1):
+        found = rows[group - 1][real[group - 1]]
+        assert len(set(found)) == len(found) == min(per_group, groups.count(group))
+        assert all(groups[row] == group for row in found)
+
+
 def test_samples_are_capped_and_never_strangers():
     groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
     means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
@@ -146,7 +161,7 @@ def test_without_turns_only_translation_is_sought_and_found(moved):
     shift = jnp.array([[0.006, -0.004, 0.003]])
     behind = points._replace(means=points.means - shift)
     start = jnp.zeros((1, 1, 6))
-    twist = search(start, behind, center - shift, frame, config)
+    twist = search(start, behind, center - shift, frame, config).twists
     np.testing.assert_array_equal(twist[0, 3:], 0)
     before, after = (disagreement(carry(behind, t, center - shift), frame, config) for t in (start[0], twist))
     assert after[0] < before[0]
@@ -274,7 +289,7 @@ def test_search_finds_a_jump_that_alignment_alone_misses(moved, table):
     seen = np.asarray(points.seen[0]) > 0
     center = behind.means[0, seen].mean(0)[None]
     still = jnp.zeros((1, 1, 6))
-    found = search(still, behind, center, see(frames[6]), CONFIG)
+    found = search(still, behind, center, see(frames[6]), CONFIG).twists
     alone = align(still[0], behind, center, see(frames[6]), CONFIG)
     miss = lambda twist: float(jnp.linalg.norm(twist[0, :3] - shift))  # noqa: E731
     assert miss(found) < 1e-3

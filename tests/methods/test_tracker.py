@@ -56,6 +56,23 @@ def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_error
         assert errors[name] < 0.25 * moved[name], (name, errors, moved)
 
 
+def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, quick, centroid_errors):
+    sequence, frames, _ = table()
+    config = replace(
+        quick,
+        redraw="moving",
+        matching=False,
+        refine=replace(quick.refine, iterations=0),
+        align=replace(quick.align, every_start=False, reach=0.0, turns=()),
+    )
+    for t, result in enumerate(track(started, frames[0], frames[1:], config), start=1):
+        errors = centroid_errors(sequence, started, result.pose, t)
+        assert max(errors.values()) < 5e-3, errors
+        assert not result.info["skipped"]
+    with pytest.raises(ValueError, match=r"redraw: expected all where refine.iterations is above 0"):
+        replace(quick, redraw="moving")
+
+
 def test_labels_keep_the_masks_values(table, started):
     _, _, mask = table()
     assert started.label_ids[0] == 0

@@ -1,6 +1,7 @@
 """Where has each group gone? Several starts are aligned with the images, and what agrees best is kept."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,10 +31,18 @@ def judge(
     return disagreement(carry(points, twists, centers), sight, config)
 
 
-def least(residuals: Float[Array, "h k"], twists: Float[Array, "h k 6"]) -> Float[Array, "k 6"]:
+class Found(NamedTuple):
+    """Where each group is, as far as is known."""
+
+    twists: Float[Array, "k 6"]  # translation, metres, and rotation vector, radians
+    residuals: Float[Array, "k"]  # how badly that agrees with the images, as `judge` has it
+
+
+def least(residuals: Float[Array, "h k"], twists: Float[Array, "h k 6"]) -> Found:
     """For each group the twist of the hypothesis with the least residual; the first wins ties."""
-    best = jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf), axis=0)
-    return twists[best, jnp.arange(best.shape[0])]
+    residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
+    best, group = jnp.argmin(residuals, axis=0), jnp.arange(residuals.shape[1])
+    return Found(twists[best, group], residuals[best, group])
 
 
 def turned(
@@ -70,7 +79,8 @@ def _shifted(points: Points, centers: Float[Array, "k 3"], sight: Sight, config:
     some = jax.tree.map(lambda a: a[:, :, ::4], points)
     shifts = jnp.asarray(ball(config.reach, config.spacing), points.means.dtype)
     twists = jnp.zeros((len(shifts), len(centers), 6), points.means.dtype).at[..., :3].set(shifts[:, None])
-    return least(jax.lax.map(lambda t: judge(t, some, centers, sight, widened(config)), twists), twists)
+    residuals = jax.lax.map(lambda t: judge(t, some, centers, sight, widened(config)), twists)
+    return least(residuals, twists).twists
 
 
 def search(
@@ -79,7 +89,7 @@ def search(
     centers: Float[Array, "k 3"],
     sight: Sight,
     config: AlignConfig,
-) -> Float[Array, "k 6"]:
+) -> Found:
     """The twist of each group that agrees best with the images; no worse than the first start.
 
     Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
@@ -94,9 +104,8 @@ def search(
         sight: what the cameras see now.
     """
 
-    def best_of(twists):
-        residuals = jax.lax.map(lambda t: judge(t, points, centers, sight, config), twists)
-        return least(residuals, twists)
+    def judged(twists):
+        return jax.lax.map(lambda t: judge(t, points, centers, sight, config), twists)
 
     def aligned(twists):
         return jax.lax.map(lambda t: align(t, points, centers, sight, widened(config)), twists)
@@ -104,7 +113,17 @@ def search(
     # By colour alone, a plain thing would slide about within its outline.
     if sight.depths is not None and config.reach:
         starts = jnp.concatenate([starts, _shifted(points, centers, sight, config)[None]])
-    best = best_of(aligned(starts) if config.every_start else starts)
+    # What stands still is the first hypothesis, whatever is tried.
+    first = judged(starts[:1])
+    tried = aligned(starts) if config.every_start else starts[1:]
+    best = least(jnp.concatenate([first, judged(tried)]), jnp.concatenate([starts[:1], tried]))
     if config.max_turn and config.turns:
-        best = best_of(aligned(turned(best, principal_axes(points, centers), config.turns)))
-    return best_of(jnp.stack([starts[0], best, align(best, points, centers, sight, config)]))
+        tried = aligned(turned(best.twists, principal_axes(points, centers), config.turns))
+        best = least(
+            jnp.concatenate([best.residuals[None], judged(tried)]),
+            jnp.concatenate([best.twists[None], tried]),
+        )
+    last = align(best.twists, points, centers, sight, config)[None]
+    return least(
+        jnp.concatenate([best.residuals[None], judged(last)]), jnp.concatenate([best.twists[None], last])
+    )

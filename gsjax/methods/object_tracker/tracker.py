@@ -176,8 +176,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         if config.matching and config.warm_start:
             starts += [going.at[:, :3].set(jumped[:, :3])]
         aligned = search(jnp.stack(starts), points, centers, sight, config.align)
-        kept = begun = Motion(aligned, delta)
-        residual = judge(begun.twists, points, centers, sight, config.align)
+        residual = aligned.residuals
+        kept = begun = Motion(aligned.twists, delta)
         needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
         if config.refine.iterations:
             assert last.rendered is not None

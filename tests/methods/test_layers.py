@@ -1,0 +1,90 @@
+"""What moves, drawn over a background that is kept, shows what the whole scene shows."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.object_tracker import first_pose, render_labels
+from gsjax.methods.object_tracker.layers import (
+    Backdrop,
+    background_of,
+    draw_backdrop,
+    keep_backdrop,
+    moving_of,
+    seen_from,
+    show_moving,
+    shown_by,
+)
+from gsjax.scene.render import plan_render
+
+GAP = 0.015
+
+
+@pytest.fixture(scope="module")
+def plans(table, started):
+    cameras = table()[1][0].cameras
+    moving = moving_of(started, first_pose(started))
+    return (
+        plan_render(started.gaussians, cameras, headroom=2.0),
+        plan_render(background_of(started), cameras, headroom=2.0),
+        plan_render(moving, cameras, headroom=2.0, sh_degree=None),
+    )
+
+
+@pytest.fixture(scope="module")
+def both(table, started, plans):
+    """(the whole scene, what moves over the backdrop, the backdrop)."""
+    whole_plan, still_plan, moving_plan = plans
+    frame, pose = table()[1][0], first_pose(started)
+    whole = shown_by(render_labels(started, pose, frame, whole_plan))
+    backdrop, needed = draw_backdrop(started, frame.cameras, still_plan)
+    assert 0 < needed <= still_plan.capacity
+    shown, needed = show_moving(started, pose, backdrop, moving_plan)
+    assert 0 < needed <= moving_plan.capacity
+    return whole, shown, backdrop
+
+
+def test_layers_show_what_the_whole_scene_shows(both, started):
+    whole, shown, _ = both
+    assert set(np.unique(whole.labels)) == set(range(started.num_objects + 1))
+    agree = np.asarray(whole.labels) == np.asarray(shown.labels)
+    assert agree.mean() > 0.97  # outlines are where the two may differ
+    assert (np.asarray(whole.covered) == np.asarray(shown.covered)).mean() > 0.98
+    inside = agree & (np.asarray(whole.labels) > 0)
+    assert np.median(np.abs(whole.depths - shown.depths)[inside]) < 2e-3
+
+
+def test_cameras_see_the_same_gaussians_in_both(both, started, table):
+    whole, shown, _ = both
+    cameras, pose = table()[1][0].cameras, first_pose(started)
+    a, b = (np.asarray(seen_from(started, pose, s, cameras, GAP)) for s in (whole, shown))
+    assert 0.1 < a.mean() < 0.9
+    assert (a == b).mean() > 0.97
+
+
+def test_what_stands_in_front_hides_what_moves(both, started, plans):
+    _, _, backdrop = both
+    wall = backdrop._replace(
+        depths=jnp.full_like(backdrop.depths, 0.1), alphas=jnp.ones_like(backdrop.alphas)
+    )
+    hidden, _ = show_moving(started, first_pose(started), wall, plans[2])
+    assert not hidden.labels.any()
+    np.testing.assert_array_equal(hidden.depths, wall.depths)
+    assert hidden.covered.all()
+
+
+def test_the_backdrop_is_drawn_again_only_when_a_camera_moves(both, started, plans, table):
+    _, _, backdrop = both
+    cameras = table()[1][0].cameras
+    marked = backdrop._replace(colors=backdrop.colors + 7.0)  # tells a kept one from one drawn anew
+    kept, needed = keep_backdrop(marked, started, cameras, plans[1])
+    np.testing.assert_array_equal(kept.colors, marked.colors)
+    assert needed == 0
+    moved: Camera = eqx.tree_at(lambda c: c.viewmat, cameras, cameras.viewmat.at[0, 0, 3].add(0.01))
+    drawn, needed = keep_backdrop(marked, started, moved, plans[1])
+    expected: Backdrop = draw_backdrop(started, moved, plans[1])[0]
+    np.testing.assert_allclose(drawn.colors, expected.colors, atol=1e-6)
+    np.testing.assert_array_equal(drawn.cameras.viewmat, moved.viewmat)
+    assert needed > 0
