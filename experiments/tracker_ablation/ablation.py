@@ -4,7 +4,7 @@
 of which every third frame is taken, so that objects move far from one to the next.
 """
 
-import sys
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,19 +16,17 @@ from rich.console import Console
 from gsjax.cli.loop import follow
 from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
 from gsjax.cli.scoring import Scores, group_values, metrics, score_motion
-from gsjax.cli.summary import MOVED_MM
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
 from gsjax.scene.frame import Frame
 
-sys.path.append(str(Path(__file__).resolve().parents[2]))  # the checkout, which a console script does not see
-from benchmarks.workloads import data_folder
-
+DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 RECORDINGS = {  # with the frames that are taken
     "tabletop": ("simulated:tabletop?width=240&height=180", "0:24"),
-    "tabletop_0": (str(data_folder() / "tabletop_0"), "0:60:3"),
+    "tabletop_0": (str(DATA / "tabletop_0"), "0:60:3"),
 }
 CAMERAS, MASK_CAMERA, HELD_OUT = (0, 1), 1, (2,)
+MOVED_MM = 30.0  # an object that moves less says little about a tracker
 FULL = TrackerConfig()
 
 
