@@ -17,8 +17,8 @@ COMMANDS = {
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
-"""Each command's module, which has `Options`, a dataclass or a union of them (subcommands), and
-`run(options)`, which returns the exit code."""
+"""Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
+which returns the exit code, and perhaps `defaults(arguments)`, the options before any is given."""
 
 
 def entry() -> None:

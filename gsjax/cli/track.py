@@ -1,6 +1,7 @@
 """`gsjax track`: from a recording to a run folder."""
 
 import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -27,7 +28,7 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
 from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
-from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
+from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, start_scene
 from gsjax.scene.frame import Frame
 
 
@@ -53,8 +54,18 @@ class Options:
     """Replace a finished run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
+    preset: Literal["accurate", "fast"] = "accurate"
+    """What the tracker's settings are unless given: for small errors, or for 30 Hz."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """The tracker's own settings."""
+
+
+def defaults(arguments: list[str]) -> Options:
+    """The options before any is given, but for the preset: the tracker's are those that it names."""
+    named = [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
+    named += [after for a, after in itertools.pairwise(arguments) if a == "--preset"]
+    tracker = PRESETS.get(named[-1], TrackerConfig()) if named else TrackerConfig()
+    return Options(dataset=tyro.MISSING, out=tyro.MISSING, tracker=tracker)
 
 
 def run(options: Options) -> int:

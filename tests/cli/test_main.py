@@ -1,6 +1,7 @@
 """The front door: help, unknown words, info, and how errors and warnings are said."""
 
 import warnings
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -8,6 +9,7 @@ from rich.console import Console
 from gsjax.cli import COMMANDS, main
 from gsjax.cli.messages import Notes, describe
 from gsjax.data import DataWarning
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig
 
 
 @pytest.fixture
@@ -100,3 +102,15 @@ def test_each_kind_of_warning_is_shown_once_and_counted(capfd):
     said = capfd.readouterr().err
     assert said == "warning: frame 0 is empty\n"
     assert notes.all == ["a note", "Warning: frame 0 is empty (and 2 more like it)"]
+
+
+def test_a_preset_is_where_the_trackers_settings_begin(monkeypatch, tmp_path):
+    chosen = []
+    monkeypatch.setattr("gsjax.cli.track.run", lambda options: chosen.append(options) or 0)
+    command = ["track", "simulated:tabletop", "--out", str(tmp_path / "run")]
+    for more in ([], ["--preset", "fast"], ["--preset=fast", "--tracker.align.iterations", "3"]):
+        assert main([*command, *more]) == 0
+    accurate, fast, changed = (options.tracker for options in chosen)
+    assert accurate == TrackerConfig() == PRESETS["accurate"]
+    assert fast == PRESETS["fast"]
+    assert changed == replace(fast, align=replace(fast.align, iterations=3))

@@ -5,6 +5,7 @@ search, region, refine, tracker, grow, tracking.
 """
 
 from gsjax.methods.object_tracker.config import (
+    PRESETS,
     AlignConfig,
     GrowConfig,
     MatchConfig,
@@ -28,6 +29,7 @@ from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
 
 __all__ = [
     "EMPTY",
+    "PRESETS",
     "AlignConfig",
     "GrowConfig",
     "MatchConfig",

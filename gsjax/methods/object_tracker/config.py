@@ -202,3 +202,16 @@ class TrackerConfig:
                 "TrackerConfig.redraw: expected all where refine.iterations is above 0, found moving; set "
                 "refine.iterations to 0, or draw all"
             )
+
+
+FAST = TrackerConfig(
+    start=StartConfig(object_pixels=2.5, background_pixels=6.0),
+    align=AlignConfig(iterations=5, pixels=96, centers=64, every_start=False, reach=0.0, turns=()),
+    refine=RefineConfig(iterations=0),
+    grow=GrowConfig(candidates=32),
+    matching=False,
+    redraw="moving",
+)
+PRESETS = {"accurate": TrackerConfig(), "fast": FAST}
+"""`accurate` looks for objects everywhere and refines them photometrically. `fast`, for 30 Hz on two cores,
+goes on from where they were: it loses what jumps. docs/results-tracking.md has what each costs."""
