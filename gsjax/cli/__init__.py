@@ -18,7 +18,7 @@ COMMANDS = {
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
 """Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
-which returns the exit code, and perhaps `defaults(arguments)`, the options before any is given."""
+which returns the exit code, and perhaps `options_for(arguments)`, where defaults depend on what is given."""
 
 
 def entry() -> None:

@@ -34,11 +34,8 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
     debug = False
     try:
         chosen = import_module(module)
-        # What is not given may depend on what is.
-        before = chosen.defaults(arguments) if hasattr(chosen, "defaults") else None
         options = tyro.cli(
-            chosen.Options,
-            **({} if before is None else {"default": before}),
+            chosen.options_for(arguments) if hasattr(chosen, "options_for") else chosen.Options,
             prog=f"gsjax {command}",
             description=f"{does[0].upper()}{does[1:]}.",
             args=arguments,

@@ -60,12 +60,14 @@ class Options:
     """The tracker's own settings."""
 
 
-def defaults(arguments: list[str]) -> Options:
-    """The options before any is given, but for the preset: the tracker's are those that it names."""
+def options_for(arguments: list[str]) -> type[Options]:
+    """The options where a preset is named: the tracker's are those of the preset unless given."""
     named = [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
     named += [after for a, after in itertools.pairwise(arguments) if a == "--preset"]
-    tracker = PRESETS.get(named[-1], TrackerConfig()) if named else TrackerConfig()
-    return Options(dataset=tyro.MISSING, out=tyro.MISSING, tracker=tracker)
+    if not named or named[-1] not in PRESETS:
+        return Options
+    tracker = ("tracker", TrackerConfig, field(default=PRESETS[named[-1]]))
+    return dataclasses.make_dataclass("Options", [tracker], bases=(Options,), frozen=True)
 
 
 def run(options: Options) -> int:

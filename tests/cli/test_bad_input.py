@@ -259,7 +259,7 @@ def test_a_meta_of_other_types(refused, recording, key, value, says):
     [
         ("headroom", "0.5", "TrackerConfig.headroom: expected 1 or more, found 0.5"),
         ("start.part-size", "0", "StartConfig.part_size: expected more than 0, found 0"),
-        ("refine.iterations", "0", "RefineConfig.iterations: expected 1 or more, found 0"),
+        ("refine.iterations", "-1", "RefineConfig.iterations: expected 0 or more, found -1"),
         ("align.spacing", "nan", "AlignConfig.spacing: expected more than 0, found nan"),
     ],
 )

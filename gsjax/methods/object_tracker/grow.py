@@ -132,7 +132,8 @@ def _nearest(
     def one(query):
         squared = jnp.where(taken, jnp.sum((own - query) ** 2, axis=-1), jnp.inf)
         least = squared.min()
-        best = jnp.where(squared == least, columns, len(own) - 1).min()  # many times as fast as XLA:CPU's argmin
+        # XLA:CPU's argmin takes many times as long.
+        best = jnp.where(squared == least, columns, len(own) - 1).min()
         return scene.labels[best], jnp.sqrt(least)
 
     return jax.lax.map(one, ask, batch_size=32)
