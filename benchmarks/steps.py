@@ -16,7 +16,7 @@ from benchmarks.workloads import ball
 from gsjax.data import open_sequence
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
-from gsjax.methods.object_tracker import TrackerConfig, start_scene, track
+from gsjax.methods.object_tracker import PRESETS, start_scene, track
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import gaussians_from_activated
@@ -36,11 +36,11 @@ class StepTimes:
     compile_s: float
 
 
-def tracker(repeats: int) -> StepTimes:
+def tracker(repeats: int, preset: str = "accurate") -> StepTimes:
     """The object tracker's update: every frame is another, as in use."""
     sequence = open_sequence(TABLE.format(repeats + 2)).select(cameras=(0, 1))
     frames = [sequence.frame(t) for t in range(sequence.num_frames)]
-    config = TrackerConfig()
+    config = PRESETS[preset]
     # Fitting the first frame takes long and is not what is timed.
     config = replace(config, start=replace(config.start, iterations=20))
     scene = start_scene(frames[0], sequence.mask(0, 0), 0, config)
@@ -82,7 +82,11 @@ def _loss(gaussians, target, *, step, key, plan, camera):
     return photometric_loss(rendered.colors, target), {"overflow": rendered.meta.overflow}
 
 
-STEPS: dict[str, Callable[[int], StepTimes]] = {"steps-tracker": tracker, "steps-fit": fit}
+STEPS: dict[str, Callable[[int], StepTimes]] = {
+    "steps-tracker": tracker,
+    "steps-tracker-fast": partial(tracker, preset="fast"),
+    "steps-fit": fit,
+}
 
 
 @dataclass(frozen=True)
