@@ -107,6 +107,11 @@ def search(
     def judged(twists):
         return jax.lax.map(lambda t: judge(t, points, centers, sight, config), twists)
 
+    def better(known: Found, tried) -> Found:
+        """`known`, or what of `tried` agrees better."""
+        residuals = jnp.concatenate([known.residuals[None], judged(tried)])
+        return least(residuals, jnp.concatenate([known.twists[None], tried]))
+
     def aligned(twists):
         return jax.lax.map(lambda t: align(t, points, centers, sight, widened(config)), twists)
 
@@ -114,16 +119,8 @@ def search(
     if sight.depths is not None and config.reach:
         starts = jnp.concatenate([starts, _shifted(points, centers, sight, config)[None]])
     # What stands still is the first hypothesis, whatever is tried.
-    first = judged(starts[:1])
-    tried = aligned(starts) if config.every_start else starts[1:]
-    best = least(jnp.concatenate([first, judged(tried)]), jnp.concatenate([starts[:1], tried]))
+    best = Found(starts[0], judged(starts[:1])[0])
+    best = better(best, aligned(starts) if config.every_start else starts[1:])
     if config.max_turn and config.turns:
-        tried = aligned(turned(best.twists, principal_axes(points, centers), config.turns))
-        best = least(
-            jnp.concatenate([best.residuals[None], judged(tried)]),
-            jnp.concatenate([best.twists[None], tried]),
-        )
-    last = align(best.twists, points, centers, sight, config)[None]
-    return least(
-        jnp.concatenate([best.residuals[None], judged(last)]), jnp.concatenate([best.twists[None], last])
-    )
+        best = better(best, aligned(turned(best.twists, principal_axes(points, centers), config.turns)))
+    return better(best, align(best.twists, points, centers, sight, config)[None])

@@ -123,8 +123,13 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         pixels = pixels_of_groups(
             sight_of(frame, config.align.shading), shown.labels, shown.depths, num_objects, config.align
         )
-        remembered = (shown, backdrop, frame.images if config.matching else None) if keep else (None,) * 3
-        return TrackerState(nowhere, pixels, first_keyframe(pixels), jnp.int32(0), *remembered)
+        return TrackerState(
+            nowhere, pixels, first_keyframe(pixels), jnp.int32(0), *memory(shown, backdrop, frame)
+        )
+
+    def memory(shown: Shown, backdrop: Backdrop | None, frame: Frame):
+        """What the next frame looks back on where the last scene is not drawn again."""
+        return (shown, backdrop, frame.images if config.matching else None) if keep else (None,) * 3
 
     def show(scene: TrackedScene, pose: Pose, frame: Frame, backdrop: Backdrop | None, plan: TrackerPlan):
         """What the scene shows, and what capacities that took (`near`, `full`)."""
@@ -208,8 +213,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         pixels = pixels_of_groups(sight, shown.labels, shown.depths, num_objects, config.align)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
-        memory = (shown, backdrop, frame.images if config.matching else None) if keep else (None,) * 3
-        new_state = TrackerState(kept, pixels, keyframe, state.count + 1, *memory)
+        told = memory(shown, backdrop, frame)
+        new_state = TrackerState(kept, pixels, keyframe, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
