@@ -59,6 +59,11 @@ def intrinsics(
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
+def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
+    """The same view in pictures of another size, whose pixels are 1 / `scale` times as wide."""
+    return Camera(camera.viewmat, camera.K * jnp.array([[scale], [scale], [1.0]]), width, height)
+
+
 def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) -> Float[Array, "*n 3"]:
     """Points in the frame of one camera."""
     return jnp.matmul(points, viewmat[:3, :3].T, precision="highest") + viewmat[:3, 3]

@@ -32,7 +32,16 @@ from gsjax.methods.object_tracker.points import (
     sight_of,
     tones,
 )
-from gsjax.methods.object_tracker.search import ball, principal_axes, search, turned
+from gsjax.methods.object_tracker.search import (
+    Found,
+    Watch,
+    ball,
+    first_watch,
+    least,
+    principal_axes,
+    search,
+    turned,
+)
 
 CONFIG = AlignConfig(iterations=12)
 CARTON = 2
@@ -48,94 +57,101 @@ def moved(table):
     points = pixels_of_groups(see(frames[6]), labels, frames[6].depths, 1, CONFIG)
     k = sequence.truth.names.index("carton")
     motion = sequence.truth.poses[7, k] @ np.linalg.inv(sequence.truth.poses[6, k])
-    then = np.asarray(points.means[0], np.float64) @ motion[:3, :3].T + motion[:3, 3]
-    seen = np.asarray(points.seen[0]) > 0
-    return points, points.means[0, seen].mean(0)[None], see(frames[7]), then, labels
+    one = jax.tree.map(lambda a: a[0], points)
+    then = np.einsum("ij,cjp->cip", motion[:3, :3], np.asarray(one.means, np.float64)) + motion[:3, 3:]
+    return one, middle(one), see(frames[7]), then, labels
 
 
 def see(frame):
     return sight_of(frame, CONFIG.shading)
 
 
-def run(points, center, frame, config=CONFIG):
+def middle(points):
+    """The mean of the points that count."""
+    return (points.means * (points.seen[:, None] > 0)).sum((0, 2)) / (points.seen > 0).sum()
+
+
+def run(points, center, sight, config=CONFIG):
     """(the twist found from standing still, where it carries the points)."""
-    found = align(jnp.zeros((1, 6)), points, center, frame, config)
-    return found, np.asarray(carry(points, found, center).means[0])
+    found = align(jnp.zeros(6), points, center, sight, config)
+    return found, np.asarray(carry(points, found, center).means)
+
+
+def look(points, center, sight, config=CONFIG, everywhere=1):
+    """The twist that a search of one group finds from standing still."""
+    points = jax.tree.map(lambda a: a[None], points)
+    how = (config, first_watch(1), jnp.array([True]), jnp.int32(everywhere))
+    return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how)[0].twists[0]
+
+
+def gap(points, sight, config=CONFIG):
+    """How badly points agree where they are."""
+    return float(disagreement(jnp.zeros(6), points, jnp.zeros(3), sight, config))
 
 
 def error(points, means, then):
-    seen = np.asarray(points.seen[0]) > 0
-    return np.linalg.norm(means - then, axis=-1)[seen].mean()
+    seen = np.asarray(points.seen) > 0
+    return np.linalg.norm(means - then, axis=1)[seen].mean()
 
 
-def without_depth(frame):
-    return eqx.tree_at(lambda f: f.depths, frame, None, is_leaf=lambda x: x is None)
+def without_depth(sight):
+    return sight._replace(pixels=sight.tones)
 
 
 def test_a_known_motion_is_found_and_agrees_better(moved):
-    points, center, frame, then, _ = moved
-    before = error(points, np.asarray(points.means[0]), then)
-    _, means = run(points, center, frame)
+    points, center, sight, then, _ = moved
+    before = error(points, np.asarray(points.means), then)
+    _, means = run(points, center, sight)
     assert error(points, means, then) < min(1.5e-3, before), before
-    moved_points = points._replace(means=jnp.asarray(means)[None])
-    start, end = (disagreement(p, frame, CONFIG)[0] for p in (points, moved_points))
-    assert end < start
+    assert gap(points._replace(means=jnp.asarray(means)), sight) < gap(points, sight)
 
 
 def test_colour_alone_finds_it_too(moved):
-    points, center, frame, then, _ = moved
-    _, means = run(points, center, without_depth(frame))
+    points, center, sight, then, _ = moved
+    _, means = run(points, center, without_depth(sight))
     assert error(points, means, then) < 4e-3
 
 
 def test_something_in_front_does_not_pull(moved):
-    points, center, frame, then, _ = moved
+    points, center, sight, then, _ = moved
     row, column = np.argwhere(np.asarray(moved[4][0]) == 1).mean(0).astype(int)
     patch = (0, slice(row, row + 6), slice(column - 20, column + 20))
-    hidden = eqx.tree_at(
-        lambda f: (f.tones, f.depths),
-        frame,
-        (
-            frame.tones.at[patch].set(tones(jnp.array([0.1, 0.9, 0.1]), CONFIG.shading)),
-            frame.depths.at[patch].set(0.4),
-        ),
-    )
-    found = search(jnp.zeros((1, 1, 6)), points, center, hidden, CONFIG).twists
-    assert error(points, np.asarray(carry(points, found, center).means[0]), then) < 2e-3
+    green = jnp.append(tones(jnp.array([0.1, 0.9, 0.1]), CONFIG.shading), 0.4)
+    hidden = sight._replace(pixels=sight.pixels.at[patch].set(green))
+    found = look(points, center, hidden)
+    assert error(points, np.asarray(carry(points, found, center).means), then) < 2e-3
 
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_a_group_that_nobody_sees_stands_still(moved, depth):
-    points, center, frame, _, _ = moved
+    points, center, sight, _, _ = moved
     unseen = points._replace(seen=jnp.zeros_like(points.seen))
-    found, _ = run(unseen, center, frame if depth else without_depth(frame))
+    found, _ = run(unseen, center, sight if depth else without_depth(sight))
     np.testing.assert_allclose(found, 0, atol=1e-6)
-    assert disagreement(unseen, frame, CONFIG)[0] == 0
+    assert gap(unseen, sight) == 0
 
 
 def test_disagreement_is_nothing_for_a_perfect_fit_and_half_outside_the_picture(moved, table):
     points = moved[0]
     _, frames, _ = table(8, 2, **SIZE)
-    assert disagreement(points, see(frames[6]), CONFIG)[0] < 1e-3
-    away = points._replace(means=points.means + jnp.array([0.0, 50.0, 0.0]))
-    np.testing.assert_allclose(disagreement(away, see(frames[6]), CONFIG), 0.5, atol=1e-6)
+    assert gap(points, see(frames[6])) < 1e-3
+    away = points._replace(means=points.means + jnp.array([0.0, 50.0, 0.0])[:, None])
+    np.testing.assert_allclose(gap(away, see(frames[6])), 0.5, atol=1e-6)
 
 
 def test_only_pixels_of_the_group_are_picked(moved, table):
     points, labels = moved[0], np.asarray(moved[4])
     _, frames, _ = table(8, 2, **SIZE)
     for c in range(2):
-        chosen = np.asarray(points.seen[0, c]) > 0
+        chosen = np.asarray(points.seen[c]) > 0
         assert chosen.sum() == min(CONFIG.pixels, (labels[c] == 1).sum())
         theirs = np.asarray(see(frames[6]).tones[c])[labels[c] == 1]
-        found = np.asarray(points.tones[0, c])[chosen]
+        found = np.asarray(points.tones[c]).T[chosen]
         assert {tuple(row) for row in found} <= {tuple(row) for row in theirs}
-        assert len(np.unique(np.asarray(points.means[0, c])[chosen], axis=0)) == chosen.sum()  # none twice
+        assert len(np.unique(np.asarray(points.means[c]).T[chosen], axis=0)) == chosen.sum()  # none twice
 
 
-@given(
-    st.lists(st.integers(-1, 6), min_size=1, max_size=300), st.integers(1, 5), st.integers(1, 40)
-)
+@given(st.lists(st.integers(-1, 6), min_size=1, max_size=300), st.integers(1, 5), st.integers(1, 40))
 def test_the_first_members_of_a_group_are_distinct_members_and_as_many_as_there_are(groups, num, per_group):
     rows, real = map(np.asarray, first_members(jnp.asarray(groups), num, per_group))
     assert rows.shape == real.shape == (num, per_group)
@@ -149,22 +165,20 @@ def test_samples_are_capped_and_never_strangers():
     groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
     means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
     few = sample_groups(means, means, jnp.ones((2, 40)), groups, 4, 8)
-    assert few.means.shape == (4, 2, 8, 3)
+    assert few.means.shape == (4, 2, 3, 8)
     real = np.asarray(few.seen) > 0
     np.testing.assert_array_equal(real.sum(2), [[8, 8], [3, 3], [0, 0], [7, 7]])
-    np.testing.assert_array_equal(few.means[real, 0], np.nonzero(real)[0] + 1)
+    np.testing.assert_array_equal(few.means[:, :, 0][real], np.nonzero(real)[0] + 1)
 
 
 def test_without_turns_only_translation_is_sought_and_found(moved):
-    points, center, frame, _, _ = moved
+    points, center, sight, _, _ = moved
     config = replace(CONFIG, max_turn=0.0)
-    shift = jnp.array([[0.006, -0.004, 0.003]])
-    behind = points._replace(means=points.means - shift)
-    start = jnp.zeros((1, 1, 6))
-    twist = search(start, behind, center - shift, frame, config).twists
-    np.testing.assert_array_equal(twist[0, 3:], 0)
-    before, after = (disagreement(carry(behind, t, center - shift), frame, config) for t in (start[0], twist))
-    assert after[0] < before[0]
+    shift = jnp.array([0.006, -0.004, 0.003])
+    behind, start = points._replace(means=points.means - shift[:, None]), center - shift
+    twist = look(behind, start, sight, config)
+    np.testing.assert_array_equal(twist[3:], 0)
+    assert gap(carry(behind, twist, start), sight, config) < gap(behind, sight, config)
 
 
 def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
@@ -172,16 +186,16 @@ def test_a_camera_without_depth_gives_pixels_at_the_models_depth(moved, table):
     labels = moved[4]
     blind = eqx.tree_at(lambda f: f.depths, frames[6], frames[6].depths.at[1].set(0.0))
     points = pixels_of_groups(see(blind), labels, frames[6].depths, 1, CONFIG)
-    np.testing.assert_array_equal(points.seen, moved[0].seen)
-    np.testing.assert_allclose(points.means, moved[0].means)
+    np.testing.assert_array_equal(points.seen[0], moved[0].seen)
+    np.testing.assert_allclose(points.means[0], moved[0].means)
 
 
 def test_join_holds_the_points_of_both(moved):
     points = moved[0]
     both = join(points, points._replace(means=points.means + 1))
-    count = points.num_points
-    assert both.seen.shape == (1, 2, 2 * count)
-    np.testing.assert_array_equal(both.means[:, :, :count] + 1, both.means[:, :, count:])
+    count = points.seen.shape[-1]
+    assert both.seen.shape == (2, 2 * count)
+    np.testing.assert_array_equal(both.means[..., :count] + 1, both.means[..., count:])
 
 
 def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
@@ -196,17 +210,18 @@ def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
         count = faded(keyframe, 0.5).seen[:, 0, 0]
         np.testing.assert_allclose(count, [0.4 if turn == 0.3 else 1.0, 1.0], rtol=1e-5)
     # Not renewed, so carried twice; renewed, so new, and unturned.
-    np.testing.assert_allclose(keyframe.points.means[1, 0, 0], [1.2, 1.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(keyframe.points.means[0, 0, 0], [2.0, 2.0, 2.0])
+    np.testing.assert_allclose(keyframe.points.means[1, 0, :, 0], [1.2, 1.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(keyframe.points.means[0, 0, :, 0], [2.0, 2.0, 2.0])
     np.testing.assert_allclose(keyframe.turned, [[1, 0, 0, 0], [1, 0, 0, 0]], atol=1e-6)
 
 
 def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():
     image = jnp.asarray(np.mgrid[0:4, 0:5].transpose(1, 2, 0) + 0.5, jnp.float32)  # (row, column) of centres
     places = jnp.array([[2.3, 1.7], [0.5, 0.5], [4.5, 3.5]])
-    values, slopes = bilinear(image, places)
-    np.testing.assert_allclose(values, places[:, ::-1], atol=2e-3)
-    np.testing.assert_allclose(slopes, np.tile([[0, 1], [1, 0]], (3, 1, 1)), atol=1e-6)
+    read = bilinear(image, *places.T)
+    np.testing.assert_allclose(read.values.T, places[:, ::-1], atol=2e-3)
+    np.testing.assert_allclose(read.slopes, np.tile([[[0], [1]], [[1], [0]]], 3), atol=1e-6)
+    np.testing.assert_allclose(read.nearest.T, [[1.5, 2.5], [0.5, 0.5], [3.5, 4.5]])
 
 
 def test_tones_forget_the_light_and_keep_the_colour():
@@ -219,40 +234,49 @@ def test_tones_forget_the_light_and_keep_the_colour():
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_gradients_of_residuals_are_those_of_finite_differences(moved, depth):
-    points, _, frame, _, _ = moved
-    frame = frame if depth else without_depth(frame)
+    points, _, sight, _, _ = moved
+    sight = sight if depth else without_depth(sight)
     # Off the centres of pixels, where a bilinear image has its kinks.
-    one = Points(points.means[0, :, :20] + 1.3e-3, points.tones[0, :, :20], points.seen[0, :, :20])
-    found = _residuals(one, frame, CONFIG)
+    one = Points(points.means[..., :20] + 1.3e-3, points.tones[..., :20], points.seen[..., :20])
+    found = _residuals(one, sight, CONFIG)
     small = 2e-5
     for axis in range(3):
-        step = small * jnp.eye(3)[axis]
+        step = small * jnp.eye(3)[axis][:, None]
         ahead, behind = (
-            _residuals(one._replace(means=one.means + s * step), frame, CONFIG).values for s in (1, -1)
+            _residuals(one._replace(means=one.means + s * step), sight, CONFIG).values for s in (1, -1)
         )
         slope = np.asarray(ahead - behind, np.float64) / (2 * small)
         # A depth edge is a jump: few points sit on one.
-        close = np.isclose(slope, found.gradients[..., axis], rtol=0.05, atol=2.0)
+        close = np.isclose(slope, found.gradients[:, axis], rtol=0.05, atol=2.0)
         assert close.mean() > 0.9
 
 
-def test_normal_equations_are_those_of_differentiation(moved):
+@pytest.mark.parametrize("depth", [True, False])
+def test_normal_equations_are_those_of_differentiation(moved, depth):
     """J^T W J and J^T W r, put together by hand, against the Jacobian that forward mode has."""
-    points, center, frame, _, _ = moved
-    one = Points(*(a[0] for a in points))
-    _, hessian, gradient = _normal_equations(one, center[0], frame, CONFIG)
+    points, center, sight, _, _ = moved
+    sight = sight if depth else without_depth(sight)
+    fit = _normal_equations(jnp.zeros(6), points, center, sight, CONFIG)
 
     def values(twist):
-        return _residuals(Points(*(a[0] for a in carry(points, twist[None], center))), frame, CONFIG).values
+        return _residuals(carry(points, twist, center), sight, CONFIG).values
 
-    jacobian, base = jax.jacfwd(values)(jnp.zeros(6)), _residuals(one, frame, CONFIG)
+    jacobian, base = jax.jacfwd(values)(jnp.zeros(6)), _residuals(points, sight, CONFIG)
     squared = base.values**2
-    squared = squared.at[..., :3].set(squared[..., :3].mean(-1, keepdims=True))
-    weights = one.seen[..., None] * base.counts / (1 + squared) ** 2
-    expected = jnp.einsum("cpdi,cpd,cpdj->ij", jacobian, weights, jacobian)
-    np.testing.assert_allclose(hessian, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
-    expected = jnp.einsum("cpdi,cpd,cpd->i", jacobian, weights, base.values)
-    np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+    squared = squared.at[:, :3].set(squared[:, :3].mean(1, keepdims=True))
+    weights = points.seen[:, None] * base.counts / (1 + squared) ** 2
+    expected = jnp.einsum("cdpi,cdp,cdpj->ij", jacobian, weights, jacobian)
+    np.testing.assert_allclose(fit.hessian, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+    expected = jnp.einsum("cdpi,cdp,cdp->i", jacobian, weights, base.values)
+    np.testing.assert_allclose(fit.gradient, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+
+
+def test_many_starts_at_once_are_each_alone(moved):
+    points, center, sight, _, _ = moved
+    starts = 0.004 * jax.random.normal(jax.random.key(0), (3, 6))
+    together = jax.vmap(align, in_axes=(0, None, None, None, None))(starts, points, center, sight, CONFIG)
+    alone = jnp.stack([align(start, points, center, sight, CONFIG) for start in starts])
+    np.testing.assert_allclose(together, alone, atol=2e-4)
 
 
 def test_a_ball_holds_the_origin_and_nothing_outside():
@@ -263,34 +287,69 @@ def test_a_ball_holds_the_origin_and_nothing_outside():
 
 
 def test_turned_holds_the_start_and_turns_about_its_own_axes():
-    twists = jnp.array([[0.1, 0.2, 0.3, 0.0, 0.0, 0.4]])
-    axes = jnp.eye(3)[None]
-    hypotheses = turned(twists, axes, (0.2, 0.6))
-    assert hypotheses.shape == (13, 1, 6)
-    np.testing.assert_allclose(hypotheses[0], twists, atol=1e-6)
-    np.testing.assert_allclose(hypotheses[:, 0, :3], jnp.tile(twists[:, :3], (13, 1)))
-    about_z = [float(h[0, 5]) for h in hypotheses if np.allclose(h[0, 3:5], 0, atol=1e-6)]
+    twist = jnp.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
+    hypotheses = turned(twist, jnp.eye(3), (0.2, 0.6))
+    assert hypotheses.shape == (13, 6)
+    np.testing.assert_allclose(hypotheses[0], twist, atol=1e-6)
+    np.testing.assert_allclose(hypotheses[:, :3], jnp.tile(twist[:3], (13, 1)))
+    about_z = [float(h[5]) for h in hypotheses if np.allclose(h[3:5], 0, atol=1e-6)]
     np.testing.assert_allclose(sorted(about_z), [-0.2, 0.2, 0.4, 0.6, 1.0], atol=1e-5)
 
 
 def test_principal_axes_are_those_of_a_rod():
-    along = jnp.linspace(-1, 1, 50)[:, None] * jnp.array([0.6, 0.8, 0.0])
-    points = Points(along[None, None], jnp.zeros((1, 1, 50, 3)), jnp.ones((1, 1, 50)))
-    axes = principal_axes(points, jnp.zeros((1, 3)))
-    np.testing.assert_allclose(jnp.abs(axes[0, 2]), [0.6, 0.8, 0.0], atol=1e-4)
+    along = jnp.array([0.6, 0.8, 0.0])[:, None] * jnp.linspace(-1, 1, 50)
+    points = Points(along[None], jnp.zeros((1, 3, 50)), jnp.ones((1, 50)))
+    np.testing.assert_allclose(jnp.abs(principal_axes(points, jnp.zeros(3))[2]), [0.6, 0.8, 0.0], atol=1e-4)
 
 
-def test_search_finds_a_jump_that_alignment_alone_misses(moved, table):
-    """The carton has been carried 40 mm: nothing overlaps where it starts, and nobody tells how far."""
+def test_the_least_is_taken_of_each_group_and_nothing_that_is_not_finite():
+    residuals = jnp.array([[0.3, jnp.nan, 0.5], [0.2, 0.9, 0.5]])
+    twists = jnp.arange(36.0).reshape(2, 3, 6)
+    found = least(residuals, twists)
+    np.testing.assert_allclose(found.residuals, [0.2, 0.9, 0.5])
+    np.testing.assert_allclose(found.twists, jnp.stack([twists[1, 0], twists[1, 1], twists[0, 2]]))
+
+
+@pytest.fixture(scope="module")
+def jumped(moved, table):
+    """(points of the carton before it was carried 40 mm, their middle, what is seen then, that shift)."""
     points = moved[0]
-    _, frames, _ = table(8, 2, **SIZE)
     shift = jnp.array([0.03, -0.025, 0.01])
-    behind = points._replace(means=points.means - shift)
-    seen = np.asarray(points.seen[0]) > 0
-    center = behind.means[0, seen].mean(0)[None]
-    still = jnp.zeros((1, 1, 6))
-    found = search(still, behind, center, see(frames[6]), CONFIG).twists
-    alone = align(still[0], behind, center, see(frames[6]), CONFIG)
-    miss = lambda twist: float(jnp.linalg.norm(twist[0, :3] - shift))  # noqa: E731
-    assert miss(found) < 1e-3
-    assert miss(alone) > 5e-3
+    behind = points._replace(means=points.means - shift[:, None])
+    return behind, middle(behind), see(table(8, 2, **SIZE)[1][6]), shift
+
+
+def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
+    """Nothing overlaps where it starts, and nobody tells how far it went."""
+    *given, shift = jumped
+    brief = replace(CONFIG, iterations=3)
+    miss = [float(jnp.linalg.norm(look(*given, brief, n)[:3] - shift)) for n in (0, 1)]
+    assert miss[0] > 5e-3
+    assert miss[1] < 1e-3
+
+
+def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jumped):
+    """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
+    *given, shift = jumped
+    points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
+    visible = jnp.array([True, True, True])
+    watches = [
+        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.zeros(3)), visible, [1]),
+        (Watch(jnp.full(3, 0.3), jnp.array([0.0, 5.0, 100.0])), visible, [2]),
+        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.array([2.0, 0.0, 0.0])), ~visible.at[0].set(False), [0]),
+    ]
+    for watch, there, expected in watches:
+        one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
+        found, looked_for = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
+        np.testing.assert_array_equal(np.flatnonzero(looked_for), expected)
+        right = jnp.linalg.norm(found.twists[:, :3] - shift, axis=1) < 1e-3
+        np.testing.assert_array_equal(np.flatnonzero(right), expected)
+    assert isinstance(found, Found)
+
+
+def test_a_watch_knows_what_is_usual_and_who_waits():
+    watch = first_watch(2)
+    for _ in range(60):
+        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]))
+    np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
+    np.testing.assert_allclose(watch.waited, [60, 0])

@@ -1,7 +1,7 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
 Read the files as the data flows: config, scene, fit, shapes, motion, layers, matching, points, align,
-search, region, refine, tracker, grow, tracking.
+search, region, refine, tracker, grow, budget, tracking.
 """
 
 from gsjax.methods.object_tracker.config import (

@@ -1,4 +1,4 @@
-"""Direct alignment of each group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
+"""Direct alignment of a group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
 
 What aligns is a set of points with colours: pixels that showed the group earlier, and centres (see `points`).
 Each has a colour and a depth to agree with at the pixel it falls on:
@@ -6,9 +6,9 @@ Each has a colour and a depth to agree with at the pixel it falls on:
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
 with I and c as tones (see `points`), which see little of shading, and weighted by 1 / (1 + r^2)^2
-(Geman-McClure), which forgets what is hidden by something else. The groups' normal equations are independent
-of each other. An iteration costs a fraction of a rendered one, and depth pulls from further away than colour
-does, so groups arrive, large turns included, where rendering can finish.
+(Geman-McClure), which forgets what is hidden by something else. An iteration costs a fraction of a rendered
+one, and depth pulls from further away than colour does, so groups arrive, large turns included, where
+rendering can finish. Everything here is of one group and one start; `jax.vmap` makes it many.
 """
 
 from typing import NamedTuple
@@ -16,145 +16,144 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from gsjax.geometry.cameras import project
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, Sight, carry, of_groups
+from gsjax.methods.object_tracker.points import Points, Sight, carry
 
 
-def bilinear(
-    image: Float[Array, "h w d"], pixels: Float[Array, "*n 2"]
-) -> tuple[Float[Array, "*n d"], Float[Array, "*n d 2"]]:
-    """`image` between pixel centres (at +0.5), and its slope along x and y a pixel; outside, its border."""
-    height, width = image.shape[:2]
-    x = jnp.clip(pixels[..., 0] - 0.5, 0.0, width - 1.001)
-    y = jnp.clip(pixels[..., 1] - 0.5, 0.0, height - 1.001)
+class Read(NamedTuple):
+    """An image at p places, each of its d channels side by side."""
+
+    values: Float[Array, "d p"]
+    slopes: Float[Array, "2 d p"]  # along x and y, a pixel
+    nearest: Float[Array, "d p"]  # of the pixel that the place lies in
+
+
+def bilinear(image: Float[Array, "h w d"], x: Float[Array, "p"], y: Float[Array, "p"]) -> Read:
+    """`image` between pixel centres (at +0.5); outside, its border."""
+    height, width, channels = image.shape
+    x = jnp.clip(x - 0.5, 0.0, width - 1.001)
+    y = jnp.clip(y - 0.5, 0.0, height - 1.001)
     column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
-    right, down = (x - column)[..., None], (y - row)[..., None]
-    a, b = image[row, column], image[row, column + 1]
-    c, d = image[row + 1, column], image[row + 1, column + 1]
+    right, down = x - column, y - row
+    place, pixels = row * width + column, image.reshape(-1, channels)
+    a, b, c, d = (pixels[place + offset].T for offset in (0, 1, width, width + 1))
     upper, lower = a + right * (b - a), c + right * (d - c)
     across = (b - a) + down * ((d - c) - (b - a))
-    return upper + down * (lower - upper), jnp.stack([across, lower - upper], axis=-1)
+    above, below = jnp.where(right < 0.5, a, b), jnp.where(right < 0.5, c, d)
+    return Read(
+        upper + down * (lower - upper),
+        jnp.stack([across, lower - upper]),
+        jnp.where(down < 0.5, above, below),
+    )
 
 
 class Residuals(NamedTuple):
     """How points differ from the images: red, green, blue and, where the frame has it, depth."""
 
-    values: Float[Array, "c p d"]  # in units of their scales
-    counts: Float[Array, "c p d"]  # 1 where there is something to compare with, else 0
-    gradients: Float[Array, "c p d 3"]  # with respect to the point, a metre
+    values: Float[Array, "c d p"]  # in units of their scales
+    counts: Bool[Array, "c d p"]  # whether there is something to compare with
+    gradients: Float[Array, "c 3 d p"]  # with respect to the point, a metre
 
 
 def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
     """Of one group's points."""
-    height, width = sight.tones.shape[1:3]
+    height, width, channels = sight.pixels.shape[1:]
+    scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
 
-    def one(points, tones, viewmat, K, image, depth):
-        pixels, z = project(points, viewmat, K)
-        # d pixel / d point = (K - pixel e_z^T) / z, turned into the world's axes.
-        axis = viewmat[2, :3]
-        moves = (K[:2] @ viewmat[:3, :3] - pixels[:, :, None] * axis) / jnp.maximum(z, 1e-6)[:, None, None]
-        inside = (pixels > 0.5).all(-1) & (pixels < jnp.array([width, height]) - 0.5).all(-1)
-        inside &= z > 1e-3
-        found, slopes = bilinear(image, pixels)
-        values = (found - tones) / config.color_scale
-        gradients = slopes @ moves / config.color_scale
-        counts = jnp.broadcast_to(inside[:, None], values.shape)
-        if depth is None:
-            return Residuals(values, counts.astype(z.dtype), gradients)
-        # The depth between pixels that lie on two surfaces is nobody's: there, the nearest pixel's.
-        column, row = jnp.floor(pixels).astype(jnp.int32).T
-        nearest = depth[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
-        between, slope = bilinear(depth[..., None], pixels)
-        smooth = jnp.abs(between[:, 0] - nearest) < config.depth_scale
-        gap = (jnp.where(smooth, between[:, 0], nearest) - z) / config.depth_scale
-        pull = (jnp.where(smooth[:, None], (slope @ moves)[:, 0], 0.0) - axis) / config.depth_scale
-        return Residuals(
-            jnp.concatenate([values, gap[:, None]], axis=1),
-            jnp.concatenate([counts, (inside & (nearest > 0))[:, None]], axis=1).astype(z.dtype),
-            jnp.concatenate([gradients, pull[:, None]], axis=1),
-        )
+    def one(means, tones, viewmat, K, image):
+        local = viewmat[:3, :3] @ means + viewmat[:3, 3:]
+        z = jnp.maximum(local[2], 1e-6)
+        x, y = (K[:2] @ local) / z
+        inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
+        found, (across, along), nearest = bilinear(image, x, y)
+        wanted, counts = tones, jnp.broadcast_to(inside, tones.shape)
+        if channels == 4:
+            # The depth between pixels that lie on two surfaces is nobody's: there, the nearest pixel's.
+            smooth = jnp.abs(found[3] - nearest[3]) < config.depth_scale
+            found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
+            across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
+            wanted = jnp.concatenate([tones, local[2:]])
+            counts = jnp.concatenate([counts, (inside & (nearest[3] > 0))[None]])
+        # d pixel / d local = (K - pixel e_z^T) / z
+        gradients = K[0, :, None, None] * (across / z) + K[1, :, None, None] * (along / z)
+        gradients = gradients.at[2].add(-(x * across + y * along) / z)
+        if channels == 4:
+            gradients = gradients.at[2, 3].add(-1.0)
+        in_world = jnp.einsum("ji,jdp->idp", viewmat[:3, :3], gradients / scales)
+        return Residuals((found - wanted) / scales, counts, in_world)
 
-    over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, None if sight.depths is None else 0))
-    cameras = sight.cameras
-    return over_cameras(points.means, points.tones, cameras.viewmat, cameras.K, sight.tones, sight.depths)
+    return jax.vmap(one)(points.means, points.tones, sight.cameras.viewmat, sight.cameras.K, sight.pixels)
 
 
-def _of_color(residuals: Residuals) -> Float[Array, "c p d"]:
+def _squared(residuals: Residuals) -> Float[Array, "c d p"]:
     """Squared residuals, in which each colour channel has the mean of the three."""
     squared = residuals.values**2
-    mean = squared[..., :3].mean(-1, keepdims=True)
-    return jnp.concatenate([jnp.broadcast_to(mean, (*mean.shape[:-1], 3)), squared[..., 3:]], axis=-1)
-
-
-def _normal_equations(points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig):
-    """(cost, J^T W J, J^T W r) of one group, for a small twist about `center`."""
-    residuals = _residuals(points, sight, config)
-    squared = _of_color(residuals)
-    weights = points.seen[..., None]
-    # What falls outside the picture, or is truncated, costs as much as a bad fit.
-    cost = jnp.sum(weights * jnp.where(residuals.counts > 0, squared / (1 + squared), 0.5))
-    arms = jnp.cross((points.means - center)[:, :, None], residuals.gradients)
-    jacobian = jnp.concatenate([residuals.gradients, arms], axis=-1)
-    robust = weights * residuals.counts / (1 + squared) ** 2
-    weighted = jacobian * robust[..., None]
-    hessian = jnp.einsum("cpdi,cpdj->ij", weighted, jacobian)
-    return cost, hessian, jnp.einsum("cpdi,cpd->i", weighted, residuals.values)
+    mean = squared[:, :3].mean(1, keepdims=True)
+    return jnp.concatenate([jnp.broadcast_to(mean, squared[:, :3].shape), squared[:, 3:]], axis=1)
 
 
 class _Fit(NamedTuple):
-    """The best twist so far of each group, with what it takes to go on from it."""
+    """A twist, and what it takes to go on from it."""
 
-    twists: Float[Array, "k 6"]
-    cost: Float[Array, "k"]
-    hessian: Float[Array, "k 6 6"]
-    gradient: Float[Array, "k 6"]
+    twist: Float[Array, "6"]
+    cost: Float[Array, ""]
+    hessian: Float[Array, "6 6"]
+    gradient: Float[Array, "6"]
+
+
+def _normal_equations(
+    twist: Float[Array, "6"], points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig
+) -> _Fit:
+    """Cost, J^T W J and J^T W r after `twist`, for a small one about the moved centre that follows it."""
+    moved = carry(points, twist, center)
+    residuals = _residuals(moved, sight, config)
+    squared, weights = _squared(residuals), points.seen[:, None]
+    # What falls outside the picture, or is truncated, costs as much as a bad fit.
+    cost = jnp.sum(weights * jnp.where(residuals.counts, squared / (1 + squared), 0.5))
+    x, y, z = jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0)[:, :, None]
+    by_x, by_y, by_z = jnp.moveaxis(residuals.gradients, 1, 0)
+    turns = (y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x)
+    jacobian = jnp.stack([by_x, by_y, by_z, *turns], axis=1)
+    weighted = jacobian * (weights * residuals.counts / (1 + squared) ** 2)[:, None]
+    hessian = jnp.einsum("cidp,cjdp->ij", weighted, jacobian)
+    return _Fit(twist, cost, hessian, jnp.einsum("cidp,cdp->i", weighted, residuals.values))
 
 
 def align(
-    twists: Float[Array, "k 6"],
+    twist: Float[Array, "6"],
     points: Points,
-    centers: Float[Array, "k 3"],
+    center: Float[Array, "3"],
     sight: Sight,
     config: AlignConfig,
-) -> Float[Array, "k 6"]:
-    """Levenberg-Marquardt from `twists` (translation, rotation vector) on all groups at once.
+) -> Float[Array, "6"]:
+    """Levenberg-Marquardt from `twist` (translation, rotation vector).
 
     Args:
-        twists: where to start.
-        points: where they were in the last frame.
-        centers: the groups' centroids in the last frame.
+        twist: where to start.
+        points: one group's, where they were in the last frame.
+        center: its centroid in the last frame.
         sight: what the cameras see now.
     """
-
     longest = jnp.array([config.max_step] * 3 + [config.max_turn] * 3)
-
-    def fit(twists) -> _Fit:
-        over_groups = jax.vmap(_normal_equations, in_axes=(0, 0, None, None))
-        moved = carry(points, twists, centers)
-        return _Fit(twists, *over_groups(moved, centers + twists[:, :3], sight, config))
+    # Directions that no pixel speaks of stand still.
+    floor = jnp.array([1.0] * 3 + [1e-2 if config.max_turn else 1e12] * 3)
 
     def iterate(carried, _):
         best, trial, damping = carried
-        new = fit(trial)
+        new = _normal_equations(trial, points, center, sight, config)
         better = new.cost < best.cost
-        best = jax.tree.map(lambda a, b: of_groups(better, a, b), new, best)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
         damping = jnp.clip(jnp.where(better, damping * 0.3, damping * 10.0), 1e-4, 1e4)
-        diagonal = jnp.einsum("kii->ki", best.hessian)
-        # Directions that no pixel speaks of stand still.
-        floor = jnp.array([1.0] * 3 + [1e-2 if config.max_turn else 1e12] * 3)
-        damped = best.hessian + (damping[:, None] * diagonal + floor)[:, :, None] * jnp.eye(6)
-        change = -jnp.linalg.solve(damped, best.gradient[..., None])[..., 0]
-        trial = compose(jnp.clip(change, -longest, longest), best.twists)
-        return (best, trial, damping), None
+        damped = best.hessian + jnp.diag(damping * jnp.diagonal(best.hessian) + floor)
+        change = -jax.scipy.linalg.solve(damped, best.gradient, assume_a="pos")
+        return (best, compose(jnp.clip(change, -longest, longest), best.twist), damping), None
 
-    count = len(twists)
-    nothing = _Fit(twists, jnp.full(count, jnp.inf), jnp.zeros((count, 6, 6)), jnp.zeros((count, 6)))
-    start = (nothing, twists, jnp.full(count, 1e-2))
+    nothing = _Fit(twist, jnp.inf, jnp.zeros((6, 6), twist.dtype), jnp.zeros_like(twist))
+    start = (jax.tree.map(jnp.asarray, nothing), twist, jnp.asarray(1e-2, twist.dtype))
     (best, *_), _ = jax.lax.scan(iterate, start, None, length=config.iterations + 1)
-    return best.twists
+    return best.twist
 
 
 def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
@@ -163,18 +162,15 @@ def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float
     return jnp.concatenate([twists[..., :3] + change[..., :3], rotation.log()], axis=-1)
 
 
-def disagreement(points: Points, sight: Sight, config: AlignConfig) -> Float[Array, "k"]:
-    """How badly each group's points agree with the images: 0 perfect, 1 not at all.
+def disagreement(
+    twist: Float[Array, "6"], points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig
+) -> Float[Array, ""]:
+    """How badly a group's points agree with the images after its twist: 0 perfect, 1 not at all.
 
     Colour and depth count the same; what falls outside the picture counts half.
     """
-
-    def one(points):
-        residuals = _residuals(points, sight, config)
-        squared, counts = _of_color(residuals)[..., 2:], residuals.counts[..., 2:]
-        known = jnp.maximum(counts.sum(-1), 1)
-        cost = jnp.sum(counts * squared / (1 + squared), axis=-1) / known
-        cost = jnp.where(counts[..., 0] > 0, cost, 0.5)
-        return jnp.sum(points.seen * cost) / jnp.maximum(points.seen.sum(), 1e-6)
-
-    return jax.vmap(one)(points)
+    residuals = _residuals(carry(points, twist, center), sight, config)
+    squared, counts = _squared(residuals)[:, 2:], residuals.counts[:, 2:]
+    cost = jnp.sum(counts * squared / (1 + squared), axis=1) / jnp.maximum(counts.sum(1), 1)
+    cost = jnp.where(counts[:, 0], cost, 0.5)
+    return jnp.sum(points.seen * cost) / jnp.maximum(points.seen.sum(), 1e-6)

@@ -1,6 +1,6 @@
 """The settings of the object-aware tracker, with their units and what they trade."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 
@@ -75,11 +75,11 @@ class AlignConfig:
     """A depth difference that is large, metres."""
     centers: int = 256
     """Gaussians of a group whose centres are aligned."""
-    center_weight: float = 0.2
-    """What a centre counts beside a pixel, which looks more like the new frame."""
+    center_weight: float = 1.0
+    """What a centre counts beside a pixel. It keeps from drifting; a pixel looks more like the new frame."""
     pixels: int = 192
     """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
-    keyframe_turn: float = 0.2
+    keyframe_turn: float = 0.4
     """The keyframe counts less as a group turns, and beyond this turn the last frame replaces it, radians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
@@ -91,8 +91,8 @@ class AlignConfig:
     """How far a group is looked for by shifting it as it is, metres ..."""
     spacing: float = 0.015
     """... in steps of this length, metres."""
-    every_start: bool = True
-    """Align from every place where a group may have gone, or only from the one that agrees best as it is."""
+    everywhere: int | None = None
+    """Groups that are looked for everywhere around in a frame, those first that agree worst; None: all."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Turns by which the best start is varied, to either side about each principal axis, radians."""
     max_step: float = 0.1
@@ -188,13 +188,24 @@ class TrackerConfig:
     """Look for each object by template matching first. Without, it is found from where it was."""
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
+    cameras: tuple[int, ...] = ()
+    """The frame's cameras that are followed with, counted from 0; all unless given."""
+    shrink: int = 1
+    """Pictures are averaged over so many pixels each way before anything else."""
     redraw: Literal["all", "moving"] = "all"
     """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
+    coarseness: int = 1
+    """With "moving": pictures shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""
 
     def __post_init__(self):
-        _check(self, at_least={"headroom": 1})
+        _check(self, at_least={"headroom": 1, "coarseness": 1, "shrink": 1})
+        if self.coarseness > 1 and (self.redraw == "all" or self.matching):
+            raise ValueError(
+                f"TrackerConfig.coarseness: expected 1 unless redraw is moving and matching off, found "
+                f"{self.coarseness}"
+            )
         if self.redraw not in ("all", "moving"):
             raise ValueError(f"TrackerConfig.redraw: expected all or moving, found {self.redraw!r}")
         if self.redraw == "moving" and self.refine.iterations:
@@ -206,12 +217,16 @@ class TrackerConfig:
 
 FAST = TrackerConfig(
     start=StartConfig(object_pixels=2.5, background_pixels=6.0),
-    align=AlignConfig(iterations=5, pixels=96, centers=64, every_start=False, reach=0.0, turns=()),
+    align=AlignConfig(iterations=5, pixels=96, centers=64, everywhere=2),
     refine=RefineConfig(iterations=0),
     grow=GrowConfig(candidates=32),
     matching=False,
     redraw="moving",
+    coarseness=2,
 )
-PRESETS = {"accurate": TrackerConfig(), "fast": FAST}
+BALANCED = replace(
+    FAST, align=AlignConfig(pixels=128, centers=128), grow=GrowConfig(candidates=64), coarseness=1
+)
+PRESETS = {"accurate": TrackerConfig(), "balanced": BALANCED, "fast": FAST}
 """`accurate` looks for objects everywhere and refines them photometrically. `fast`, for 30 Hz on two cores,
 goes on from where they were: it loses what jumps. docs/results-tracking.md has what each costs."""

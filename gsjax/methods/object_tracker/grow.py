@@ -45,11 +45,10 @@ def empty_slots(scene: TrackedScene) -> Bool[Array, "m"]:
     return scene.labels[: scene.num_moving] > scene.num_objects
 
 
-def unexplained(shown: Shown, frame: Frame, config: GrowConfig) -> Bool[Array, "c h w"]:
+def unexplained(shown: Shown, measured: Float[Array, "c h w"], config: GrowConfig) -> Bool[Array, "c h w"]:
     """Pixels measured in front of the model, or where there is none."""
-    assert frame.depths is not None
-    in_front = shown.covered & (shown.depths - frame.depths > config.min_gap)
-    return (frame.depths > 0) & (in_front | ~shown.covered)
+    in_front = shown.covered & (shown.depths - measured > config.min_gap)
+    return (measured > 0) & (in_front | ~shown.covered)
 
 
 def grow(
@@ -59,6 +58,7 @@ def grow(
     frame: Frame,
     step: Int[Array, ""],
     config: GrowConfig,
+    coarseness: int = 1,
 ) -> tuple[TrackedScene, Pose]:
     """Fill empty slots with pixels that continue an object.
 
@@ -67,19 +67,22 @@ def grow(
         shown: what they show in the frame's cameras.
         frame: what the cameras saw at this pose, with depth.
         step: any number that differs from frame to frame: it picks which pixels are looked at.
+        coarseness: what is shown is of every so-manieth pixel.
     """
     assert frame.depths is not None
     # Only pixels near an object can continue it; other places wait until one comes by.
-    near = shown.labels > 0
-    for reach in ((1, 2 * config.reach + 1, 1), (1, 1, 2 * config.reach + 1)):
+    near, width = shown.labels > 0, 2 * (config.reach // coarseness) + 1
+    for reach in ((1, width, 1), (1, 1, width)):
         near = jax.lax.reduce_window(near, False, jnp.logical_or, reach, (1, 1, 1), "SAME")
-    # Every second pixel each way.
-    chosen = (unexplained(shown, frame, config) & near)[:, ::2, ::2]
+    # Every second pixel each way, or those that are shown if these are fewer.
+    lattice = max(2, coarseness)
+    chosen = unexplained(shown, frame.depths[:, ::coarseness, ::coarseness], config) & near
+    chosen = chosen[:, :: lattice // coarseness, :: lattice // coarseness]
     order = jax.random.uniform(jax.random.fold_in(jax.random.key(2), step), chosen.size)
     priority, places = jax.lax.top_k(jnp.where(chosen.ravel(), 1.0 + order, 0.0), config.candidates)
 
     camera, row, column = jnp.unravel_index(places, chosen.shape)
-    row, column = 2 * row, 2 * column
+    row, column = lattice * row, lattice * column
     depth, color = frame.depths[camera, row, column], frame.images[camera, row, column]
     pixels = jnp.stack([column, row], axis=-1) + 0.5
     views = (frame.cameras.viewmat[camera], frame.cameras.K[camera])
@@ -92,7 +95,7 @@ def grow(
     rank = jnp.cumsum(wanted) - 1
     target = jnp.where(wanted, slots[jnp.maximum(rank, 0)], scene.gaussians.num)
     target = jnp.where(target < scene.num_moving, target, scene.gaussians.num)  # dropped where none is left
-    scale = 1.1 * depth / frame.cameras.K[camera, 0, 0]  # pixels of the lattice are two apart
+    scale = 0.55 * lattice * depth / frame.cameras.K[camera, 0, 0]
     born = Gaussians(
         means=points,
         quats=jnp.zeros((config.candidates, 4), points.dtype).at[:, 0].set(1.0),
@@ -127,13 +130,12 @@ def _nearest(
     ask = jnp.concatenate([points / config.distance, colors / config.color], axis=1)
     taken = (scene.labels <= scene.num_objects).at[: scene.num_moving].min(~empty_slots(scene))
 
-    columns = jnp.arange(len(own), dtype=jnp.int32)
-
-    def one(query):
-        squared = jnp.where(taken, jnp.sum((own - query) ** 2, axis=-1), jnp.inf)
-        least = squared.min()
-        # XLA:CPU's argmin takes many times as long.
-        best = jnp.where(squared == least, columns, len(own) - 1).min()
-        return scene.labels[best], jnp.sqrt(least)
-
-    return jax.lax.map(one, ask, batch_size=32)
+    # |a - b|^2 by one product of matrices, around a common middle for the rounding's sake.
+    middle = own.mean(0)
+    own, ask = own - middle, ask - middle
+    squared = jnp.sum(own**2, -1)[:, None] - 2 * own @ ask.T + jnp.sum(ask**2, -1)
+    squared = jnp.where(taken[:, None], squared, jnp.inf)
+    # XLA:CPU's argmin takes many times as long.
+    rows = jnp.arange(len(own), dtype=jnp.int32)[:, None]
+    best = jnp.where(squared == squared.min(0), rows, len(own) - 1).min(0)
+    return scene.labels[best], jnp.linalg.norm(own[best] - ask, axis=-1)

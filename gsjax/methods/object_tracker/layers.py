@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.cameras import Camera, camera_centers, project
+from gsjax.geometry.cameras import Camera, camera_centers, project, resized
 from gsjax.methods.object_tracker.motion import Pose, facing, place
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.rasterize.plan import Plan
@@ -72,6 +72,18 @@ def moving_of(scene: TrackedScene, pose: Pose) -> Gaussians:
     return eqx.tree_at(lambda g: (g.means, g.quats), moving, (pose.means, pose.quats))
 
 
+def thinned(gaussians: Gaussians, coarseness: int) -> Gaussians:
+    """Every coarseness^2-th Gaussian, `coarseness` times as large: the same surface for smaller pictures."""
+    some = jax.tree.map(lambda a: a[:: coarseness**2], gaussians)
+    return eqx.tree_at(lambda g: g.log_scales, some, some.log_scales + np.log(coarseness))
+
+
+def reduced(cameras: Camera, coarseness: int) -> Camera:
+    """The same views in smaller pictures, pixels `coarseness` times as wide."""
+    width, height = (-(-size // coarseness) for size in (cameras.width, cameras.height))
+    return resized(cameras, 1 / coarseness, width, height)
+
+
 def draw_backdrop(scene: TrackedScene, cameras: Camera, plan: Plan) -> tuple[Backdrop, Int[Array, ""]]:
     """The background in these cameras, and what capacity that needed."""
     drawn = render(background_of(scene), cameras, plan)
@@ -84,22 +96,21 @@ def keep_backdrop(
     """The backdrop for these cameras: the one there is, unless a camera has moved."""
     same = jnp.array_equal(backdrop.cameras.viewmat, cameras.viewmat)
     same &= jnp.array_equal(backdrop.cameras.K, cameras.K)
-    return jax.lax.cond(
-        same, lambda: (backdrop, jnp.int32(0)), lambda: draw_backdrop(scene, cameras, plan)
-    )
+    return jax.lax.cond(same, lambda: (backdrop, jnp.int32(0)), lambda: draw_backdrop(scene, cameras, plan))
 
 
 def show_moving(
-    scene: TrackedScene, pose: Pose, backdrop: Backdrop, plan: Plan
+    scene: TrackedScene, pose: Pose, backdrop: Backdrop, plan: Plan, coarseness: int = 1
 ) -> tuple[Shown, Int[Array, ""]]:
-    """What moves, drawn alone, over the backdrop; and what capacity that needed.
+    """What moves, `thinned` and drawn alone, over the backdrop; and what capacity that needed.
 
     Labels are drawn as their binary digits, which are few channels: where one label has more than half of a
     pixel's weight, so has each of its digits.
     """
-    moving, cameras = moving_of(scene, pose), backdrop.cameras
+    moving, cameras = thinned(moving_of(scene, pose), coarseness), backdrop.cameras
     powers = np.left_shift(1, np.arange(max(1, scene.num_objects.bit_length())))
-    digits = ((scene.labels[: scene.num_moving, None] & powers) > 0).astype(pose.means.dtype)
+    labels = scene.labels[: scene.num_moving : coarseness**2]
+    digits = ((labels[:, None] & powers) > 0).astype(pose.means.dtype)
     images, alphas, meta = rasterization(
         moving.means,
         moving.quats,

@@ -20,34 +20,40 @@ from gsjax.scene.frame import Frame
 
 
 class Points(NamedTuple):
-    """Points of the groups 1..K that each of C cameras looks for."""
+    """Points of the groups 1..K that each of C cameras looks for; a coordinate's values lie side by side."""
 
-    means: Float[Array, "*k c p 3"]
-    tones: Float[Array, "*k c p 3"]
+    means: Float[Array, "*k c 3 p"]
+    tones: Float[Array, "*k c 3 p"]
     seen: Float[Array, "*k c p"]  # what a point counts, 0 to 1; 0 fills up a row
-
-    @property
-    def num_points(self) -> int:
-        """How many there are of a group in a camera, those that count nothing included."""
-        return self.seen.shape[-1]
 
 
 def join(*several: Points) -> Points:
     """The points of all."""
-    return Points(*(jnp.concatenate(rows, axis=2) for rows in zip(*several, strict=True)))
+    return Points(*(jnp.concatenate(rows, axis=-1) for rows in zip(*several, strict=True)))
 
 
 class Sight(NamedTuple):
-    """A frame as points are compared with it."""
+    """A frame as points are compared with it: red, green and blue in tones and, if measured, depth."""
 
     cameras: Camera
-    tones: Float[Array, "c height width 3"]
-    depths: Float[Array, "c height width"] | None
+    pixels: Float[Array, "c height width d"]
+
+    @property
+    def tones(self) -> Float[Array, "c height width 3"]:
+        return self.pixels[..., :3]
+
+    @property
+    def depths(self) -> Float[Array, "c height width"] | None:
+        """Metres; 0 where nothing was measured."""
+        return self.pixels[..., 3] if self.pixels.shape[-1] == 4 else None
 
 
 def sight_of(frame: Frame, shading: float) -> Sight:
     """The frame in tones."""
-    return Sight(frame.cameras, tones(frame.images, shading), frame.depths)
+    seen = tones(frame.images, shading)
+    if frame.depths is None:
+        return Sight(frame.cameras, seen)
+    return Sight(frame.cameras, jnp.concatenate([seen, frame.depths[..., None]], axis=-1))
 
 
 def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
@@ -65,11 +71,11 @@ def of_groups(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array,
     return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
-def carry(points: Points, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Points:
-    """Each group's points after its twist (translation, rotation vector) about its centre."""
-    center = centers[:, None, None]
-    turned = jnp.einsum("kij,kcpj->kcpi", jaxlie.SO3.exp(twists[:, 3:]).as_matrix(), points.means - center)
-    return points._replace(means=center + turned + twists[:, None, None, :3])
+def carry(points: Points, twist: Float[Array, "6"], center: Float[Array, "3"]) -> Points:
+    """One group's points after its twist (translation, rotation vector) about its centre."""
+    turn = jaxlie.SO3.exp(twist[3:]).as_matrix()
+    moved = jnp.einsum("ij,cjp->cip", turn, points.means - center[:, None]) + (center + twist[:3])[:, None]
+    return points._replace(means=moved)
 
 
 def sample_groups(
@@ -82,9 +88,10 @@ def sample_groups(
 ) -> Points:
     """Up to `per_group` members of each group, spread over it; a large one needs no more."""
     rows, real = first_members(groups, num_groups, min(per_group, groups.shape[0]))
-    in_all = (num_groups, seen.shape[0], *rows.shape[1:], 3)
     weights = jnp.moveaxis(seen[:, rows], 0, 1) * real[:, None]
-    return Points(*(jnp.broadcast_to(a[rows][:, None], in_all) for a in (means, tones)), weights)
+    in_all = (*weights.shape[:2], 3, weights.shape[2])
+    of_each = (jnp.swapaxes(a[rows], 1, 2)[:, None] for a in (means, tones))
+    return Points(*(jnp.broadcast_to(a, in_all) for a in of_each), weights)
 
 
 def first_members(
@@ -113,6 +120,7 @@ def pixels_of_groups(
     depths: Float[Array, "c h w"],
     num_groups: int,
     config: AlignConfig,
+    coarseness: int = 1,
 ) -> Points:
     """Up to `config.pixels` pixels of each group in each camera, as points that this camera looks for.
 
@@ -121,9 +129,11 @@ def pixels_of_groups(
         labels: the group of each pixel, 0 for none.
         depths: of the model at that pixel. What is measured further off
             than a group is thick is something else.
+        coarseness: labels and depths are of every so-manieth pixel.
     """
-    height, width = labels.shape[1:]
-    grid = pixel_grid(width, height).reshape(-1, 2)
+    height, width = sight.pixels.shape[1:3]
+    grid = pixel_grid(width, height)[::coarseness, ::coarseness].reshape(-1, 2)
+    sight = sight._replace(pixels=sight.pixels[:, ::coarseness, ::coarseness])
     measured = depths
     if sight.depths is not None:
         with_depth = (sight.depths > 0).any((1, 2))[:, None, None]
@@ -133,7 +143,8 @@ def pixels_of_groups(
     def one(viewmat, K, groups, depth, image):
         rows, real = first_members(groups.ravel(), num_groups, config.pixels)
         points = unproject(grid[rows], depth.ravel()[rows], viewmat, K)
-        return points, image.reshape(-1, 3)[rows], real.astype(points.dtype)
+        seen = image.reshape(-1, 3)[rows]
+        return jnp.swapaxes(points, 1, 2), jnp.swapaxes(seen, 1, 2), real.astype(points.dtype)
 
     views = (sight.cameras.viewmat, sight.cameras.K, jnp.where(usable, labels, 0), measured, sight.tones)
     return Points(*jax.vmap(one, out_axes=1)(*views))
@@ -172,4 +183,4 @@ def renewed(keyframe: Keyframe, pixels: Points, max_turn: float) -> Keyframe:
 def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:
     """The keyframe after each group's twist about its centre."""
     turned = jaxlie.SO3.exp(twists[:, 3:]) @ jaxlie.SO3(keyframe.turned)
-    return Keyframe(carry(keyframe.points, twists, centers), turned.normalize().wxyz)
+    return Keyframe(jax.vmap(carry)(keyframe.points, twists, centers), turned.normalize().wxyz)

@@ -1,4 +1,8 @@
-"""Where has each group gone? Several starts are aligned with the images, and what agrees best is kept."""
+"""Where has each group gone? Several starts are aligned with the images, and what agrees best is kept.
+
+Every group goes on from the better of its starts. That loses what jumps or changes its spin, and then it
+agrees badly; so the groups that agree worst, as many as there is time for, are looked for everywhere around.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -7,17 +11,27 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.align import align, disagreement
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, Sight, carry
+from gsjax.methods.object_tracker.points import Points, Sight
+
+_LEAST_USUAL = 0.02  # a residual below this is noise
+_PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 
 
 def widened(config: AlignConfig) -> AlignConfig:
     """Wider scales of the residuals, which listen to more of what disagrees: for starts that are far off."""
     factor = config.widen
     return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
+
+
+class Found(NamedTuple):
+    """Where each group is, as far as is known."""
+
+    twists: Float[Array, "*k 6"]  # translation, metres, and rotation vector, radians
+    residuals: Float[Array, "*k"]  # how badly that agrees with the images: 0 perfect, 1 not at all
 
 
 def judge(
@@ -27,44 +41,34 @@ def judge(
     sight: Sight,
     config: AlignConfig,
 ) -> Float[Array, "k"]:
-    """How badly each group agrees with the images after its twist: 0 perfect, 1 not at all."""
-    return disagreement(carry(points, twists, centers), sight, config)
+    """How badly each group agrees with the images after its twist."""
+    over_groups = jax.vmap(disagreement, in_axes=(0, 0, 0, None, None))
+    return over_groups(twists, points, centers, sight, config)
 
 
-class Found(NamedTuple):
-    """Where each group is, as far as is known."""
-
-    twists: Float[Array, "k 6"]  # translation, metres, and rotation vector, radians
-    residuals: Float[Array, "k"]  # how badly that agrees with the images, as `judge` has it
-
-
-def least(residuals: Float[Array, "h k"], twists: Float[Array, "h k 6"]) -> Found:
+def least(residuals: Float[Array, "h *k"], twists: Float[Array, "h *k 6"]) -> Found:
     """For each group the twist of the hypothesis with the least residual; the first wins ties."""
     residuals = jnp.where(jnp.isfinite(residuals), residuals, jnp.inf)
-    best, group = jnp.argmin(residuals, axis=0), jnp.arange(residuals.shape[1])
-    return Found(twists[best, group], residuals[best, group])
+    best = jnp.argmin(residuals, axis=0, keepdims=True)
+    take = jnp.take_along_axis
+    return Found(take(twists, best[..., None], axis=0)[0], take(residuals, best, axis=0)[0])
 
 
 def turned(
-    twists: Float[Array, "k 6"], axes: Float[Array, "k 3 3"], angles: tuple[float, ...]
-) -> Float[Array, "h k 6"]:
-    """The twists themselves, and each after a turn to either side by each angle about each of its axes."""
-    steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)], axis=1)
-    steps = jnp.concatenate([jnp.zeros_like(steps[:, :1]), steps], axis=1)
-
-    def one(step):
-        rotation = jaxlie.SO3.exp(twists[:, 3:]) @ jaxlie.SO3.exp(step)
-        return jnp.concatenate([twists[:, :3], rotation.log()], axis=-1)
-
-    return jax.vmap(one, in_axes=1)(steps)
+    twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
+) -> Float[Array, "h 6"]:
+    """The twist itself, and after a turn to either side by each angle about each of the axes."""
+    steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)])
+    steps = jnp.concatenate([jnp.zeros_like(steps[:1]), steps])
+    rotations = (jaxlie.SO3.exp(twist[3:]) @ jaxlie.SO3.exp(steps)).log()
+    return jnp.concatenate([jnp.broadcast_to(twist[:3], rotations.shape), rotations], axis=-1)
 
 
-def principal_axes(points: Points, centers: Float[Array, "k 3"]) -> Float[Array, "k 3 3"]:
-    """Axes of each group, one a row: a bottle rolls about its own, whichever way it lies."""
-    weights = (points.seen > 0).astype(points.means.dtype)
-    away = (points.means - centers[:, None, None]) * weights[..., None]
-    _, vectors = jnp.linalg.eigh(jnp.einsum("kcpi,kcpj->kij", away, away))
-    return jnp.swapaxes(vectors, -1, -2)
+def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Axes of a group, one a row: a bottle rolls about its own, whichever way it lies."""
+    away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
+    _, vectors = jnp.linalg.eigh(jnp.einsum("cip,cjp->ij", away, away))
+    return vectors.T
 
 
 def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
@@ -74,13 +78,63 @@ def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
     return grid[np.linalg.norm(grid, axis=1) <= radius]
 
 
-def _shifted(points: Points, centers: Float[Array, "k 3"], sight: Sight, config: AlignConfig):
-    """The pure translation of each group, of a coarse grid, that agrees best: of some of its points."""
-    some = jax.tree.map(lambda a: a[:, :, ::4], points)
-    shifts = jnp.asarray(ball(config.reach, config.spacing), points.means.dtype)
-    twists = jnp.zeros((len(shifts), len(centers), 6), points.means.dtype).at[..., :3].set(shifts[:, None])
-    residuals = jax.lax.map(lambda t: judge(t, some, centers, sight, widened(config)), twists)
-    return least(residuals, twists).twists
+def look_everywhere(
+    known: Found,
+    starts: Float[Array, "h 6"],
+    points: Points,
+    center: Float[Array, "3"],
+    sight: Sight,
+    config: AlignConfig,
+) -> Found:
+    """`known` of one group, or what agrees better.
+
+    Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
+    match. Then turns to all sides are tried from the best, because a knock changes a spin from one frame to
+    the next, and a round thing may roll without its shape changing.
+    """
+    wide = widened(config)
+
+    def judged(twists, points, config):
+        return jax.vmap(disagreement, in_axes=(0, None, None, None, None))(
+            twists, points, center, sight, config
+        )
+
+    def better(known: Found, twists, with_config) -> Found:
+        """`known`, or what of `twists` agrees better once aligned."""
+        aligned = jax.vmap(align, in_axes=(0, None, None, None, None))(
+            twists, points, center, sight, with_config
+        )
+        residuals = jnp.append(known.residuals, judged(aligned, points, config))
+        return least(residuals, jnp.concatenate([known.twists[None], aligned]))
+
+    starts = jnp.concatenate([starts, known.twists[None]])
+    # By colour alone, a plain thing would slide about within its outline.
+    if sight.depths is not None and config.reach:
+        shifts = jnp.asarray(ball(config.reach, config.spacing), starts.dtype)
+        shifts = jnp.zeros((len(shifts), 6), starts.dtype).at[:, :3].set(shifts)
+        some = jax.tree.map(lambda a: a[..., ::4], points)
+        starts = jnp.concatenate([starts, least(judged(shifts, some, wide), shifts).twists[None]])
+    best = better(known, starts, wide)
+    if config.max_turn and config.turns:
+        best = better(best, turned(best.twists, principal_axes(points, center), config.turns), wide)
+    return better(best, best.twists[None], config)
+
+
+class Watch(NamedTuple):
+    """How each group has been followed, which says where to look first."""
+
+    usual: Float[Array, "k"]  # residual of late
+    waited: Float[Array, "k"]  # frames since it was last looked for everywhere
+
+    def after(self, residuals: Float[Array, "k"], looked_for: Bool[Array, "k"]) -> "Watch":
+        """One frame later."""
+        usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
+        return Watch(usual, jnp.where(looked_for, 0.0, self.waited + 1.0))
+
+
+def first_watch(num_groups: int) -> Watch:
+    """Before the first frame."""
+    return Watch(jnp.full(num_groups, 0.1), jnp.zeros(num_groups))
 
 
 def search(
@@ -89,38 +143,40 @@ def search(
     centers: Float[Array, "k 3"],
     sight: Sight,
     config: AlignConfig,
-) -> Found:
-    """The twist of each group that agrees best with the images; no worse than the first start.
-
-    Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
-    match.
-    Then turns to all sides are tried from the best, because a knock changes a spin from one frame to the
-    next, and a round thing may roll without its shape changing.
+    watch: Watch,
+    visible: Bool[Array, "k"],
+    everywhere: Int[Array, ""],
+) -> tuple[Found, Bool[Array, "k"]]:
+    """The twist of each group that agrees best with the images, no worse than any start; and which
+    groups were looked for everywhere.
 
     Args:
         starts: hypotheses: translation, metres, and rotation vector, radians, of each group.
         points: of each group in the last frame.
         centers: what groups turn about.
         sight: what the cameras see now.
+        watch: how groups have been followed so far.
+        visible: groups that a camera sees; no other is looked for.
+        everywhere: how many groups are looked for everywhere, those first that agree worst beside what is
+            usual for them, or that have waited longest.
     """
+    judged = jax.vmap(judge, in_axes=(0, None, None, None, None))
+    best = least(judged(starts, points, centers, sight, config), starts)
+    over_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
+    aligned = over_groups(best.twists, points, centers, sight, widened(config))
+    aligned = over_groups(aligned, points, centers, sight, config)
+    tried = jnp.stack([best.twists, aligned])
+    found = least(judged(tried, points, centers, sight, config), tried)
 
-    def judged(twists):
-        return jax.lax.map(lambda t: judge(t, points, centers, sight, config), twists)
+    urgency = jnp.where(visible, found.residuals / watch.usual + _PATIENCE * watch.waited, -jnp.inf)
+    order = jnp.argsort(-urgency)
+    count = jnp.minimum(everywhere, visible.sum())
 
-    def better(known: Found, tried) -> Found:
-        """`known`, or what of `tried` agrees better."""
-        residuals = jnp.concatenate([known.residuals[None], judged(tried)])
-        return least(residuals, jnp.concatenate([known.twists[None], tried]))
+    def look(i, found: Found) -> Found:
+        group = order[i]
+        known, own = jax.tree.map(lambda a: a[group], (found, points))
+        better = look_everywhere(known, starts[:, group], own, centers[group], sight, config)
+        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better)
 
-    def aligned(twists):
-        return jax.lax.map(lambda t: align(t, points, centers, sight, widened(config)), twists)
-
-    # By colour alone, a plain thing would slide about within its outline.
-    if sight.depths is not None and config.reach:
-        starts = jnp.concatenate([starts, _shifted(points, centers, sight, config)[None]])
-    # What stands still is the first hypothesis, whatever is tried.
-    best = Found(starts[0], judged(starts[:1])[0])
-    best = better(best, aligned(starts) if config.every_start else starts[1:])
-    if config.max_turn and config.turns:
-        best = better(best, aligned(turned(best.twists, principal_axes(points, centers), config.turns)))
-    return better(best, align(best.twists, points, centers, sight, config)[None])
+    found = jax.lax.fori_loop(0, count, look, found)
+    return found, jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)

@@ -178,7 +178,7 @@ def _cost(poses, means, colors, frame):
             pixels, z = project(moved, viewmat, K)
             size = jnp.array([image.shape[1], image.shape[0]])
             inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-            gap = jnp.abs(bilinear(image, pixels)[0] - colors).mean(-1)
+            gap = jnp.abs(bilinear(image, *pixels.T).values.T - colors).mean(-1)
             return jnp.where(inside, jnp.minimum(gap, _COLOR_LIMIT), _COLOR_LIMIT).mean()
 
         return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images).mean()
@@ -204,7 +204,8 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
         pixels, z = project(scene.gaussians.means, viewmat, K)
         size = jnp.array([image.shape[1], image.shape[0]])
         inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-        return bilinear(image, pixels)[0], inside, bilinear(near[..., None], pixels)[0][..., 0] > 0.1
+        close = bilinear(near[..., None], *pixels.T).values[0] > 0.1
+        return bilinear(image, *pixels.T).values.T, inside, close
 
     return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images, near)
 

@@ -15,10 +15,12 @@ from gsjax.methods.object_tracker.layers import (
     draw_backdrop,
     keep_backdrop,
     moving_of,
+    reduced,
     render_labels,
     seen_from,
     show_moving,
     shown_by,
+    thinned,
 )
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
@@ -47,7 +49,7 @@ from gsjax.methods.object_tracker.region import (
     touched_tiles,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.methods.object_tracker.search import judge, search
+from gsjax.methods.object_tracker.search import Watch, first_watch, judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
@@ -62,6 +64,7 @@ class TrackerState(NamedTuple):
     motion: Motion  # of the last frame: where delta starts, and the constant-velocity hypothesis
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
+    watch: Watch
     count: Int[Array, ""]  # frames so far
     shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
     backdrop: Backdrop | None
@@ -74,6 +77,7 @@ class TrackerBatch(NamedTuple):
     scene: TrackedScene
     frame: Frame
     plan: TrackerPlan
+    everywhere: Int[Array, ""] | None = None  # groups to look for everywhere; None: as the config says
 
 
 def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
@@ -117,14 +121,20 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
     def init(params: Pose) -> TrackerState:
         nowhere = Motion(jnp.zeros((num_objects, 6), params.means.dtype), jnp.zeros_like(params.means))
-        scene, frame, plan = first
-        backdrop = draw_backdrop(scene, frame.cameras, plan.full)[0] if keep else None
+        scene, frame, plan, _ = first
+        views = reduced(frame.cameras, config.coarseness)
+        backdrop = draw_backdrop(scene, views, plan.full)[0] if keep else None
         shown, _ = show(scene, params, frame, backdrop, plan)
-        pixels = pixels_of_groups(
-            sight_of(frame, config.align.shading), shown.labels, shown.depths, num_objects, config.align
-        )
+        sight = sight_of(frame, config.align.shading)
+        how = (num_objects, config.align, config.coarseness)
+        pixels = pixels_of_groups(sight, shown.labels, shown.depths, *how)
         return TrackerState(
-            nowhere, pixels, first_keyframe(pixels), jnp.int32(0), *memory(shown, backdrop, frame)
+            nowhere,
+            pixels,
+            first_keyframe(pixels),
+            first_watch(num_objects),
+            jnp.int32(0),
+            *memory(shown, backdrop, frame),
         )
 
     def memory(shown: Shown, backdrop: Backdrop | None, frame: Frame):
@@ -136,11 +146,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         if backdrop is None:
             rendered = render_labels(scene, pose, frame, plan.full)
             return shown_by(rendered), rendered.meta.needed.max()
-        return show_moving(scene, pose, backdrop, plan.near)
+        return show_moving(scene, pose, backdrop, plan.near, config.coarseness)
 
     def look_back(params: Pose, state: TrackerState, batch: TrackerBatch) -> _Last:
         """What the last scene shows."""
-        scene, frame, plan = batch
+        scene, frame, plan, _ = batch
         gap = config.start.depth_gap
         if keep:
             assert state.shown is not None
@@ -158,7 +168,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         return _Last(seen, Template(last.colors, last.depths, last.features[..., 1:]), last)
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
-        scene, frame, plan = batch
+        scene, frame, plan, everywhere = batch
         groups = scene.labels[: scene.num_moving]
         centers = group_means(params.means, groups, num_objects)
         sight = sight_of(frame, config.align.shading)
@@ -180,7 +190,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             delta = state.motion.delta
         if config.matching and config.warm_start:
             starts += [going.at[:, :3].set(jumped[:, :3])]
-        aligned = search(jnp.stack(starts), points, centers, sight, config.align)
+        if everywhere is None:
+            everywhere = jnp.int32(
+                num_objects if config.align.everywhere is None else config.align.everywhere
+            )
+        seen = (config.align, state.watch, visible, everywhere)
+        aligned, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
         residual = aligned.residuals
         kept = begun = Motion(aligned.twists, delta)
         needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
@@ -201,7 +216,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         pose = move(params, kept, centers, groups)
         backdrop, drawn = state.backdrop, jnp.int32(0)
         if backdrop is not None:
-            backdrop, drawn = keep_backdrop(backdrop, scene, frame.cameras, plan.full)
+            views = reduced(frame.cameras, config.coarseness)
+            backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
         shown, shown_needed = show(scene, pose, frame, backdrop, plan)
         if last.rendered is not None:
             drawn = jnp.maximum(last.rendered.meta.needed.max(), shown_needed)
@@ -210,11 +226,13 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, shown_needed))
         overflow = needed.exceeds(plan)
         sound = all_finite((pose, shifts)) & ~overflow
-        pixels = pixels_of_groups(sight, shown.labels, shown.depths, num_objects, config.align)
+        how = (num_objects, config.align, config.coarseness)
+        pixels = pixels_of_groups(sight, shown.labels, shown.depths, *how)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
         told = memory(shown, backdrop, frame)
-        new_state = TrackerState(kept, pixels, keyframe, state.count + 1, *told)
+        watch = state.watch.after(residual, looked_for)
+        new_state = TrackerState(kept, pixels, keyframe, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
@@ -224,6 +242,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "found": found,
             "visible": visible,
             "residual": residual,
+            "looked_for": looked_for,
             "motion": kept,
             "shown": shown,
             "background": shifts,
@@ -249,7 +268,7 @@ def _match(template: Template | None, frame: Frame, num_objects: int, config: Tr
 
 def _refine(begun: Motion, params: Pose, centers, last: Rendered, batch: TrackerBatch, config: TrackerConfig):
     """Refined motion, shifts of the background (None if that is frozen), capacities needed, and info."""
-    scene, frame, plan = batch
+    scene, frame, plan, _ = batch
     groups = scene.labels[: scene.num_moving]
     tiles = touched_tiles([params.means, move(params, begun, centers, groups).means], frame)
     near = near_background(scene, last, tiles)
@@ -273,8 +292,12 @@ def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackerC
     """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds."""
     headroom = config.headroom
     if config.redraw == "moving":
-        full = plan_render(background_of(scene), frame.cameras, headroom=headroom)
-        near = plan_render(moving_of(scene, pose), frame.cameras, headroom=headroom, sh_degree=None)
+        views, moving = (
+            reduced(frame.cameras, config.coarseness),
+            thinned(moving_of(scene, pose), config.coarseness),
+        )
+        full = plan_render(background_of(scene), views, headroom=headroom)
+        near = plan_render(moving, views, headroom=headroom, sh_degree=None)
         return TrackerPlan(full, near, 0)
     full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
     rendered = render(place(scene, pose), frame.cameras, full)

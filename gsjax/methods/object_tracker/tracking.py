@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.methods.object_tracker.budget import Chosen, Costs, Governor, choose, ladder
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.grow import empty_slots, grow, with_slots
@@ -24,8 +25,10 @@ from gsjax.methods.object_tracker.tracker import (
 )
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import keep_if
-from gsjax.scene.frame import Frame, without_broken
+from gsjax.scene.frame import Frame, part_of, without_broken
 from gsjax.scene.gaussians import Gaussians
+
+_TRIALS = 5  # updates whose median says what one costs
 
 
 class Tracked(NamedTuple):
@@ -39,6 +42,8 @@ class Tracked(NamedTuple):
         seconds: from images in memory to the new state, re-planning included; compilation apart.
         compile_seconds: what compiling took before that; 0 but for the first frame and after re-plans.
         plan: the plan it ran under.
+        everywhere: how many groups it was allowed to look for everywhere.
+        chosen: the settings that were chosen for a budget; None without one.
     """
 
     scene: TrackedScene
@@ -48,6 +53,8 @@ class Tracked(NamedTuple):
     seconds: float
     compile_seconds: float
     plan: TrackerPlan
+    everywhere: int
+    chosen: Chosen | None = None
 
     def gaussians(self) -> Gaussians:
         """The whole scene as it stands now."""
@@ -82,7 +89,7 @@ def _first_state(pose, batch, config: TrackerConfig, num_objects: int):
 
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
-    frame, broken = without_broken(batch.frame)
+    frame, broken = without_broken(part_of(batch.frame, config.cameras, config.shrink))
     batch = batch._replace(frame=frame)
     tracker = object_tracker(config, num_objects, batch, reduction)
     with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
@@ -92,7 +99,7 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
         scene = keep_if(~info["skipped"], shift_background(scene, background), scene)
     info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
     if config.grow.slots and frame.depths is not None:
-        grown = grow(scene, pose, shown, frame, state.count, config.grow)
+        grown = grow(scene, pose, shown, frame, state.count, config.grow, config.coarseness)
         scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
         info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
@@ -116,6 +123,7 @@ def track(
     frames: Iterable[Frame],
     config: TrackerConfig | None = None,
     *,
+    budget_ms: float | None = None,
     pose: Pose | None = None,
     state: TrackerState | None = None,
 ) -> Iterator[Tracked]:
@@ -129,43 +137,87 @@ def track(
         first: the frame that `scene` or `pose` shows.
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackerConfig`.
+        budget_ms: what an update may take, milliseconds. The richest settings that keep to it are then chosen
+            by measured cost, and of `config` only what says how a scene starts is used (see `budget`).
         pose, state: where to go on from, with the same `Tracked`'s scene; the first frame unless given.
 
     Raises:
-        ValueError: a frame has other shapes than the first one.
+        ValueError: a frame has other shapes than the first one, or the budget is not above 0.
     """
     config = TrackerConfig() if config is None else config
+    if budget_ms is not None and not budget_ms > 0:
+        raise ValueError(f"budget_ms: expected milliseconds above 0, found {budget_ms}")
     if pose is None:
         if config.grow.slots and first.depths is not None:
             scene = with_slots(scene, config.grow.slots)
         pose = first_pose(scene)
-    first, _ = without_broken(first)
-    plan = plan_tracker(scene, pose, first, config)
-    reduction = _reduction(scene, first, config)
-    if state is None:
-        state = _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
-    compiled: dict[TrackerPlan, Any] = {}
-    static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
+    count, chosen, governor = scene.num_objects, None, None
+    if budget_ms is not None:
+        measure = partial(_measured, scene, pose, first)
+        chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
+        config, governor = chosen.config, Governor(budget_ms / 1e3, chosen.costs, count)
+    run = _Runner(scene, pose, first, config)
+    state = run.first_state(scene, pose) if state is None else state
+    usually = count if config.align.everywhere is None else min(config.align.everywhere, count)
     for index, frame in enumerate(frames):
         _check_alike(frame, first, index + 1)
         jax.block_until_ready(frame)
+        everywhere = usually if governor is None else governor.allowed()
+        (scene, pose, state, info), seconds, compile_seconds = run(
+            scene, pose, state, frame, index, everywhere
+        )
+        if governor is not None:
+            governor.spent(seconds, everywhere)
+        yield Tracked(scene, pose, state, info, seconds, compile_seconds, run.plan, everywhere, chosen)
+
+
+class _Runner:
+    """The compiled update of one configuration, compiled again where a plan has become too small."""
+
+    def __init__(self, scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig):
+        first, _ = without_broken(part_of(first, config.cameras, config.shrink))
+        self.plan = plan_tracker(scene, pose, first, config)
+        self._first, self._config = first, config
+        reduction = _reduction(scene, first, config)
+        self._static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
+        self._compiled: dict[TrackerPlan, Any] = {}
+
+    def first_state(self, scene: TrackedScene, pose: Pose) -> TrackerState:
+        """What the first frame leaves behind."""
+        return _first_state(
+            pose, TrackerBatch(scene, self._first, self.plan), self._config, scene.num_objects
+        )
+
+    def __call__(self, scene, pose, state, frame: Frame, index: int, everywhere: int):
+        """What `_update` gives, the seconds that it took, and those of compiling."""
         seconds = compile_seconds = 0.0
         while True:
-            batch = TrackerBatch(scene, frame, plan)
+            batch = TrackerBatch(scene, frame, self.plan, jnp.int32(everywhere))
             arguments = (pose, state, batch, index)
-            if plan not in compiled:
+            if self.plan not in self._compiled:
                 begun = time.perf_counter()
-                compiled[plan] = _compiled_update(*_signature(arguments), **static)
+                self._compiled[self.plan] = _compiled_update(*_signature(arguments), **self._static)
                 compile_seconds += time.perf_counter() - begun
             begun = time.perf_counter()
-            result = jax.block_until_ready(compiled[plan](*arguments))
+            result = jax.block_until_ready(self._compiled[self.plan](*arguments))
             seconds += time.perf_counter() - begun
             info = result[3]
             if not bool(info["overflow"]):
-                break
-            plan = plan.grown(info["needed"], config.headroom)
-        scene, pose, state, info = result
-        yield Tracked(scene, pose, state, info, seconds, compile_seconds, plan)
+                return result, seconds, compile_seconds
+            self.plan = self.plan.grown(info["needed"], self._config.headroom)
+
+
+def _measured(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> Costs:
+    """What updates cost: on the first frame again, which changes nothing."""
+    run, count = _Runner(scene, pose, first, config), scene.num_objects
+    state = run.first_state(scene, pose)
+
+    def median(everywhere: int) -> float:
+        return float(np.median([run(scene, pose, state, first, 0, everywhere)[1] for _ in range(_TRIALS)]))
+
+    median(0)  # the first calls fault their memory in
+    base = median(0)
+    return Costs(base, max(median(count) - base, 0.0) / count)
 
 
 def _check_alike(frame: Frame, first: Frame, index: int) -> None:
