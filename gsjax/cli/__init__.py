@@ -13,6 +13,7 @@ from rich.table import Table
 
 COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
+    "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),

@@ -26,6 +26,19 @@ def describe() -> dict[str, Any]:
     }
 
 
+def resident_mb() -> float:
+    """Memory that this process holds now, MB; the most it ever held where the system tells only that."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        kilobytes = next(
+            line for line in status.read_text().splitlines() if line.startswith("VmRSS")
+        ).split()[1]
+        return int(kilobytes) / 1e3
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # macOS counts bytes
+
+
 def name(machine: dict[str, Any]) -> str:
     """What two runs must share for their milliseconds to be compared: processor, cores and device."""
     device = "" if machine["device"] == "cpu" else f", {machine['device']}"

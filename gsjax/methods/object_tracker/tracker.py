@@ -244,6 +244,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "residual": residual,
             "looked_for": looked_for,
             "motion": kept,
+            "centers": centers + kept.twists[:, :3],
             "shown": shown,
             "background": shifts,
         }

@@ -1,0 +1,292 @@
+"""`gsjax live`: follow objects while frames arrive, at the rate at which they do."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.machine import resident_mb
+from gsjax.cli.messages import Notes
+from gsjax.cli.messages import describe as describe_error
+from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
+from gsjax.cli.run_folder import RunFolder
+from gsjax.data.opencv_cameras import open_camera, snapshots
+from gsjax.data.stream import Arrival, Newest, Snapshot, replay
+from gsjax.methods.object_tracker import Tracked, TrackedScene, start_scene, track
+from gsjax.perception.segmenters import PlaneOrRegionSegmenter
+from gsjax.scene.frame import Frame
+
+CAMERA_PREFIX = "camera:"
+_MEMORY_EVERY_S = 1.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax live` is told."""
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
+    out: Path
+    """Folder for the run. It must be new, empty, or hold an unfinished run."""
+    seconds: float = 60.0
+    """How long to follow."""
+    hz: float = 30.0
+    """Frames a second: of the replay, and what the budget comes from."""
+    budget_ms: float | None = None
+    """What an update may take; the time between two frames unless given."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of the recording's cameras to track with. All unless given."""
+    mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
+    """Id of the camera whose first mask names the objects. The first that has masks, unless given."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames of the recording are replayed."""
+    masks: Literal["auto", "files", "segment"] = "auto"
+    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
+    patience: float = 10.0
+    """Seconds to wait for a frame before giving up."""
+    max_skew: float = 0.02
+    """Cameras of one frame may be so far apart, seconds; a frame beyond that is left out and counted."""
+    overwrite: bool = False
+    """Replace a finished run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+
+
+class Source(NamedTuple):
+    """Where frames come from.
+
+    Attributes:
+        first: what the scene starts from.
+        scene: at that frame.
+        names: of each mask value.
+        snapshots: the stream, which begins when it is first asked.
+    """
+
+    first: Frame
+    scene: TrackedScene
+    names: dict[int, str]
+    snapshots: Iterator[Snapshot]
+
+
+def run(options: Options) -> int:
+    """Follow a stream and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; what was followed before that is on disk.
+    """
+    _check(options)
+    console = Console(stderr=True, highlight=False)
+    with Notes(console) as notes:
+        folder = RunFolder(options.out, overwrite=options.overwrite)
+        folder.write_config(options)
+        source = _open(options, console)
+        log = Log(source)
+        stopped = follow(options, source, log, console)
+        found = log.metrics() | {
+            "source": options.source,
+            "complete": stopped is None,
+            "stopped": None if stopped is None else describe_error(stopped) or "Ctrl-C",
+            "notes": notes.all,
+            "machine": describe_machine(),
+        }
+        folder.write_metrics(found)
+        if log.times:
+            folder.write_trajectory(**log.trajectory())
+    _print(found, folder)
+    if isinstance(stopped, KeyboardInterrupt):
+        return 130
+    if stopped is not None:
+        raise stopped
+    return 0
+
+
+def _check(options: Options) -> None:
+    for name in ("seconds", "hz", "patience"):
+        if not getattr(options, name) > 0:
+            raise ValueError(f"--{name}: expected more than 0, found {getattr(options, name)}")
+
+
+def _open(options: Options, console: Console) -> Source:
+    """The stream, and the scene at its first frame."""
+    if options.source.startswith(CAMERA_PREFIX):
+        number = options.source.removeprefix(CAMERA_PREFIX)
+        if not number.isdecimal():
+            raise ValueError(
+                f"SOURCE: expected {CAMERA_PREFIX}NUMBER, as in camera:0, found {options.source}"
+            )
+        camera = open_camera(int(number))
+        stream = snapshots([camera])
+        first = next(stream).frame
+        image, depth = (np.asarray(a[0]) for a in (first.images, first.depths))
+        mask = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K)
+        return Source(first, start_scene(first, mask.astype(np.int32)), {}, stream)
+    recording = open_recording(options.source, options.cameras, (), options.frames)
+    mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+    if mask.labels is None:
+        raise ValueError(
+            f"SOURCE: {options.source} has no depth; gsjax live starts from depth. Use gsjax track."
+        )
+    draw_ahead(recording, console)
+    frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
+    with console.status("fitting the scene to the first frame"):
+        scene = start_scene(frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera))
+    names = label_names(recording, mask.source)
+    return Source(frames[0], scene, names, replay(frames, options.hz, options.seconds))
+
+
+class Log:
+    """What is kept of a stream: a few numbers an update, so that memory stays flat."""
+
+    def __init__(self, source: Source):
+        groups = source.scene.num_objects
+        self._names, self._ids = source.names, source.scene.label_ids
+        self.times: list[float] = []
+        self.stamps: list[float] = []
+        self.latencies: list[float] = []
+        self.seconds: list[float] = []
+        self.everywhere: list[int] = []
+        self.memory_mb: list[float] = []
+        self.poses: list[np.ndarray] = []
+        self._turned = Rotation.identity(groups)
+        self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
+        self._memory_at = 0.0
+
+    def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
+        """One update."""
+        now = perf_counter()
+        self.times.append(now)
+        self.stamps.append(arrival.snapshot.stamp)
+        self.latencies.append(now - arrival.time)
+        self.seconds.append(update.seconds)
+        self.late += update.seconds > budget
+        self.everywhere.append(update.everywhere)
+        self.chosen = update.chosen
+        self.plans.add(update.plan)
+        twists, centers = jax.device_get((update.info["motion"].twists, update.info["centers"]))
+        self._turned = Rotation.from_rotvec(twists[:, 3:]) * self._turned
+        quats = self._turned.as_quat(scalar_first=True)
+        self.poses.append(np.concatenate([centers, quats], axis=1).astype(np.float32))
+        if now - self._memory_at > _MEMORY_EVERY_S:
+            self._memory_at = now
+            self.memory_mb.append(resident_mb())
+
+    def trajectory(self) -> dict[str, np.ndarray]:
+        """The place and turn of every group over time."""
+        poses = np.stack(self.poses)
+        return {
+            "times": np.asarray(self.stamps),
+            "centers": poses[..., :3],
+            "quats": poses[..., 3:],
+            "label_ids": np.asarray(self._ids[1:]),
+            "latency_s": np.asarray(self.latencies),
+            "update_s": np.asarray(self.seconds),
+        }
+
+    def metrics(self) -> dict[str, Any]:
+        """What metrics.json holds of the stream."""
+        span = self.times[-1] - self.times[0] if len(self.times) > 1 else None
+        return {
+            "frames": dict(self.counts),
+            "hz": (len(self.times) - 1) / span if span else None,
+            "latency_ms": _spread(self.latencies),
+            "update_ms": _spread(self.seconds),
+            "late": self.late,
+            "looked_for": float(np.mean(self.everywhere)) if self.everywhere else None,
+            "budget": None if self.chosen is None else budget_metrics(self.chosen),
+            "plans": len(self.plans),
+            "memory_mb": {"first": self.memory_mb[0], "last": self.memory_mb[-1], "max": max(self.memory_mb)}
+            if self.memory_mb
+            else None,
+            "objects": {str(v): self._names.get(v, f"object {v}") for v in sorted({*self._ids} - {0})},
+        }
+
+
+def budget_metrics(chosen) -> dict[str, Any]:
+    """What was chosen for a budget, and why, for metrics.json."""
+    tried = {
+        name: {"base_ms": 1e3 * costs.base, "each_search_ms": 1e3 * costs.search}
+        for name, costs in chosen.tried.items()
+    }
+    return {"chosen": chosen.name, "fits": chosen.fits, "measured": tried}
+
+
+def _spread(seconds: list[float]) -> dict[str, float] | None:
+    """Median, 95th percentile and worst, milliseconds."""
+    if not seconds:
+        return None
+    milliseconds = 1e3 * np.asarray(seconds)
+    return {
+        "median": float(np.median(milliseconds)),
+        "p95": float(np.percentile(milliseconds, 95)),
+        "worst": float(milliseconds.max()),
+    }
+
+
+def follow(options: Options, source: Source, log: Log, console: Console) -> BaseException | None:
+    """Track until the stream ends; returns what ended it early, or None."""
+    budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
+    newest = Newest(source.snapshots, max_skew=options.max_skew, patience=options.patience)
+    arrived: list[Arrival] = []
+
+    def frames() -> Iterator[Frame]:
+        yield source.first  # compiles the update, and faults its memory in, before the stream begins
+        begun = perf_counter()
+        for arrival in newest:
+            arrived[:] = [arrival]
+            yield arrival.snapshot.frame
+            if perf_counter() - begun > options.seconds:
+                return
+
+    try:
+        with console.status("measuring what updates cost") as status:
+            updates = track(source.scene, source.first, frames(), budget_ms=budget_ms)
+            for update in updates:
+                if not arrived:
+                    continue
+                log.add(update, arrived[0], budget_ms / 1e3)
+                if len(log.times) % 15 == 0:
+                    worst = 1e3 * max(log.latencies)
+                    status.update(
+                        f"{newest.counts.used} frames, {newest.counts.dropped} dropped, {worst:.0f} ms"
+                    )
+    except (KeyboardInterrupt, Exception) as stopped:
+        return stopped
+    finally:
+        log.counts = vars(newest.counts)
+    return None
+
+
+def _print(found: dict[str, Any], folder: RunFolder) -> None:
+    """The run in a few lines."""
+    console = Console(highlight=False)
+    frames, latency, memory = found["frames"], found["latency_ms"], found["memory_mb"]
+    table = Table.grid(padding=(0, 3, 0, 0))
+    table.add_row(
+        "[bold]frames[/]", f"{frames['offered']} offered, {frames['used']} used, {frames['dropped']} dropped"
+    )
+    left_out = {"out of order": frames["out_of_order"], "cameras out of sync": frames["out_of_sync"]}
+    for name, count in left_out.items():
+        if count:
+            table.add_row("", f"{count} left out, {name}")
+    if latency:
+        table.add_row("[bold]rate[/]", f"{found['hz']:.1f} Hz" if found["hz"] else "one update")
+        spread = ", ".join(f"{name} {value:.0f} ms" for name, value in latency.items())
+        table.add_row("[bold]latency[/]", f"from arrival to the new state: {spread}")
+        table.add_row(
+            "[bold]late[/]", f"{found['late']} updates over the budget; settings: {found['budget']['chosen']}"
+        )
+    if memory:
+        table.add_row(
+            "[bold]memory[/]", f"{memory['first']:.0f} MB at first, {memory['last']:.0f} MB at last"
+        )
+    console.print(table)
+    console.print(f"[bold]written[/] {folder.path}", soft_wrap=True)

@@ -1,0 +1,106 @@
+"""RGB-D cameras that OpenCV reads (its OpenNI 2 backend: Kinect, Xtion, Astra), as a stream of snapshots."""
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataError
+from gsjax.data.stream import Snapshot
+from gsjax.geometry.cameras import Camera, intrinsics
+from gsjax.scene.frame import Frame
+
+_MILLIMETRE = 1e-3
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """What is used of `cv2.VideoCapture`."""
+
+    def isOpened(self) -> bool: ...
+    def get(self, propId: int) -> float: ...
+    def grab(self) -> bool: ...
+    def retrieve(self, *, flag: int = 0) -> tuple[bool, np.ndarray]: ...
+
+
+class RgbdCamera(NamedTuple):
+    """An open camera and where it stands.
+
+    Attributes:
+        capture: of OpenCV.
+        K: pixels; pixel centres at +0.5.
+        viewmat: world to camera, OpenCV axes.
+    """
+
+    capture: Capture
+    K: Float[np.ndarray, "3 3"]
+    viewmat: Float[np.ndarray, "4 4"]
+
+
+def open_camera(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) -> RgbdCamera:
+    """The RGB-D camera that OpenCV counts as `index`, with depth registered to colour, as its driver has it.
+
+    Args:
+        viewmat: world to camera; the world is the camera's own unless given.
+
+    Raises:
+        DataError: there is no such camera, or it measures no depth.
+    """
+    capture = cv2.VideoCapture(index, cv2.CAP_OPENNI2)
+    capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
+    return described(index, capture, np.eye(4) if viewmat is None else viewmat)
+
+
+def described(index: int, capture: Capture, viewmat: Float[np.ndarray, "4 4"]) -> RgbdCamera:
+    """`capture` with its intrinsics. Raises DataError as `open_camera` does."""
+    what, expected = f"camera {index}", "an RGB-D camera of OpenCV's OpenNI 2 backend"
+    if not capture.isOpened():
+        found = "none that opens"
+        raise DataError(what, expected, found, "Connect it, install its OpenNI 2 driver, or replay a folder.")
+    focal = capture.get(cv2.CAP_OPENNI_DEPTH_GENERATOR + cv2.CAP_PROP_OPENNI_FOCAL_LENGTH)
+    if not focal > 0:
+        raise DataError(what, expected, "a camera without depth", "Tracking starts from depth: take another.")
+    width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    return RgbdCamera(capture, intrinsics(focal, width, height), viewmat)
+
+
+def snapshots(cameras: Sequence[RgbdCamera]) -> Iterator[Snapshot]:
+    """What all cameras see, as long as they give pictures. All are grabbed first, then read out.
+
+    Raises:
+        DataError: a camera gives a picture without depth, or of another size than the first one.
+    """
+    viewmats = jnp.asarray(np.stack([camera.viewmat for camera in cameras]), jnp.float32)
+    Ks = jnp.asarray(np.stack([camera.K for camera in cameras]), jnp.float32)
+    while True:
+        stamps = []
+        for camera in cameras:
+            if not camera.capture.grab():
+                return
+            stamps.append(time.monotonic())
+        images, depths = zip(
+            *(_retrieved(c, camera.capture) for c, camera in enumerate(cameras)), strict=True
+        )
+        sizes = {image.shape[:2] for image in (*images, *depths)}
+        if len(sizes) > 1:
+            raise DataError(
+                "cameras", "pictures of one size", f"{sorted(sizes)}", "Set one video mode for all."
+            )
+        height, width = images[0].shape[:2]
+        colors = jnp.asarray(np.stack(images)[..., ::-1], jnp.float32) / 255
+        frame = Frame(colors, jnp.asarray(np.stack(depths)), Camera(viewmats, Ks, width, height))
+        yield Snapshot(frame, stamps[0], stamps[-1] - stamps[0])
+
+
+def _retrieved(c: int, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
+    """BGR bytes and depth in metres."""
+    there, image = capture.retrieve(flag=cv2.CAP_OPENNI_BGR_IMAGE)
+    with_depth, depth = capture.retrieve(flag=cv2.CAP_OPENNI_DEPTH_MAP)
+    if not (there and with_depth):
+        what = "colour" if not there else "depth"
+        raise DataError(f"camera {c}", "colour and depth", f"a frame without {what}", "Check its connection.")
+    return image, (_MILLIMETRE * depth).astype(np.float32)

@@ -1,0 +1,109 @@
+"""A budget is kept by leaving things out, and what was late is paid back."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig, track
+from gsjax.methods.object_tracker.budget import Costs, Governor, choose, ladder
+
+RUNGS = ladder(TrackerConfig(), 3)
+NAMES = list(RUNGS)
+
+
+def measured(**base_ms):
+    """A measurement by the place of a rung on the ladder: what is richer costs more."""
+    calls = []
+
+    def measure(config):
+        name = next(n for n in NAMES if RUNGS[n] is config)
+        calls.append(name)
+        milliseconds = base_ms.get(name.replace(",", "").replace(" ", "_"), 10.0)
+        return Costs(milliseconds / 1e3, milliseconds / 1e4)
+
+    return measure, calls
+
+
+COSTS = {
+    "accurate": 1000.0,
+    "balanced": 100.0,
+    "fast": 20.0,
+    "fast_half_the_resolution": 10.0,
+    "fast_half_the_resolution_2_cameras": 7.0,
+    "fast_half_the_resolution_1_camera": 4.0,
+}
+
+
+def test_the_ladder_goes_from_the_richest_to_one_camera():
+    assert NAMES[:3] == ["accurate", "balanced", "fast"]
+    assert NAMES[-1] == "fast, half the resolution, 1 camera"
+    assert RUNGS[NAMES[-1]].cameras == (0,)
+    assert all(rung.grow.slots == TrackerConfig().grow.slots for rung in RUNGS.values())
+    assert set(PRESETS) <= set(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("budget_ms", "expected", "fits", "most_measured"),
+    [
+        (33.0, "fast", True, 1),
+        (60.0, "fast", True, 2),  # fast fits with all groups, balanced does not
+        (250.0, "balanced", True, 3),
+        (5000.0, "accurate", True, 3),
+        (15.0, "fast, half the resolution", True, 2),
+        (5.5, "fast, half the resolution, 1 camera", True, 4),
+        (1.0, "fast, half the resolution, 1 camera", False, 4),
+    ],
+)
+def test_the_richest_rung_that_fits_is_chosen(budget_ms, expected, fits, most_measured):
+    measure, calls = measured(**COSTS)
+    chosen = choose(RUNGS, measure, budget_ms / 1e3, 9)
+    assert (chosen.name, chosen.fits) == (expected, fits)
+    assert chosen.config is RUNGS[expected]
+    assert len(calls) == len(set(calls)) == len(chosen.tried) <= most_measured
+
+
+def test_as_many_groups_are_looked_for_as_there_is_time_for():
+    assert Governor(0.033, Costs(0.010, 0.004), 9).allowed() == 4
+    assert Governor(0.100, Costs(0.010, 0.004), 9).allowed() == 9
+    assert Governor(0.010, Costs(0.020, 0.004), 9).allowed() == 0
+
+
+def test_what_was_late_is_paid_back_and_then_forgotten():
+    governor, costs = Governor(0.033, Costs(0.010, 0.004), 9), Costs(0.010, 0.004)
+    assert governor.spent(0.048, 4)  # something else took the processor
+    allowed = []
+    for _ in range(12):
+        allowed.append(governor.allowed())
+        assert not governor.spent(costs.base + allowed[-1] * costs.search, allowed[-1])
+    assert allowed[0] < 3
+    assert allowed[-1] >= 3
+    assert allowed == sorted(allowed)
+
+
+@given(st.lists(st.floats(0, 0.2), min_size=1, max_size=60))
+def test_a_governor_always_recovers(hiccups):
+    """However late updates were, undisturbed ones look for groups again within a second or so."""
+    governor, costs = Governor(0.033, Costs(0.010, 0.004), 9), Costs(0.010, 0.004)
+    for hiccup in hiccups:
+        count = governor.allowed()
+        assert 0 <= count <= 9
+        governor.spent(costs.base + count * costs.search + hiccup, count)
+    for _ in range(60):
+        count = governor.allowed()
+        governor.spent(costs.base + count * costs.search, count)
+    assert governor.allowed() >= 3
+
+
+def test_a_budget_of_nothing_is_refused(table, started):
+    _, frames, _ = table()
+    with pytest.raises(ValueError, match="budget_ms: expected milliseconds above 0, found -1"):
+        next(track(started, frames[0], frames[1:], budget_ms=-1))
+
+
+@pytest.mark.slow
+def test_objects_are_followed_within_a_generous_budget(table, started, quick, centroid_errors):
+    sequence, frames, _ = table()
+    for t, result in enumerate(track(started, frames[0], frames[1:], quick, budget_ms=100.0), start=1):
+        assert max(centroid_errors(sequence, started, result.pose, t).values()) < 5e-3
+        assert result.chosen.name in ladder(quick, 2)
+        assert 0 <= result.everywhere <= started.num_objects
