@@ -19,6 +19,7 @@ from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.scoring import budget_metrics
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, Newest, Snapshot, replay
 from gsjax.methods.object_tracker import Tracked, TrackedScene, start_scene, track
@@ -208,15 +209,6 @@ class Log:
             else None,
             "objects": {str(v): self._names.get(v, f"object {v}") for v in sorted({*self._ids} - {0})},
         }
-
-
-def budget_metrics(chosen) -> dict[str, Any]:
-    """What was chosen for a budget, and why, for metrics.json."""
-    tried = {
-        name: {"base_ms": 1e3 * costs.base, "each_search_ms": 1e3 * costs.search}
-        for name, costs in chosen.tried.items()
-    }
-    return {"chosen": chosen.name, "fits": chosen.fits, "measured": tried}
 
 
 def _spread(seconds: list[float]) -> dict[str, float] | None:

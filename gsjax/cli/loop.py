@@ -1,5 +1,6 @@
 """The host loop: frames in, poses out, and everything timed."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -12,7 +13,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
-from gsjax.methods.object_tracker import EMPTY, Pose, TrackedScene, TrackerConfig, first_pose, track
+from gsjax.methods.object_tracker import (
+    EMPTY,
+    Pose,
+    Tracked,
+    TrackedScene,
+    TrackerConfig,
+    first_pose,
+    track,
+)
+from gsjax.methods.object_tracker.budget import Chosen
 from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
@@ -36,6 +46,9 @@ class Tracking:
         plans: how many plans there were; more than one means that it had to plan again.
         visible: [K] of each update, which objects some camera saw.
         skipped: updates that changed nothing, because a number in them was not finite.
+        everywhere: of each update, how many groups it was allowed to look for everywhere.
+        chosen: the settings chosen for a budget, or None.
+        resumed: how many frames an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
     """
 
@@ -51,6 +64,9 @@ class Tracking:
     plans: int = 0
     visible: list[np.ndarray] = field(default_factory=list)
     skipped: int = 0
+    everywhere: list[int] = field(default_factory=list)
+    chosen: Chosen | None = None
+    resumed: int = 0
     stopped: BaseException | None = None
 
     @property
@@ -91,20 +107,36 @@ class Tracking:
         return scene, pose
 
 
+def begin(scene: TrackedScene) -> Tracking:
+    """Tracking that has come to the first frame."""
+    return Tracking(scene, [jax.device_get(first_pose(scene))])
+
+
 def follow(
-    scene: TrackedScene, first: Frame, tracked: Sequence, config: TrackerConfig, console: Console
+    tracking: Tracking,
+    first: Frame,
+    tracked: Sequence,
+    config: TrackerConfig,
+    console: Console,
+    *,
+    budget_ms: float | None = None,
+    after: Tracked | None = None,
+    saved: Callable[[Tracking, Tracked, bool], None] = lambda tracking, update, last: None,
 ) -> Tracking:
-    """Track all frames after the first. Ctrl-C or an error ends the loop; what was tracked until then stays.
+    """Track all frames that are left. Ctrl-C or an error ends the loop; what was tracked until then stays.
 
     Args:
-        scene: at the first frame.
-        first: what the tracked cameras saw then.
+        tracking: what there is so far; it is added to, and returned.
+        first: what the tracked cameras saw at first.
         tracked: the tracked cameras; only images and depth are loaded.
         config: the tracker's.
         console: for the progress bar.
+        budget_ms: what an update may take, or None.
+        after: the last update, where tracking goes on from an earlier run.
+        saved: called after each update, and once more, with True, where the loop is stopped early.
     """
-    tracking = Tracking(scene, [jax.device_get(first_pose(scene))])
-    frames = Prefetched(tracked.frame, range(1, tracked.num_frames), LOADED_AHEAD)
+    frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), LOADED_AHEAD)
+    update = after
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=None),
@@ -114,24 +146,31 @@ def follow(
     )
     begun, plans = perf_counter(), set()
     with Progress(*columns, console=console, expand=True) as progress:
-        task = progress.add_task("tracking", total=tracked.num_frames, completed=1, rate="compiling")
+        task = progress.add_task(
+            "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"
+        )
         try:
-            for update in track(scene, first, frames, config):
+            for update in track(tracking.scene, first, frames, config, budget_ms=budget_ms, after=after):
                 tracking.poses.append(jax.device_get(update.pose))
                 tracking.final = update.scene
                 tracking.joined.append(int(update.info["joined"]))
                 tracking.update_s.append(update.seconds)
                 tracking.compile_s += update.compile_seconds
-                if tracking.num_frames == 2:
+                tracking.everywhere.append(update.everywhere)
+                tracking.chosen = update.chosen
+                if not plans:
                     known = update.seconds + update.compile_seconds + frames.waited
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)
                 tracking.visible.append(np.asarray(update.info["visible"]))
                 tracking.skipped += int(update.info["skipped"])
                 plans.add(update.plan)
+                saved(tracking, update, False)
                 progress.update(task, advance=1, rate=_rate(tracking))
         except (KeyboardInterrupt, Exception) as stopped:
             tracking.stopped = stopped
             progress.update(task, rate="stopped")
+            if update is not None and update.info:
+                saved(tracking, update, True)
     tracking.loop_s = perf_counter() - begun
     tracking.loading_s, tracking.plans = frames.waited, len(plans)
     return tracking

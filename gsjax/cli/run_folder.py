@@ -13,7 +13,7 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "trajectory.npz", "scene.ply", "report.html")
-_FOLDERS = ("renders", "plots")
+_FOLDERS = ("renders", "plots", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 _SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
@@ -30,6 +30,7 @@ class RunFolder:
           video_CAM.mp4           input, render, error and labels side by side
           plots/NAME.svg|png      update time, error over frames, ...
           report.html             all of it on one page, written last
+          resume/                 what an unfinished run goes on from; a finished one has none
 
     A run is finished when it has its report, and metrics.json does not say that it was stopped.
 
@@ -37,29 +38,33 @@ class RunFolder:
         path: the folder, which exists.
     """
 
-    def __init__(self, path: str | Path, *, overwrite: bool = False):
-        """Makes the folder, clearing what an unfinished run left there.
+    def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool = False):
+        """Makes the folder, clearing what an unfinished run left there unless it is to go on.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
             overwrite: clear an earlier run although it is finished. What a run does not write beside it is
                 kept; renders/ and plots/ are cleared whole.
+            resume: keep an unfinished run.
 
         Raises:
+            FileNotFoundError: `resume` is on and no run is there.
             FileExistsError: a finished run is there and `overwrite` is off.
             FileExistsError: something that is not a run is there; nothing of it is touched.
             NotADirectoryError: `path` is a file.
         """
         self.path = Path(path)
+        if resume and not self.config.is_file():
+            raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():
             raise NotADirectoryError(f"{self.path}: expected a folder, found a file; name another folder")
         if self.path.is_dir() and any(self.path.iterdir()):
-            self._claim(overwrite)
+            self._claim(overwrite, resume)
         self.path.mkdir(parents=True, exist_ok=True)
 
-    def _claim(self, overwrite: bool) -> None:
+    def _claim(self, overwrite: bool, resume: bool) -> None:
         # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
-        config = self.path / "config.yml"
+        config = self.config
         if not config.is_file() or not config.read_bytes().startswith(_SIGNATURE.encode()):
             raise FileExistsError(
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
@@ -69,6 +74,8 @@ class RunFolder:
             raise FileExistsError(
                 f"{self.path}: holds a finished run; name another folder, or replace it with --overwrite"
             )
+        if resume:
+            return
         for name in (*_FILES, *_FOLDERS, *_PATTERNS):
             for entry in self.path.glob(name):
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -80,6 +87,19 @@ class RunFolder:
         if not (self.report.is_file() and metrics.is_file()):
             return False
         return bool(json.loads(metrics.read_text(encoding="utf-8")).get("complete", True))
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yml"
+
+    @property
+    def resume(self) -> Path:
+        """Where an unfinished run keeps what it can go on from."""
+        return self.path / "resume"
+
+    def forget_resume(self) -> None:
+        """Removes what only an unfinished run needs."""
+        shutil.rmtree(self.resume, ignore_errors=True)
 
     @property
     def report(self) -> Path:
@@ -112,8 +132,19 @@ class RunFolder:
             TypeError: `config` is not a dataclass instance.
         """
         text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
-        with atomic_write(self.path / "config.yml") as temporary:
+        with atomic_write(self.config) as temporary:
             temporary.write_text(f"{_SIGNATURE}\n{text}", encoding="utf-8")
+
+    def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
+        """Raises ValueError where config.yml says something else than `config`, the settings `but` apart."""
+        stored = yaml.safe_load(self.config.read_text(encoding="utf-8"))
+        given = _plain(dataclasses.asdict(config))
+        for name in given.keys() | stored.keys():
+            if name not in but and stored.get(name) != given.get(name):
+                raise ValueError(
+                    f"--resume: the run in {self.path} was begun with {name} {stored.get(name)!r}, now it is "
+                    f"{given.get(name)!r}; give the same, or begin anew without --resume"
+                )
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Writes metrics.json; numbers that are not finite become null."""

@@ -9,6 +9,7 @@ import numpy as np
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import FirstMask, Recording, label_names
 from gsjax.cli.views import View
+from gsjax.methods.object_tracker.budget import Chosen
 from gsjax.metrics.image import depth_error, psnr, ssim
 from gsjax.metrics.segmentation import LabelOverlap
 from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
@@ -157,6 +158,15 @@ def metrics(
             },
         },
     }
+
+
+def budget_metrics(chosen: Chosen) -> dict[str, Any]:
+    """What was chosen for a budget, and why, for metrics.json."""
+    tried = {
+        name: {"base_ms": 1e3 * costs.base, "each_search_ms": 1e3 * costs.search}
+        for name, costs in chosen.tried.items()
+    }
+    return {"chosen": chosen.name, "fits": chosen.fits, "measured": tried}
 
 
 def object_names(

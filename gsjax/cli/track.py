@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from gsjax.cli.loop import Tracking, follow
+from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, describe, say_error
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
@@ -24,8 +24,9 @@ from gsjax.cli.recording import (
     warn_of_missing,
 )
 from gsjax.cli.report import format_number
+from gsjax.cli.resume import Saver, load
 from gsjax.cli.run_folder import RunFolder
-from gsjax.cli.scoring import Scores, group_values, metrics, object_names, score_motion
+from gsjax.cli.scoring import Scores, budget_metrics, group_values, metrics, object_names, score_motion
 from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, start_scene
@@ -50,6 +51,10 @@ class Options:
     """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
+    budget_ms: float | None = None
+    """What an update may take, milliseconds. The tracker's settings are then chosen by measured cost."""
+    resume: bool = False
+    """Go on with the unfinished run in the same folder, given the same options."""
     overwrite: bool = False
     """Replace a finished run in the same folder."""
     debug: bool = False
@@ -79,22 +84,37 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
-        folder = RunFolder(options.out, overwrite=options.overwrite)
-        folder.write_config(dataclasses.replace(options, cameras=recording.tracked.camera_ids))
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = dataclasses.replace(options, cameras=recording.tracked.camera_ids)
+        if options.resume:
+            folder.check_config(settings, but=("resume", "overwrite", "debug", "out"))
+        folder.write_config(settings)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
-        scene, seconds["start"] = _start(recording, first, mask, options.tracker, console, notes)
-        tracking = follow(scene, first, recording.tracked, options.tracker, console)
+        after = None
+        if options.resume:
+            tracking, after = load(folder.resume, first, options.tracker)
+            notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
+        else:
+            scene, seconds["start"] = _start(recording, first, mask, options.tracker, console, notes)
+            tracking = begin(scene)
+        saver = Saver(folder.resume, tracking.resumed)
+        how = {"budget_ms": options.budget_ms, "after": after, "saved": saver}
+        tracking = follow(tracking, first, recording.tracked, options.tracker, console, **how)
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
         _say_if_stopped(tracking, recording, notes)
-        found, report, failed = _judge(folder, tracking, recording, mask, seconds, notes, console)
+        found, report, failed = _judge(
+            folder, tracking, recording, mask, seconds, notes, console, options.budget_ms
+        )
         seconds["total"] = perf_counter() - begun
         found |= {"seconds": seconds, "notes": notes.all}
         folder.write_metrics(found)
         write_run_report(folder, found, **report)
+        if found["complete"]:
+            folder.forget_resume()
     print_summary(folder, found)
     if isinstance(tracking.stopped, KeyboardInterrupt):
         return 130
@@ -154,6 +174,7 @@ def _judge(
     seconds: dict[str, float],
     notes: Notes,
     console: Console,
+    budget_ms: float | None,
 ) -> tuple[dict[str, Any], dict[str, Any], Exception | None]:
     """Render and score what was tracked. Ctrl-C or an error ends it; what was scored until then counts.
 
@@ -180,7 +201,7 @@ def _judge(
     motion = score_motion(tracking, recording)
     names = object_names(tracking, recording, mask, values)
     seconds["evaluation"] = perf_counter() - begun
-    found = _what_ran(tracking, recording, mask, scores)
+    found = _what_ran(tracking, recording, mask, scores, budget_ms)
     found |= metrics(tracking, recording, mask, scores, motion, values)
     _note_what_is_missing(found, tracking, recording, mask, values, notes)
     report = {
@@ -190,7 +211,22 @@ def _judge(
     return found, report, failed
 
 
-def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores) -> dict[str, Any]:
+def _budget(tracking: Tracking, budget_ms: float | None) -> dict[str, Any] | None:
+    """What a budget led to."""
+    if budget_ms is None or tracking.chosen is None:
+        return None
+    updates = 1e3 * np.asarray(tracking.update_s[1:])
+    return {
+        "ms": budget_ms,
+        **budget_metrics(tracking.chosen),
+        "late": int((updates > budget_ms).sum()),
+        "everywhere": tracking.everywhere,
+    }
+
+
+def _what_ran(
+    tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
+) -> dict[str, Any]:
     """The part of metrics.json that says what ran, and how fast."""
     ids, updates = recording.tracked.frame_ids, np.asarray(tracking.update_s[1:]) * 1e3
     stopped = tracking.stopped
@@ -217,6 +253,7 @@ def _what_ran(tracking: Tracking, recording: Recording, mask: FirstMask, scores:
             "median": float(np.median(updates)) if len(updates) else None,
             "p95": float(np.percentile(updates, 95)) if len(updates) else None,
         },
+        "budget": _budget(tracking, budget_ms),
         "plans": tracking.plans,
         "updates_skipped": tracking.skipped,
         "machine": describe_machine(),

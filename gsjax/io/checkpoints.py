@@ -81,6 +81,15 @@ def load_checkpoint(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str
     return jax.tree.unflatten(structure, merged), header["metadata"]
 
 
+def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
+    """The metadata that was saved at `path`.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    return _read(Path(path))[1]["metadata"]
+
+
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the header of a checkpoint whose checksum is right."""
     try:

@@ -36,13 +36,12 @@ def unfitted(frame, mask, mask_camera, config):
     return start_scene(frame, mask, mask_camera, replace(config, start=start))
 
 
-def standing_still(scene, first, frames, config):
+def standing_still(scene, first, frames, config, **how):
     """`track` for objects that never move."""
     for _ in frames:
         seen = np.ones(scene.num_objects, bool)
-        yield Tracked(
-            scene, first_pose(scene), None, {"visible": seen, "joined": 0, "skipped": False}, 0.01, 0.0, None
-        )
+        info = {"visible": seen, "joined": 0, "skipped": False}
+        yield Tracked(scene, first_pose(scene), None, info, 0.01, 0.0, None, 0)
 
 
 @pytest.fixture

@@ -334,9 +334,13 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
     points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
     visible = jnp.array([True, True, True])
     watches = [
-        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.zeros(3)), visible, [1]),
-        (Watch(jnp.full(3, 0.3), jnp.array([0.0, 5.0, 100.0])), visible, [2]),
-        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.array([2.0, 0.0, 0.0])), ~visible.at[0].set(False), [0]),
+        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.zeros(3), jnp.ones(3)), visible, [1]),
+        (Watch(jnp.full(3, 0.3), jnp.array([0.0, 5.0, 100.0]), jnp.ones(3)), visible, [2]),
+        (
+            Watch(jnp.array([0.3, 0.1, 0.3]), jnp.array([2.0, 0.0, 0.0]), jnp.ones(3)),
+            ~visible.at[0].set(False),
+            [0],
+        ),
     ]
     for watch, there, expected in watches:
         one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
@@ -349,7 +353,9 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
 
 def test_a_watch_knows_what_is_usual_and_who_waits():
     watch = first_watch(2)
-    for _ in range(60):
-        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]))
+    for t in range(60):
+        shown = jnp.array([t, 60.0 - t])
+        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]), shown)
     np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
     np.testing.assert_allclose(watch.waited, [60, 0])
+    np.testing.assert_allclose(watch.largest, [59, 60])

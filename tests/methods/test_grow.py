@@ -83,7 +83,7 @@ def test_a_scene_that_explains_all_grows_little(table, started, plan):
     frame = table()[1][0]
     scene, _ = grown(with_slots(started, 256), frame, plan)
     shown = shown_by(render_labels(started, first_pose(started), frame, plan))
-    assert np.asarray(unexplained(shown, frame, CONFIG)).mean() < 0.02
+    assert np.asarray(unexplained(shown, frame.depths, CONFIG)).mean() < 0.02
     assert 256 - int(empty_slots(scene).sum()) <= 32
 
 

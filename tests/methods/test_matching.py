@@ -188,7 +188,5 @@ def test_what_the_picture_does_not_show_of_a_template_does_not_count():
     (color, value), (image, _) = blob(start), blob(start + shift)
     depths = jnp.full((1, HEIGHT, WIDTH), 1.1)
     weights = jnp.asarray(value > 0.1, jnp.float32)[None, ..., None]
-    match = match_templates(
-        Template(jnp.asarray(color)[None], depths, weights), frame(image[None]), CONFIG
-    )
+    match = match_templates(Template(jnp.asarray(color)[None], depths, weights), frame(image[None]), CONFIG)
     np.testing.assert_allclose(match.shift[0, 0], shift, atol=0.3)

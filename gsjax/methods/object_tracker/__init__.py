@@ -25,7 +25,7 @@ from gsjax.methods.object_tracker.tracker import (
     object_tracker,
     plan_tracker,
 )
-from gsjax.methods.object_tracker.tracking import Tracked, start_scene, track
+from gsjax.methods.object_tracker.tracking import Tracked, first_state, start_scene, track
 
 __all__ = [
     "EMPTY",
@@ -43,6 +43,7 @@ __all__ = [
     "TrackerPlan",
     "TrackerState",
     "first_pose",
+    "first_state",
     "object_tracker",
     "place",
     "plan_tracker",

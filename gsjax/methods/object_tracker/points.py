@@ -114,6 +114,12 @@ def first_members(
     return jnp.asarray(visit)[found & jnp.uint32((1 << bits) - 1)], real
 
 
+def pixel_counts(labels: Int[Array, "c h w"], num_groups: int) -> Float[Array, "k"]:
+    """How many pixels show each group 1..K, all cameras together."""
+    groups = jnp.arange(1, num_groups + 1)
+    return jax.vmap(lambda group: (labels == group).sum(dtype=float))(groups)
+
+
 def pixels_of_groups(
     sight: Sight,
     labels: Int[Array, "c h w"],

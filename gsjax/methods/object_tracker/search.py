@@ -125,16 +125,26 @@ class Watch(NamedTuple):
 
     usual: Float[Array, "k"]  # residual of late
     waited: Float[Array, "k"]  # frames since it was last looked for everywhere
+    largest: Float[Array, "k"]  # pixels that showed it when it was seen best, all cameras together
 
-    def after(self, residuals: Float[Array, "k"], looked_for: Bool[Array, "k"]) -> "Watch":
-        """One frame later."""
+    def after(
+        self, residuals: Float[Array, "k"], looked_for: Bool[Array, "k"], shown: Float[Array, "k"]
+    ) -> "Watch":
+        """One frame later.
+
+        Args:
+            residuals: as in `Found`.
+            looked_for: which groups were looked for everywhere.
+            shown: pixels that showed each group.
+        """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
-        return Watch(usual, jnp.where(looked_for, 0.0, self.waited + 1.0))
+        waited = jnp.where(looked_for, 0.0, self.waited + 1.0)
+        return Watch(usual, waited, jnp.maximum(self.largest, shown))
 
 
 def first_watch(num_groups: int) -> Watch:
     """Before the first frame."""
-    return Watch(jnp.full(num_groups, 0.1), jnp.zeros(num_groups))
+    return Watch(jnp.full(num_groups, 0.1), jnp.zeros(num_groups), jnp.zeros(num_groups))
 
 
 def search(

@@ -31,6 +31,7 @@ from gsjax.methods.object_tracker.points import (
     faded,
     first_keyframe,
     join,
+    pixel_counts,
     pixels_of_groups,
     renewed,
     sample_groups,
@@ -55,7 +56,9 @@ from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered, plan_render, render
 
-_MIN_SEEN = 0.02  # share of a group's Gaussians that must be seen somewhere for it to be moved
+# Pixels that must show a group for it to be moved: fewer cannot decide six numbers. So many are enough, and
+# this share of what there once were, for what is small.
+_ENOUGH_PIXELS, _MIN_SHARE = 200, 0.2
 
 
 class TrackerState(NamedTuple):
@@ -96,6 +99,7 @@ class _Last(NamedTuple):
     """The last scene, before it has moved."""
 
     seen: Float[Array, "c m"]  # 1 for each moving Gaussian that a camera saw
+    shown: Float[Array, "k"]  # pixels of each group, all cameras together
     template: Template | None
     rendered: Rendered | None  # where the whole scene was drawn
 
@@ -156,16 +160,18 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             assert state.shown is not None
             assert state.backdrop is not None
             seen = seen_from(scene, params, state.shown, state.backdrop.cameras, gap)
+            count = pixel_counts(state.shown.labels, num_objects)
             if state.images is None:
-                return _Last(seen, None, None)
+                return _Last(seen, count, None, None)
             weights = jax.nn.one_hot(state.shown.labels - 1, num_objects)
-            return _Last(seen, Template(state.images, state.shown.depths, weights), None)
+            return _Last(seen, count, Template(state.images, state.shown.depths, weights), None)
         last = render_labels(scene, params, frame, plan.full, one_sided=True)
         assert last.features is not None
         mostly = last.features.max(-1) > 0.5
         labels = jnp.where(mostly, jnp.argmax(last.features, axis=-1), 0).astype(jnp.int32)
         seen = seen_from(scene, params, Shown(labels, last.depths, mostly), frame.cameras, gap)
-        return _Last(seen, Template(last.colors, last.depths, last.features[..., 1:]), last)
+        count = pixel_counts(labels, num_objects)
+        return _Last(seen, count, Template(last.colors, last.depths, last.features[..., 1:]), last)
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan, everywhere = batch
@@ -174,7 +180,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         sight = sight_of(frame, config.align.shading)
 
         last = look_back(params, state, batch)
-        visible = group_means(last.seen.max(0), groups, num_objects) > _MIN_SEEN
+        enough = _ENOUGH_PIXELS / config.coarseness**2
+        visible = last.shown > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)
         jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
@@ -231,7 +238,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, looked_for)
+        watch = state.watch.after(residual, looked_for, last.shown)
         new_state = TrackerState(kept, pixels, keyframe, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {

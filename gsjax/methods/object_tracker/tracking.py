@@ -87,6 +87,13 @@ def _first_state(pose, batch, config: TrackerConfig, num_objects: int):
     return object_tracker(config, num_objects, batch).init(pose)
 
 
+def first_state(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> TrackerState:
+    """What the first frame leaves behind, for `pose`, which it shows."""
+    first, _ = without_broken(part_of(first, config.cameras, config.shrink))
+    plan = plan_tracker(scene, pose, first, config)
+    return _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
+
+
 @partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
 def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
     frame, broken = without_broken(part_of(batch.frame, config.cameras, config.shrink))
@@ -124,8 +131,7 @@ def track(
     config: TrackerConfig | None = None,
     *,
     budget_ms: float | None = None,
-    pose: Pose | None = None,
-    state: TrackerState | None = None,
+    after: Tracked | None = None,
 ) -> Iterator[Tracked]:
     """Follow the objects of `scene` through `frames` (those after the first one), one `Tracked` a frame.
 
@@ -139,7 +145,7 @@ def track(
         config: see `TrackerConfig`.
         budget_ms: what an update may take, milliseconds. The richest settings that keep to it are then chosen
             by measured cost, and of `config` only what says how a scene starts is used (see `budget`).
-        pose, state: where to go on from, with the same `Tracked`'s scene; the first frame unless given.
+        after: the update to go on from, with its scene, state and settings; the first frame unless given.
 
     Raises:
         ValueError: a frame has other shapes than the first one, or the budget is not above 0.
@@ -147,17 +153,21 @@ def track(
     config = TrackerConfig() if config is None else config
     if budget_ms is not None and not budget_ms > 0:
         raise ValueError(f"budget_ms: expected milliseconds above 0, found {budget_ms}")
-    if pose is None:
+    chosen = None
+    if after is not None:
+        scene, pose, chosen = after.scene, after.pose, after.chosen
+    else:
         if config.grow.slots and first.depths is not None:
             scene = with_slots(scene, config.grow.slots)
         pose = first_pose(scene)
-    count, chosen, governor = scene.num_objects, None, None
+    count, governor = scene.num_objects, None
     if budget_ms is not None:
-        measure = partial(_measured, scene, pose, first)
-        chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
+        if chosen is None:
+            measure = partial(_measured, scene, pose, first)
+            chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
         config, governor = chosen.config, Governor(budget_ms / 1e3, chosen.costs, count)
     run = _Runner(scene, pose, first, config)
-    state = run.first_state(scene, pose) if state is None else state
+    state = first_state(scene, pose, first, config) if after is None else after.state
     usually = count if config.align.everywhere is None else min(config.align.everywhere, count)
     for index, frame in enumerate(frames):
         _check_alike(frame, first, index + 1)
@@ -177,16 +187,10 @@ class _Runner:
     def __init__(self, scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig):
         first, _ = without_broken(part_of(first, config.cameras, config.shrink))
         self.plan = plan_tracker(scene, pose, first, config)
-        self._first, self._config = first, config
+        self._config = config
         reduction = _reduction(scene, first, config)
         self._static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
         self._compiled: dict[TrackerPlan, Any] = {}
-
-    def first_state(self, scene: TrackedScene, pose: Pose) -> TrackerState:
-        """What the first frame leaves behind."""
-        return _first_state(
-            pose, TrackerBatch(scene, self._first, self.plan), self._config, scene.num_objects
-        )
 
     def __call__(self, scene, pose, state, frame: Frame, index: int, everywhere: int):
         """What `_update` gives, the seconds that it took, and those of compiling."""
@@ -210,7 +214,7 @@ class _Runner:
 def _measured(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> Costs:
     """What updates cost: on the first frame again, which changes nothing."""
     run, count = _Runner(scene, pose, first, config), scene.num_objects
-    state = run.first_state(scene, pose)
+    state = first_state(scene, pose, first, config)
 
     def median(everywhere: int) -> float:
         return float(np.median([run(scene, pose, state, first, 0, everywhere)[1] for _ in range(_TRIALS)]))
