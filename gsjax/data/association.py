@@ -47,8 +47,8 @@ def associate(
         raise DataError(path, expected, found, "Check that all times are of one clock, or raise max_skew.")
     if not usable.all():
         missed = zip(streams, far.sum(axis=0), skews.max(axis=0), strict=True)
-        said = [f"{count} have no {name} (up to {1e3 * w:.0f} ms away)" for name, count, w in missed if count]
-        message = f"{path}: {np.sum(~usable)} of {len(usable)} frames are left out; {limit} {', '.join(said)}"
+        said = [f"{count} without {name} (up to {1e3 * w:.0f} ms off)" for name, count, w in missed if count]
+        message = f"{path}: {np.sum(~usable)} of {len(usable)} frames are left out, {', '.join(said)} {limit}"
         warnings.warn(message, DataWarning, stacklevel=3)
     return nearest[usable]
 

@@ -65,7 +65,7 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
     files = {"image": images, "depth": depths}
     K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
     return Sequence(
-        name=root.resolve().name,
+        name=_name(root.resolve()),
         camera_ids=(0,),
         width=WIDTH,
         height=HEIGHT,
@@ -77,6 +77,11 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
         load_depth=load_depth,
         locate=lambda kind, t, c: str(files[kind][t]),
     )
+
+
+def _name(root: Path) -> str:
+    """The folder's, and that of the scene where the folder is one of its sequences."""
+    return f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
 
 
 def _seen_by_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
@@ -118,13 +123,13 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
             poses.append(pose)
             images.append(image)
             depths.append(depth)
-    said = [f"{lost} have no finite pose"] * bool(lost) + [f"{missing} lack an image"] * bool(missing)
+    said = [f"{lost} without a finite pose"] * bool(lost) + [f"{missing} without an image"] * bool(missing)
     if not numbers:
         found = f"none of {len(names)}: {', '.join(said)}"
         advice = "Check the folder; was it copied whole?"
         raise DataError(root, "a frame with pose, colour and depth", found, advice)
     if said:
-        message = f"{root}: {lost + missing} of {len(names)} frames are left out; {', '.join(said)}"
+        message = f"{root}: {lost + missing} of {len(names)} frames are left out, {', '.join(said)}"
         warnings.warn(message, DataWarning, stacklevel=3)
     return numbers, np.stack(poses), images, depths
 

@@ -88,13 +88,13 @@ def test_frames_of_which_a_camera_is_too_late_are_counted_and_left_out(folder):
     times = np.arange(20) * 0.02
     late = np.where(np.arange(19) < 5, times[1:], times[1:] + 0.4 + MAX_SKEW_S)  # a pause after the fifth
     folder.write_record("b", late)
-    with pytest.warns(DataWarning, match=r"13 of 20 frames are left out; within 30 ms 13 have no b.mp4"):
+    with pytest.warns(DataWarning, match=r"13 of 20 frames are left out, 13 without b.mp4 .* within 30 ms"):
         sequence = read_push_t(folder.root)
     assert sequence.frame_ids == tuple(range(7))
     np.testing.assert_allclose(sequence.times, times[:7])
     assert [level(sequence.image(t, 1)) for t in range(7)] == [0, 0, 1, 2, 3, 4, 4]
     assert sequence.Ks.shape == (7, 2, 3, 3)
-    with pytest.warns(DataWarning, match=r"15 of 20 frames are left out; within 15 ms"):
+    with pytest.warns(DataWarning, match=r"15 of 20 frames are left out.* within 15 ms"):
         assert read_push_t(folder.root, max_skew=0.015).frame_ids == (1, 2, 3, 4, 5)
 
 

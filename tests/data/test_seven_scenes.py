@@ -55,6 +55,7 @@ def test_frames_times_and_poses(folder):
     assert (sequence.num_cameras, sequence.width, sequence.height) == (1, 640, 480)
     assert sequence.image(2, 0)[0, 0, 2] > 200  # blue, from the one that is a JPEG
     assert not sequence.has_masks
+    assert sequence.name == f"{folder.parent.name}_seq-01"
 
 
 def test_the_depth_camera_as_the_files_have_it(folder):
@@ -100,19 +101,19 @@ def test_a_point_seen_by_the_depth_camera_has_the_same_place_in_the_world(folder
 @pytest.mark.parametrize("number", ["nan", "-inf", "-1.#IND0000e+000", "1.#QNAN00e+000"])
 def test_frames_without_a_pose_are_counted_and_left_out(folder, number):
     (folder / "frame-000001.pose.txt").write_text("\n".join([" ".join([number] * 4)] * 4))
-    with pytest.warns(DataWarning, match="1 of 4 frames are left out; 1 have no finite pose"):
+    with pytest.warns(DataWarning, match="1 of 4 frames are left out, 1 without a finite pose"):
         assert read_seven_scenes(folder).frame_ids == (0, 2, 5)
 
 
 def test_frames_without_an_image_are_counted_and_left_out(folder):
     (folder / "frame-000000.depth.png").unlink()
     (folder / "frame-000005.color.png").unlink()
-    with pytest.warns(DataWarning, match="2 of 4 frames are left out; 2 lack an image"):
+    with pytest.warns(DataWarning, match="2 of 4 frames are left out, 2 without an image"):
         sequence = read_seven_scenes(folder)
     assert sequence.frame_ids == (1, 2)
     for file in folder.glob("*.depth.png"):
         file.unlink()
-    with pytest.raises(DataError, match="a frame with pose, colour and depth, found none of 4: 4 lack an im"):
+    with pytest.raises(DataError, match="a frame with pose, colour and depth, found none of 4: 4 wi"):
         read_seven_scenes(folder)
 
 

@@ -101,7 +101,9 @@ def test_a_stamp_that_occurs_twice(folder):
 def test_frames_without_depth_or_pose_are_counted_and_left_out(folder):
     folder.depths = {stamp: file for stamp, file in folder.depths.items() if file != "depth/1.png"}
     folder.poses = {stamp: pose for stamp, pose in folder.poses.items() if stamp < START + 0.135}
-    with pytest.warns(DataWarning, match=r"2 of 6 .* within 20 ms 1 have no depth \(.*, 1 have no pose \("):
+    with pytest.warns(
+        DataWarning, match=r"2 of 6 .*, 1 without depth \(.*, 1 without pose \(.* within 20 ms"
+    ):
         sequence = folder.read()
     assert sequence.frame_ids == (0, 2, 3, 4)
     assert [float(sequence.depth(t, 0)[0, 0]) for t in range(4)] == pytest.approx([1.0, 1.2, 1.3, 1.4])
