@@ -42,8 +42,8 @@ def associate(
     if not usable.any():
         t, s = np.unravel_index(np.argmax(far), far.shape)
         expected = f"something {limit} of each frame in every stream"
-        nothing = f"{list(streams)[s]} has nothing within {skews[t, s]:.3g} s"
-        found = f"no such frame: at {first[t]:.3f} s {nothing}"
+        whose = f"the nearest {list(streams)[s]} is {skews[t, s]:.4g} s away"
+        found = f"no such frame: at {first[t]:.3f} s {whose}"
         raise DataError(path, expected, found, "Check that all times are of one clock, or raise max_skew.")
     if not usable.all():
         missed = zip(streams, far.sum(axis=0), skews.max(axis=0), strict=True)

@@ -50,7 +50,7 @@ def test_the_warning_names_the_stream_that_was_missing():
 
 
 def test_clocks_that_never_meet():
-    with pytest.raises(DataError, match=r"no such frame: at 0.000 s b has nothing within 100 s.*one clock"):
+    with pytest.raises(DataError, match=r"no such frame: at 0.000 s the nearest b is 100 s away.*one clock"):
         associate(ROOT, {"a": np.arange(3.0), "b": np.arange(3.0) + 100}, 0.02)
 
 

@@ -114,7 +114,7 @@ def test_frames_without_depth_or_pose_are_counted_and_left_out(folder):
 
 def test_clocks_that_never_meet(folder):
     folder.depths = {stamp + 60: file for stamp, file in folder.depths.items()}
-    with pytest.raises(DataError, match=r"depth has nothing within 60 s.*one clock"):
+    with pytest.raises(DataError, match=r"the nearest depth is 60 s away.*one clock"):
         folder.read()
 
 
