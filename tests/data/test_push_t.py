@@ -100,7 +100,7 @@ def test_frames_of_which_a_camera_is_too_late_are_counted_and_left_out(folder):
 
 def test_cameras_that_never_meet(folder):
     folder.write_record("b", np.delete(np.arange(20) * 0.02, 1) + 10)
-    with pytest.raises(DataError, match=r"videos: expected .* within 30 ms .* the nearest b.mp4 is 10 s away"):
+    with pytest.raises(DataError, match=r"videos: .* within 30 ms .* the nearest b.mp4 is 10 s away"):
         read_push_t(folder.root)
 
 
