@@ -6,7 +6,7 @@ frame-NUMBER.pose.txt      4x4, camera to world, OpenCV axes, of the depth camer
 camera-intrinsics.txt      3x3, in some copies: the depth camera's
 
 The two cameras are not registered: a pixel of colour and the same pixel of depth show different things, up
-to 30 pixels apart. The release gives intrinsics for the depth camera alone (585 pixels, in the middle of the
+to 40 pixels apart. The release gives intrinsics for the depth camera alone (585 pixels, in the middle of the
 image). The colour camera's here are what the Kinect's maker set: 525 pixels, in the middle, and 25 mm beside
 the depth camera. Depth edges of the kitchen then lie on edges of colour, to a pixel or two.
 """
