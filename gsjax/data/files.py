@@ -54,6 +54,16 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image in pixels.
+
+    Raises:
+        DataError: the file is missing, cut off, or not an image.
+    """
+    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    return width, height
+
+
 def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
     """An 8-bit colour image, RGB.
 

@@ -8,15 +8,20 @@ from gsjax.data.errors import DataError
 from gsjax.data.panoptic import read_panoptic
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
+from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import tabletop
+from gsjax.data.tum import read_tum
 
 SIMULATED_PREFIX = "simulated:"
 SIMULATED_SCENES = {"tabletop": tabletop}
 
-# What only a folder of that layout has, and its reader.
+# What only a folder of that layout has (* stands for anything), and its reader.
 _LAYOUTS = {
     "train_meta.json": ("Panoptic", read_panoptic),
     "sample_demos": ("push-T", read_push_t),
+    "rgb.txt": ("TUM RGB-D", read_tum),
+    "frame-*.pose.txt": ("7-Scenes", read_seven_scenes),
+    "seq-*": ("7-Scenes", read_seven_scenes),
 }
 
 
@@ -40,7 +45,7 @@ def open_sequence(path: str | Path) -> Sequence:
             root, "a folder with a recording", found, f"Give its folder, or a built-in scene: {known}."
         )
     for mark, (_, read) in _LAYOUTS.items():
-        if (root / mark).exists():
+        if next(root.glob(mark), None):
             return read(root)
     marks = ", ".join(f"{mark} ({layout} layout)" for mark, (layout, _) in _LAYOUTS.items())
     names = sorted(entry.name for entry in root.iterdir())

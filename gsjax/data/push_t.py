@@ -11,9 +11,10 @@ objects/tblock.json                     the T-block as Gaussians in its own fram
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from gsjax.data.association import associate
 from gsjax.data.errors import DataError
 from gsjax.data.files import read_arrays, read_json
 from gsjax.data.sequence import PointModel, Sequence
@@ -22,23 +23,28 @@ from gsjax.geometry.cameras import viewmat_from_opengl
 from gsjax.geometry.neighbors import neighbor_spacing
 
 MAX_SKEW_S = 0.03
-"""Images farther apart in time than this are no pair: an object at 1 m/s would move by 3 cm."""
+"""How far apart in time the images of one frame may be: an object at 1 m/s would move by 3 cm."""
 
 GROUND_COLOR = 0.5
 GROUND_THICKNESS_M = 0.001
 BLOCK_LABEL = 1
 
+# RealSense counts pixel centres at integers.
+_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
-def read_push_t(path: str | Path, demo: int = 0) -> Sequence:
+
+def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S) -> Sequence:
     """Demonstration `demo` of a push-T folder. Cameras count from 0 in the order of cameras.json.
 
-    The frames are those of the first camera; each other camera gives its image nearest in time. Times are the
-    recording's own, in seconds. `models` holds the ground (static) and the T-block (whose pose is unknown).
+    The frames are those of the first camera; each other camera gives its image nearest in time. A frame of
+    which a camera has no image within `max_skew` seconds is left out, with a DataWarning that counts them.
+    Times are the recording's own, in seconds. `models` holds the ground (static) and the T-block (whose pose
+    is unknown).
 
     Raises:
-        DataError: a file is missing or bad, a video has another number of frames than timestamps, or no image
-            of a camera lies within MAX_SKEW_S of a frame.
-        ValueError: a pose is no rigid motion, or timestamps do not increase.
+        DataError: a file is missing or bad, a video has another number of frames than timestamps, timestamps
+            do not increase, or no frame has an image of every camera within `max_skew`.
+        ValueError: a pose is no rigid motion.
     """
     root = Path(path)
     folder = root / "sample_demos" / str(demo)
@@ -57,41 +63,22 @@ def read_push_t(path: str | Path, demo: int = 0) -> Sequence:
             found = f"{videos[-1].width}x{videos[-1].height}"
             expected = f"{videos[0].width}x{videos[0].height} as in the first camera"
             raise DataError(record, expected, found, "Bring all videos to one size, and K with them.")
-    pairs = np.stack(
-        [_pair(video.path, stamps[0], own) for video, own in zip(videos, stamps, strict=True)], 1
-    )
-    frames = len(stamps[0])
+    clocks = {video.path.name: own for video, own in zip(videos, stamps, strict=True)}
+    pairs = associate(folder / "videos", clocks, max_skew)
+    frames = len(pairs)
     return Sequence(
         name=f"{root.resolve().name}_{demo}",
         camera_ids=tuple(range(len(videos))),
         width=videos[0].width,
         height=videos[0].height,
-        times=stamps[0],
-        frame_ids=tuple(range(frames)),
+        times=stamps[0][pairs[:, 0]],
+        frame_ids=tuple(pairs[:, 0].tolist()),
         Ks=np.broadcast_to(np.stack(Ks), (frames, len(videos), 3, 3)),
         viewmats=np.broadcast_to(viewmat_from_opengl(np.asarray(poses)), (frames, len(videos), 4, 4)),
         load_image=lambda t, c: videos[c].frame(int(pairs[t, c])),
         models=_read_models(root),
         locate=lambda kind, t, c: f"{videos[c].path}, {kind} {pairs[t, c]}",
     )
-
-
-# RealSense counts pixel centres at integers.
-_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-
-
-def _pair(path: Path, reference: Float[np.ndarray, "t"], own: Float[np.ndarray, "s"]) -> Int[np.ndarray, "t"]:
-    """Index of the image nearest in time to each reference time."""
-    if len(own) == 0:
-        raise DataError(path, "timestamps", "none", "Leave out that camera.")
-    nearest = np.abs(own[None] - reference[:, None]).argmin(axis=1)
-    skew = np.abs(own[nearest] - reference)
-    if skew.max() > MAX_SKEW_S:
-        t = int(skew.argmax())
-        expected = f"an image within {MAX_SKEW_S * 1e3:.0f} ms of frame {t} ({reference[t]:.3f} s)"
-        found = f"the nearest {skew[t] * 1e3:.0f} ms away"
-        raise DataError(path, expected, found, "Cut the recording, or leave out that camera.")
-    return nearest
 
 
 def _read_models(root: Path) -> tuple[PointModel, ...]:

@@ -63,6 +63,12 @@ def test_unknown_built_in_scene(refused):
     assert "no built-in scene 'kitchen'; there are: tabletop" in refused("simulated:kitchen")
 
 
+def test_folder_of_several_sequences(refused, tmp_path):
+    (tmp_path / "kitchen" / "seq-01").mkdir(parents=True)
+    said = refused(tmp_path / "kitchen")
+    assert "expected the frames of one sequence, found the sequences seq-01. Give one of them" in said
+
+
 def test_missing_image(refused, recording):
     (recording / "ims" / "1" / "000002.png").unlink()
     assert "000002.png: expected an image of all 3 cameras in frame 2" in refused(recording)

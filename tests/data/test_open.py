@@ -42,6 +42,6 @@ def test_folders_that_fit_no_layout(tmp_path):
         open_sequence(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize(("name", "cameras"), [("tabletop_0", 3), ("push_t", 3)])
+@pytest.mark.parametrize(("name", "cameras"), [("tabletop_0", 3), ("push_t", 3), ("seven_scenes_kitchen", 1)])
 def test_recordings_are_recognised(shared_data, name, cameras):
     assert open_sequence(shared_data / name).num_cameras == cameras

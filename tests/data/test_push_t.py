@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, read_push_t
+from gsjax.data import DataError, DataWarning, read_push_t
 from gsjax.data.push_t import MAX_SKEW_S
 from gsjax.data.video import Video
 
@@ -84,11 +84,23 @@ def test_conventions_are_those_of_the_package(folder):
     np.testing.assert_allclose(sequence.viewmats[0, 0] @ [1, 3, 2, 1], [0, -1, 1, 1], atol=1e-12)
 
 
-def test_images_too_far_apart_in_time_are_no_pair(folder):
-    folder.write_record("b", np.delete(np.arange(20) * 0.02, 1) + 0.02 + MAX_SKEW_S)
-    with pytest.raises(
-        DataError, match=r"b.mp4: expected an image within 30 ms of frame 0 .*the nearest 50 ms"
-    ):
+def test_frames_of_which_a_camera_is_too_late_are_counted_and_left_out(folder):
+    times = np.arange(20) * 0.02
+    late = np.where(np.arange(19) < 5, times[1:], times[1:] + 0.4 + MAX_SKEW_S)  # a pause after the fifth
+    folder.write_record("b", late)
+    with pytest.warns(DataWarning, match=r"13 of 20 frames are left out, 13 without b.mp4 .* within 30 ms"):
+        sequence = read_push_t(folder.root)
+    assert sequence.frame_ids == tuple(range(7))
+    np.testing.assert_allclose(sequence.times, times[:7])
+    assert [level(sequence.image(t, 1)) for t in range(7)] == [0, 0, 1, 2, 3, 4, 4]
+    assert sequence.Ks.shape == (7, 2, 3, 3)
+    with pytest.warns(DataWarning, match=r"15 of 20 frames are left out.* within 15 ms"):
+        assert read_push_t(folder.root, max_skew=0.015).frame_ids == (1, 2, 3, 4, 5)
+
+
+def test_cameras_that_never_meet(folder):
+    folder.write_record("b", np.delete(np.arange(20) * 0.02, 1) + 10)
+    with pytest.raises(DataError, match=r"videos: .* within 30 ms .* the nearest b.mp4 is 10 s away"):
         read_push_t(folder.root)
 
 
@@ -129,7 +141,7 @@ def test_a_video_of_another_size_or_shorter_than_it_says(folder):
 
 def test_recordings_without_cameras_or_timestamps(folder):
     folder.write_record("b", [])
-    with pytest.raises(DataError, match=r"b.mp4: expected timestamps, found none"):
+    with pytest.raises(DataError, match=r"expected times of b.mp4, found none"):
         read_push_t(folder.root)
     folder.cameras = {}
     folder.write_cameras()
@@ -137,9 +149,10 @@ def test_recordings_without_cameras_or_timestamps(folder):
         read_push_t(folder.root)
 
 
-def test_timestamps_that_go_back(folder):
-    folder.write_record("a", [0.0, 0.02, 0.01, *np.arange(3, 20) * 0.02])
-    with pytest.raises(ValueError, match=r"frame 2 is at 0.01 s"):
+@pytest.mark.parametrize(("camera", "count"), [("a", 20), ("b", 19)])
+def test_timestamps_that_go_back(folder, camera, count):
+    folder.write_record(camera, [0.0, 0.02, 0.01, *np.arange(3, count) * 0.02])
+    with pytest.raises(DataError, match=rf"times of {camera}.mp4 that increase, found frame 2 is at 0.01 s"):
         read_push_t(folder.root)
 
 

@@ -1,0 +1,159 @@
+"""7-Scenes (Shotton et al. 2013): one moving Kinect with depth, poses by KinectFusion.
+
+frame-NUMBER.color.png     640x480, or .jpg
+frame-NUMBER.depth.png     uint16 millimetres, 0 and 65535 = invalid
+frame-NUMBER.pose.txt      4x4, camera to world, OpenCV axes, of the depth camera
+camera-intrinsics.txt      3x3, in some copies: the depth camera's
+
+The two cameras are not registered: a pixel of colour and the same pixel of depth show different things, up
+to 40 pixels apart. The release gives intrinsics for the depth camera alone (585 pixels, in the middle of the
+image). The colour camera's here are what the Kinect's maker set: 525 pixels, in the middle, and 25 mm beside
+the depth camera. Depth edges of the kitchen then lie on edges of colour, to a pixel or two.
+"""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import read_depth, read_image
+from gsjax.data.sequence import Sequence
+from gsjax.geometry.cameras import intrinsics
+
+RATE_HZ = 30.0
+WIDTH, HEIGHT = 640, 480
+DEPTH_FOCAL, COLOR_FOCAL = 585.0, 525.0
+BASELINE_M = 0.025
+"""How far the colour camera stands to the right of the depth camera."""
+
+_DEPTH_UNIT_M = 0.001
+_MICROSOFT_NAN = re.compile(r"-?\d\.#(?:IND|QNAN|SNAN|INF)\w*(?:[+-]\d+)?")
+_FRAME = re.compile(r"frame-(\d+)\.pose\.txt")
+
+
+def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
+    """The sequence in a folder of this layout (a seq-01 of a scene): one camera, 0, at 30 Hz by frame number.
+
+    Frames whose pose is not finite (tracking was lost) or whose images are missing are left out, with a
+    DataWarning that counts them.
+
+    Args:
+        path: the folder that holds frame-000000.pose.txt.
+        register: give the colour camera, with depth as it would see it: carried over point by point, nearer
+            before farther, and invalid where the depth camera saw nothing. False gives the depth camera with
+            the files as they are, for those who want depth alone or have registered colour themselves.
+
+    Raises:
+        DataError: the folder has no frame or holds several sequences, a pose has another form, or the
+            intrinsics in it are of another camera.
+        ValueError: a pose is no rigid motion.
+    """
+    root = Path(path)
+    _check_intrinsics(root / "camera-intrinsics.txt")
+    numbers, poses, images, depths = _read_frames(root)
+    frames = len(numbers)
+    from_depth = np.eye(4)
+    from_depth[0, 3] = -BASELINE_M if register else 0.0
+
+    def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
+        depth = read_depth(depths[t], _DEPTH_UNIT_M, WIDTH, HEIGHT)
+        return _seen_by_color(depth) if register else depth
+
+    files = {"image": images, "depth": depths}
+    K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
+    return Sequence(
+        name=_name(root.resolve()),
+        camera_ids=(0,),
+        width=WIDTH,
+        height=HEIGHT,
+        times=np.array(numbers) / RATE_HZ,
+        frame_ids=tuple(numbers),
+        Ks=np.broadcast_to(K, (frames, 1, 3, 3)),
+        viewmats=(from_depth @ np.linalg.inv(poses))[:, None],
+        load_image=lambda t, c: read_image(images[t], WIDTH, HEIGHT),
+        load_depth=load_depth,
+        locate=lambda kind, t, c: str(files[kind][t]),
+    )
+
+
+def _name(root: Path) -> str:
+    """The folder's, and that of the scene where the folder is one of its sequences."""
+    return f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
+
+
+def _seen_by_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Depth of the depth camera as the colour camera sees it; 0 where no point falls.
+
+    The colour camera's pixels are wider, so a surface that faces it has no holes.
+    """
+    rows, columns = np.nonzero(depth)
+    z = depth[rows, columns]
+    scale = COLOR_FOCAL / DEPTH_FOCAL
+    x = (columns + 0.5 - WIDTH / 2) * scale - COLOR_FOCAL * BASELINE_M / z + WIDTH / 2
+    y = (rows + 0.5 - HEIGHT / 2) * scale + HEIGHT / 2
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    inside = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+    nearest = np.full((HEIGHT, WIDTH), np.inf, np.float32)
+    np.minimum.at(nearest, (row[inside], column[inside]), z[inside])
+    return np.where(np.isfinite(nearest), nearest, np.float32(0))
+
+
+def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], list[Path], list[Path]]:
+    """Numbers, camera-to-world poses, colour and depth files of the usable frames, in order of number."""
+    names = [match for file in root.iterdir() if (match := _FRAME.fullmatch(file.name))]
+    if not names:
+        parts = sorted(part.name for part in root.glob("seq-*"))
+        found = f"the sequences {', '.join(parts)}" if parts else "no frame-NUMBER.pose.txt"
+        advice = f"Give one of them, as in {root / parts[0]}, unpacked." if parts else "Give its folder."
+        raise DataError(root, "the frames of one sequence", found, advice)
+    numbers, poses, images, depths, lost, missing = [], [], [], [], 0, 0
+    for match in sorted(names, key=lambda match: int(match[1])):
+        pose, stem = _read_matrix(root / match[0], 4), match[0].removesuffix(".pose.txt")
+        image = next((p for end in ("png", "jpg") if (p := root / f"{stem}.color.{end}").is_file()), None)
+        depth = root / f"{stem}.depth.png"
+        if not np.isfinite(pose).all():
+            lost += 1
+        elif image is None or not depth.is_file():
+            missing += 1
+        else:
+            numbers.append(int(match[1]))
+            poses.append(pose)
+            images.append(image)
+            depths.append(depth)
+    said = [f"{lost} without a finite pose"] * bool(lost) + [f"{missing} without an image"] * bool(missing)
+    if not numbers:
+        found = f"none of {len(names)}: {', '.join(said)}"
+        advice = "Check the folder; was it copied whole?"
+        raise DataError(root, "a frame with pose, colour and depth", found, advice)
+    if said:
+        message = f"{root}: {lost + missing} of {len(names)} frames are left out, {', '.join(said)}"
+        warnings.warn(message, DataWarning, stacklevel=3)
+    return numbers, np.stack(poses), images, depths
+
+
+def _read_matrix(path: Path, side: int) -> Float[np.ndarray, "side side"]:
+    """A square matrix of numbers in a text file; what Microsoft's compiler wrote for NaN is NaN."""
+    expected, advice = f"{side} lines of {side} numbers", "Fetch the file again, or remove that frame."
+    try:
+        lines = _MICROSOFT_NAN.sub("nan", path.read_text()).splitlines()
+        matrix = np.array([line.split() for line in lines if line.strip()], np.float64)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(path, expected, f"something else ({error})", advice) from None
+    if matrix.shape != (side, side):
+        raise DataError(path, expected, f"shape {matrix.shape}", advice)
+    return matrix
+
+
+def _check_intrinsics(path: Path) -> None:
+    """Other recordings come in this layout too, with the intrinsics of their camera."""
+    if not path.exists():
+        return
+    K = _read_matrix(path, 3)
+    known = intrinsics(DEPTH_FOCAL, WIDTH, HEIGHT)
+    if not np.allclose(K, known, atol=0.5):
+        expected = f"the depth camera of 7-Scenes, {known.tolist()}"
+        advice = "Another camera's recording can be given as arrays or as a Panoptic folder (docs/data.md)."
+        raise DataError(path, expected, f"{K.tolist()}", advice)

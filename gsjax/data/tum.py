@@ -1,0 +1,239 @@
+"""The TUM RGB-D benchmark (Sturm et al. 2012): one moving camera with depth, poses by motion capture.
+
+rgb.txt            lines "stamp rgb/STAMP.png", seconds; # begins a comment, in all three
+depth.txt          lines "stamp depth/STAMP.png": 16 bit, 5000 steps a metre, 0 = invalid; each pixel is the
+                   same pixel of the colour image
+groundtruth.txt    lines "stamp tx ty tz qx qy qz qw": camera to world, OpenCV axes, at its own rate
+"""
+
+import re
+import warnings
+from collections.abc import Sequence as Numbers
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+from gsjax.data.association import associate
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.sequence import Sequence
+from gsjax.geometry.distortion import undistort_map
+
+MAX_SKEW_S = 0.02
+"""The benchmark's own limit on how far apart in time colour, depth and pose of one frame may be."""
+
+DEPTH_UNIT_M = 1 / 5000
+"""The depth factor of the benchmark's files: metres of one step."""
+
+
+class _Calibration(NamedTuple):
+    """Intrinsics as the benchmark publishes them: fx, fy, cx, cy with pixel centres at integers."""
+
+    pinhole: tuple[float, float, float, float]
+    distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2, k3
+
+
+_CALIBRATIONS = {
+    1: _Calibration((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    2: _Calibration((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    3: _Calibration((535.4, 539.2, 320.1, 247.6), ()),  # its images come undistorted
+}
+_SIZE = (640, 480)
+_COMPLETE = "Check the folder; was it copied whole?"
+_UNIT_TOLERANCE = 0.01  # of a quaternion's length, which files write with four digits
+
+
+def read_tum(
+    path: str | Path,
+    K: Float[np.ndarray, "3 3"] | None = None,
+    distortion: Numbers[float] = (),
+    *,
+    max_skew: float = MAX_SKEW_S,
+    depth_unit_m: float = DEPTH_UNIT_M,
+) -> Sequence:
+    """The sequence in a folder of this layout: one camera, 0, whose frames are the colour images.
+
+    Colour, depth and poses run by their own clocks: each colour image takes the depth image nearest in time,
+    and the pose between the two that were measured before and after it (linear in place, along the shortest
+    turn), for at 1 rad/s the nearest of 100 Hz poses would be 2 to 3 pixels off. Frames for which depth or a
+    measured pose is farther than `max_skew` are left out, and so are those whose files are missing, second
+    lines of one stamp, and poses that are not finite: each with a DataWarning that counts them. Lines need
+    not be in order. Times are the stamps; `frame_ids` count the stamps of rgb.txt from 0.
+
+    Where the lens distorts (freiburg1 and 2), colour and depth are resampled to a pinhole camera of the same
+    K; what lies beyond the photograph is black and without depth.
+
+    Args:
+        path: the folder.
+        K: intrinsics with pixel centres at +0.5; those of the benchmark, which it has for freiburg1, 2 and 3
+            and which the folder's name tells apart, unless given.
+        distortion: with a K of your own, OpenCV's coefficients of the lens: none, 4, 5 or 8.
+        max_skew: seconds.
+        depth_unit_m: metres of one step of depth.
+
+    Raises:
+        DataError: a file is missing or has lines of another form, the name tells no camera, or no frame has
+            colour, depth and pose.
+    """
+    root = Path(path)
+    colors, depths = _Listed.read(root, "rgb.txt"), _Listed.read(root, "depth.txt")
+    stamps, poses = _read_poses(root / "groundtruth.txt")
+    clocks = {"colour": colors.stamps, "depth": depths.stamps, "pose": stamps}
+    matched = associate(root, clocks, max_skew)
+    images = [colors.paths[i] for i in matched[:, 0]]
+    depth_images = [depths.paths[i] for i in matched[:, 1]]
+    times = colors.stamps[matched[:, 0]]
+    width, height = image_size(images[0])
+    if K is None:
+        K, distortion = _published(root, images[0], (width, height))
+    lens = _Lens(K, distortion, width, height)
+    frames = len(times)
+    files = {"image": images, "depth": depth_images}
+    return Sequence(
+        name=root.resolve().name,
+        camera_ids=(0,),
+        width=width,
+        height=height,
+        times=times,
+        frame_ids=tuple(colors.numbers[matched[:, 0]].tolist()),
+        Ks=np.broadcast_to(K, (frames, 1, 3, 3)),
+        viewmats=np.linalg.inv(_poses_at(times, stamps, poses))[:, None],
+        load_image=lambda t, c: lens.straighten(read_image(images[t], width, height)),
+        load_depth=lambda t, c: lens.straighten(read_depth(depth_images[t], depth_unit_m, width, height)),
+        locate=lambda kind, t, c: str(files[kind][t]),
+    )
+
+
+class _Listed(NamedTuple):
+    """The files that a list names, in order of time, with their places in it."""
+
+    numbers: Int[np.ndarray, "n"]
+    stamps: Float[np.ndarray, "n"]
+    paths: list[Path]
+
+    @classmethod
+    def read(cls, root: Path, name: str) -> "_Listed":
+        """Without files that do not exist, which are counted."""
+        stamps, rows = _read_lines(root / name, "stamp file", columns=2)
+        there = np.array([(root / row[0]).is_file() for row in rows])
+        if not there.any():
+            found = f"none of {len(rows)}, for example no {rows[0][0]}"
+            raise DataError(root / name, "files that exist", found, _COMPLETE)
+        if not there.all():
+            message = f"{root / name}: {np.sum(~there)} of {len(rows)} files do not exist and are left out"
+            warnings.warn(message, DataWarning, stacklevel=4)
+        numbers = np.flatnonzero(there)
+        return cls(numbers, stamps[there], [root / rows[i][0] for i in numbers])
+
+
+def _read_lines(path: Path, form: str, columns: int) -> tuple[Float[np.ndarray, "n"], list[list[str]]]:
+    """Stamps in increasing order, and what stands behind each; second lines of one stamp are counted."""
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise DataError(path, f"lines '{form}'", "no such file", _COMPLETE) from None
+    except UnicodeDecodeError as error:
+        raise DataError(path, f"lines '{form}'", f"no text ({error})", "Fetch the file again.") from None
+    stamps, rows = [], []
+    for number, line in enumerate(lines, start=1):
+        fields = line.partition("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        if len(fields) != columns or not _is_finite(fields[0]):
+            expected, found = f"'{form}' in line {number}", repr(line[:80])
+            raise DataError(path, expected, found, "Correct the line, or begin it with #.")
+        stamps.append(float(fields[0]))
+        rows.append(fields[1:])
+    if not rows:
+        raise DataError(path, f"lines '{form}'", "none", "Fetch the file again.")
+    stamps, first = np.unique(stamps, return_index=True)
+    if len(first) < len(rows):
+        message = f"{path}: {len(rows) - len(first)} of {len(rows)} lines repeat a stamp and are left out"
+        warnings.warn(message, DataWarning, stacklevel=5)
+    return stamps, [rows[i] for i in first]
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
+
+
+def _read_poses(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 7"]]:
+    """Stamps, and positions with quaternions x y z w; what is not finite is counted and left out."""
+    stamps, rows = _read_lines(path, "stamp tx ty tz qx qy qz qw", columns=8)
+    try:
+        poses = np.array(rows, np.float64)
+    except ValueError as error:
+        raise DataError(path, "numbers only", str(error), "Correct the line, or begin it with #.") from None
+    known = np.isfinite(poses).all(axis=1)
+    if not known.any():
+        raise DataError(path, "finite poses", "none", "Fetch the file again.")
+    if not known.all():
+        message = f"{path}: {np.sum(~known)} of {len(known)} poses are not finite and are left out"
+        warnings.warn(message, DataWarning, stacklevel=3)
+    stamps, poses = stamps[known], poses[known]
+    lengths = np.linalg.norm(poses[:, 3:], axis=1)
+    bad = np.abs(lengths - 1) > _UNIT_TOLERANCE
+    if bad.any():
+        i = int(np.argmax(bad))
+        found = f"one of length {lengths[i]:.3g} at {stamps[i]:.6f} s"
+        raise DataError(path, "unit quaternions", found, "Correct that line, or begin it with #.")
+    return stamps, poses
+
+
+def _poses_at(
+    times: Float[np.ndarray, "t"], stamps: Float[np.ndarray, "n"], poses: Float[np.ndarray, "n 7"]
+) -> Float[np.ndarray, "t 4 4"]:
+    """Camera-to-world transforms between those measured; before the first and after the last, those."""
+    inside = np.clip(times, stamps[0], stamps[-1])
+    turns = Rotation.from_quat(poses[:, 3:])
+    transforms = np.tile(np.eye(4), (len(times), 1, 1))
+    turned = Slerp(stamps, turns)(inside) if len(stamps) > 1 else turns[np.zeros(len(times), int)]
+    transforms[:, :3, :3] = turned.as_matrix()
+    transforms[:, :3, 3] = np.stack([np.interp(inside, stamps, axis) for axis in poses[:, :3].T], axis=1)
+    return transforms
+
+
+def _published(
+    root: Path, image: Path, size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "3 3"], tuple[float, ...]]:
+    """K, centres at +0.5, and distortion of the camera that the folder's name tells."""
+    name = root.resolve().name
+    told = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
+    if told is None:
+        expected = "a folder's name with freiburg1, freiburg2 or freiburg3, which tells its camera"
+        advice = "Rename the folder, or give its intrinsics: read_tum(path, K=...)."
+        raise DataError(root, expected, repr(name), advice)
+    if size != _SIZE:
+        expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{told[1]} is calibrated"
+        found = f"{size[0]}x{size[1]}"
+        raise DataError(image, expected, found, "Give its intrinsics: read_tum(path, K=...).")
+    (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(told[1])]
+    return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), distortion
+
+
+class _Lens:
+    """Resamples what a lens has bent as a pinhole camera of the same K would see it."""
+
+    def __init__(self, K: Float[np.ndarray, "3 3"], distortion: Numbers[float], width: int, height: int):
+        self.map = None
+        if any(distortion):
+            where = undistort_map(jnp.asarray(K, float), jnp.asarray(distortion, float), width, height)
+            self.map = np.asarray(where, np.float32) - 0.5  # OpenCV's centres
+            self.outside = ((self.map < -0.5) | (self.map >= np.array([width, height]) - 0.5)).any(axis=-1)
+
+    def straighten(self, picture: np.ndarray) -> np.ndarray:
+        """Colour is interpolated. Depth is that of the nearest pixel: a mean of two surfaces is neither."""
+        if self.map is None:
+            return picture
+        how = cv2.INTER_LINEAR if picture.ndim == 3 else cv2.INTER_NEAREST
+        flat = cv2.remap(picture, self.map, None, how, borderMode=cv2.BORDER_REPLICATE)
+        flat[self.outside] = 0
+        return flat
