@@ -1,0 +1,274 @@
+"""Features of Gaussians from features of pixels (section III-A): in the first frame; then they ride along.
+
+Rendering is linear in what is rendered: F = W f, where W [pixels, N] holds the weight of each Gaussian in
+each pixel. W is never formed: a render applies it, and the render's VJP applies its transpose, exactly. The
+paper names two ways from maps m to features f. *Projection* gives each Gaussian the mean of the pixels that
+it shows in, weighted by how much it shows there:
+
+    f = (W^T m) / (W^T 1)
+
+*Distillation* looks for those features whose render comes closest to the maps:
+
+    min_f  |W f - a m|^2 + damping |f - f_projected|^2
+
+in which a = W 1 is the rendered alpha: what is half transparent shows half a feature. It is a linear least
+squares problem, so conjugate gradients solve it without a rate that somebody would have to choose; W^T 1 is
+the preconditioner, for it bounds what a row of W^T W can add up to. Both give a constant map back as it is.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gsjax.geometry.cameras import Camera
+from gsjax.geometry.neighbors import nearest
+from gsjax.methods.object_tracker.motion import Pose, place
+from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.optim.compiler import host_options
+from gsjax.optim.step import Step, all_finite, keep_if
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render, render
+
+MIN_WEIGHT = 0.1
+"""A Gaussian with less weight in all pixels together counts as unseen."""
+_CHANNELS = 32  # rendered at a time: a foundation model has hundreds, which would not fit at once
+
+
+class FeatureBatch(NamedTuple):
+    """What distillation is given.
+
+    Attributes:
+        gaussians: the scene, frozen.
+        cameras: C of them.
+        maps: the features of each pixel.
+        valid: 1 for each pixel that counts, 0 for the others.
+        prior: features that damping pulls towards.
+        weights: W^T 1 of each Gaussian.
+        damping: in the units of `weights`, pixels.
+        plan: from `plan_render`.
+    """
+
+    gaussians: Gaussians
+    cameras: Camera
+    maps: Float[Array, "c height width d"]
+    valid: Float[Array, "c height width"]
+    prior: Float[Array, "n d"]
+    weights: Float[Array, "n"]
+    damping: Float[Array, ""]
+    plan: Plan
+
+
+class DistillState(NamedTuple):
+    """Conjugate gradients, a solution of its own for each channel."""
+
+    residual: Float[Array, "n d"]
+    direction: Float[Array, "n d"]
+    energy: Float[Array, "d"]
+
+
+def project_features(
+    scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "c height width d"]
+) -> Float[np.ndarray, "n d"]:
+    """Each Gaussian takes the mean of the pixels that it shows in. On the host.
+
+    One that shows nowhere takes the feature of the nearest that does and has its label, for an object's far
+    side is mostly of the kind of its near one; where none of its label shows, it has zeros.
+
+    Args:
+        scene: at the time of `frame`.
+        frame: its cameras see what `maps` describe.
+        maps: a feature for each pixel; pixels that are not finite do not count.
+
+    Raises:
+        ValueError: maps have another number of cameras or another size than the frame.
+    """
+    maps, valid = _checked(maps, frame)
+    return _project(scene, frame, maps, valid, plan_render(scene.gaussians, frame.cameras))[0]
+
+
+def distill_features(
+    scene: TrackedScene,
+    frame: Frame,
+    maps: Float[Array | np.ndarray, "c height width d"],
+    *,
+    iterations: int = 10,
+    damping: float = 0.1,
+) -> Float[np.ndarray, "n d"]:
+    """The features whose render comes closest to the maps; what shows nowhere stays projected. On the host.
+
+    Args:
+        scene, frame, maps: as for `project_features`.
+        iterations: steps of conjugate gradients; each is one render and its transpose.
+        damping: how strongly a Gaussian holds on to its projected feature, in pixels of weight. Without any,
+            those that hardly show would take whatever values make up for others.
+
+    Raises:
+        ValueError: as `project_features`; or damping is negative.
+    """
+    if not damping >= 0:
+        raise ValueError(f"damping: got {damping}, want 0 or more")
+    maps, valid = _checked(maps, frame)
+    plan = plan_render(scene.gaussians, frame.cameras)
+    prior, weights = _project(scene, frame, maps, valid, plan)
+    known = (jnp.asarray(weights), jnp.asarray(damping, maps.dtype), plan)
+
+    def solve(part: Array, prior: Array) -> tuple[Array]:
+        batch = FeatureBatch(scene.gaussians, frame.cameras, part, valid, prior, *known)
+        features, state = prior, _begin()(batch)
+        for i in range(iterations):
+            features, state, _ = _advance()(features, state, batch, i)
+        return (features,)
+
+    return _in_chunks(solve, maps, prior)[0]
+
+
+def feature_distiller(first: FeatureBatch) -> Step:
+    """Conjugate gradients on distillation's normal equations, one iteration an update.
+
+    params: the features [N,D], which begin as `first.prior`. state: `DistillState`. batch: `FeatureBatch`,
+    the same each time. info: `energy` [D], the squared preconditioned residual of each channel.
+    """
+
+    def init(params: Float[Array, "n d"]) -> DistillState:
+        (drawn, alphas), transpose = _splat(params, first)
+        left = first.valid[..., None] * (alphas[..., None] * first.maps - drawn)
+        residual = transpose(left) + first.damping * (first.prior - params)
+        direction = residual / _bound(first)
+        return DistillState(residual, direction, jnp.sum(residual * direction, axis=0))
+
+    def update(params, state: DistillState, batch: FeatureBatch, *, step: Any, key: Any):
+        (drawn, _), transpose = _splat(state.direction, batch)
+        along = transpose(batch.valid[..., None] * drawn) + batch.damping * state.direction
+        length = _ratio(state.energy, jnp.sum(state.direction * along, axis=0))
+        features = params + length * state.direction
+        residual = state.residual - length * along
+        scaled = residual / _bound(batch)
+        energy = jnp.sum(residual * scaled, axis=0)
+        direction = scaled + _ratio(energy, state.energy) * state.direction
+        new = (features, DistillState(residual, direction, energy))
+        sound = all_finite(new)
+        params, state = keep_if(sound, new, (params, state))
+        return params, state, {"energy": state.energy, "skipped": ~sound}
+
+    return Step(init, update)
+
+
+def render_features(
+    scene: TrackedScene,
+    pose: Pose,
+    features: Float[Array, "n d"],
+    cameras: Camera,
+    plan: Plan | None = None,
+) -> tuple[Float[Array, "c height width d"], Float[Array, "c height width"]]:
+    """Feature maps of the scene as it stands, from any cameras, and their alphas.
+
+    A pixel's feature is the mean over what it shows, so that it does not fade where alpha does; zero where
+    nothing is drawn.
+
+    Args:
+        plan: from `plan_render(place(scene, pose), cameras)`; needed under jit.
+    """
+    rendered = render(place(scene, pose), cameras, plan, features=features)
+    assert rendered.features is not None
+    alphas = rendered.alphas[..., None]
+    return jnp.where(alphas > 1e-3, rendered.features / jnp.maximum(alphas, 1e-3), 0.0), rendered.alphas
+
+
+def _splat(features: Float[Array, "n d"], batch: FeatureBatch) -> tuple[tuple[Array, Array], Callable]:
+    """W f [C,H,W,D] with the alphas [C,H,W], and the function m -> W^T m [N,D]."""
+
+    def apply(features):
+        rendered = render(batch.gaussians, batch.cameras, batch.plan, features=features)
+        return rendered.features, rendered.alphas
+
+    drawn, pull, alphas = jax.vjp(apply, features, has_aux=True)
+    return (drawn, alphas), lambda maps: pull(maps)[0]
+
+
+def _project(
+    scene: TrackedScene, frame: Frame, maps: Array, valid: Array, plan: Plan
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n"]]:
+    """Projected features, and W^T 1."""
+    sums = _in_chunks(
+        lambda part: (_gather()(scene.gaussians, frame.cameras, plan, part, valid),),
+        jnp.concatenate([maps, jnp.ones_like(maps[..., :1])], axis=-1),
+    )[0]
+    weights, points = sums[:, -1], np.asarray(scene.gaussians.means)
+    features, seen = sums[:, :-1] / np.maximum(weights, 1e-12)[:, None], weights >= MIN_WEIGHT
+    features[~seen] = 0.0
+    labels = np.asarray(scene.labels)
+    for label in np.unique(labels[~seen]):
+        lacking, giving = (np.flatnonzero((labels == label) & rows) for rows in (~seen, seen))
+        found, _ = nearest(points[lacking], points[giving])
+        features[lacking[found >= 0]] = features[giving[found[found >= 0]]]
+    return features, weights
+
+
+def _bound(batch: FeatureBatch) -> Float[Array, "n 1"]:
+    """The preconditioner."""
+    return (batch.weights + batch.damping + 1e-6)[:, None]
+
+
+def _ratio(a: Float[Array, "d"], b: Float[Array, "d"]) -> Float[Array, "d"]:
+    """a / b, and 0 where a channel has converged."""
+    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
+
+
+def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
+    """Finite maps, and 1 for each pixel where they were."""
+    wanted = frame.images.shape[:3]
+    if np.ndim(maps) != 4 or maps.shape[:3] != wanted:
+        raise ValueError(f"maps: got shape {np.shape(maps)}, want {[*wanted, 'D']} as the frame's images")
+    maps = jnp.asarray(maps, frame.images.dtype)
+    valid = jnp.isfinite(maps).all(-1)
+    return jnp.where(valid[..., None], maps, 0.0), valid.astype(maps.dtype)
+
+
+def _in_chunks(function: Callable, *arrays: Array | np.ndarray) -> list[np.ndarray]:
+    """`function` of a few channels at a time, the last axis of each array; its results side by side."""
+    count = arrays[0].shape[-1]
+    size = min(count, _CHANNELS)
+    results = []
+    for start in range(0, count, size):
+        parts = [jnp.asarray(array[..., start : start + size]) for array in arrays]
+        # One shape for all, so that one program serves all.
+        pad = size - parts[0].shape[-1]
+        parts = [jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, pad)]) for part in parts]
+        results.append([np.array(result) for result in function(*parts)])
+    return [np.concatenate(columns, axis=-1)[..., :count] for columns in zip(*results, strict=True)]
+
+
+@cache
+def _gather() -> Callable:
+    """The jitted W^T m; made late, as the others, because its options ask which machine this is."""
+
+    def gather(gaussians: Gaussians, cameras: Camera, plan: Plan, maps, valid):
+        nothing = jnp.zeros((gaussians.num, maps.shape[-1]), maps.dtype)
+        none, damping = nothing[:, 0], jnp.zeros((), maps.dtype)
+        batch = FeatureBatch(gaussians, cameras, maps, valid, nothing, none, damping, plan)
+        return _splat(nothing, batch)[1](valid[..., None] * maps)
+
+    return jax.jit(gather, compiler_options=host_options())
+
+
+@cache
+def _begin() -> Callable:
+    def begin(batch: FeatureBatch):
+        return feature_distiller(batch).init(batch.prior)
+
+    return jax.jit(begin, compiler_options=host_options())
+
+
+@cache
+def _advance() -> Callable:
+    def advance(features, state: DistillState, batch: FeatureBatch, i):
+        return feature_distiller(batch).update(features, state, batch, step=i, key=None)
+
+    return jax.jit(advance, compiler_options=host_options())
