@@ -17,7 +17,7 @@ the preconditioner, for it bounds what a row of W^T W can add up to. Both give a
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -29,7 +29,6 @@ from gsjax.geometry.cameras import Camera
 from gsjax.geometry.neighbors import nearest
 from gsjax.methods.object_tracker.motion import Pose, place
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.optim.compiler import host_options
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -38,7 +37,7 @@ from gsjax.scene.render import plan_render, render
 
 MIN_WEIGHT = 0.1
 """A Gaussian with less weight in all pixels together counts as unseen."""
-_CHANNELS = 32  # rendered at a time: a foundation model has hundreds, which would not fit at once
+_CHANNELS = 16  # rendered at a time: hundreds, as foundation models have, compile slowly and fill the memory
 
 
 class FeatureBatch(NamedTuple):
@@ -74,7 +73,7 @@ class DistillState(NamedTuple):
 
 
 def project_features(
-    scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "c height width d"]
+    scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "..."]
 ) -> Float[np.ndarray, "n d"]:
     """Each Gaussian takes the mean of the pixels that it shows in. On the host.
 
@@ -84,7 +83,7 @@ def project_features(
     Args:
         scene: at the time of `frame`.
         frame: its cameras see what `maps` describe.
-        maps: a feature for each pixel; pixels that are not finite do not count.
+        maps: a feature for each pixel, [C,H,W,D]; pixels that are not finite do not count.
 
     Raises:
         ValueError: maps have another number of cameras or another size than the frame.
@@ -96,7 +95,7 @@ def project_features(
 def distill_features(
     scene: TrackedScene,
     frame: Frame,
-    maps: Float[Array | np.ndarray, "c height width d"],
+    maps: Float[Array | np.ndarray, "..."],
     *,
     iterations: int = 10,
     damping: float = 0.1,
@@ -119,14 +118,15 @@ def distill_features(
     prior, weights = _project(scene, frame, maps, valid, plan)
     known = (jnp.asarray(weights), jnp.asarray(damping, maps.dtype), plan)
 
-    def solve(part: Array, prior: Array) -> tuple[Array]:
+    def solve(part: Array, prior: Array) -> Array:
         batch = FeatureBatch(scene.gaussians, frame.cameras, part, valid, prior, *known)
-        features, state = prior, _begin()(batch)
+        step = feature_distiller(batch)
+        features, state = prior, step.init(prior)
         for i in range(iterations):
-            features, state, _ = _advance()(features, state, batch, i)
-        return (features,)
+            features, state, _ = step.update(features, state, batch, step=i, key=None)
+        return features
 
-    return _in_chunks(solve, maps, prior)[0]
+    return _in_chunks(solve, maps, prior)
 
 
 def feature_distiller(first: FeatureBatch) -> Step:
@@ -137,15 +137,17 @@ def feature_distiller(first: FeatureBatch) -> Step:
     """
 
     def init(params: Float[Array, "n d"]) -> DistillState:
-        (drawn, alphas), transpose = _splat(params, first)
-        left = first.valid[..., None] * (alphas[..., None] * first.maps - drawn)
-        residual = transpose(left) + first.damping * (first.prior - params)
+        gaussians, cameras, maps, valid, prior, _, damping, plan = first
+        residual = _residual(params, maps, gaussians, cameras, valid, plan)
+        residual += damping * (prior - params)
         direction = residual / _bound(first)
         return DistillState(residual, direction, jnp.sum(residual * direction, axis=0))
 
     def update(params, state: DistillState, batch: FeatureBatch, *, step: Any, key: Any):
-        (drawn, _), transpose = _splat(state.direction, batch)
-        along = transpose(batch.valid[..., None] * drawn) + batch.damping * state.direction
+        gaussians, cameras, maps, valid, _, _, damping, plan = batch
+        nothing = jnp.zeros_like(maps)
+        along = -_residual(state.direction, nothing, gaussians, cameras, valid, plan)
+        along += damping * state.direction
         length = _ratio(state.energy, jnp.sum(state.direction * along, axis=0))
         features = params + length * state.direction
         residual = state.residual - length * along
@@ -181,25 +183,37 @@ def render_features(
     return jnp.where(alphas > 1e-3, rendered.features / jnp.maximum(alphas, 1e-3), 0.0), rendered.alphas
 
 
-def _splat(features: Float[Array, "n d"], batch: FeatureBatch) -> tuple[tuple[Array, Array], Callable]:
-    """W f [C,H,W,D] with the alphas [C,H,W], and the function m -> W^T m [N,D]."""
+@partial(jax.jit, static_argnames="faded")
+def _residual(
+    features: Float[Array, "n d"],
+    maps: Float[Array, "c height width d"],
+    gaussians: Gaussians,
+    cameras: Camera,
+    valid: Float[Array, "c height width"],
+    plan: Plan,
+    faded: bool = True,
+) -> Float[Array, "n d"]:
+    """W^T (a m - W f) over the valid pixels; not `faded` leaves out a. All that is costly happens here."""
 
-    def apply(features):
-        rendered = render(batch.gaussians, batch.cameras, batch.plan, features=features)
+    def draw(features):
+        rendered = render(gaussians, cameras, plan, features=features)
         return rendered.features, rendered.alphas
 
-    drawn, pull, alphas = jax.vjp(apply, features, has_aux=True)
-    return (drawn, alphas), lambda maps: pull(maps)[0]
+    drawn, transpose, alphas = jax.vjp(draw, features, has_aux=True)
+    target = alphas[..., None] * maps if faded else maps
+    return transpose(valid[..., None] * (target - drawn))[0]
 
 
 def _project(
     scene: TrackedScene, frame: Frame, maps: Array, valid: Array, plan: Plan
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n"]]:
     """Projected features, and W^T 1."""
-    sums = _in_chunks(
-        lambda part: (_gather()(scene.gaussians, frame.cameras, plan, part, valid),),
-        jnp.concatenate([maps, jnp.ones_like(maps[..., :1])], axis=-1),
-    )[0]
+
+    def gather(part: Array) -> Array:
+        nothing = jnp.zeros((scene.gaussians.num, part.shape[-1]), part.dtype)
+        return _residual(nothing, part, scene.gaussians, frame.cameras, valid, plan, faded=False)
+
+    sums = _in_chunks(gather, jnp.concatenate([maps, jnp.ones_like(maps[..., :1])], axis=-1))
     weights, points = sums[:, -1], np.asarray(scene.gaussians.means)
     features, seen = sums[:, :-1] / np.maximum(weights, 1e-12)[:, None], weights >= MIN_WEIGHT
     features[~seen] = 0.0
@@ -231,44 +245,14 @@ def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
     return jnp.where(valid[..., None], maps, 0.0), valid.astype(maps.dtype)
 
 
-def _in_chunks(function: Callable, *arrays: Array | np.ndarray) -> list[np.ndarray]:
+def _in_chunks(function: Callable, *arrays: Array | np.ndarray) -> np.ndarray:
     """`function` of a few channels at a time, the last axis of each array; its results side by side."""
-    count = arrays[0].shape[-1]
+    count, results = arrays[0].shape[-1], []
     size = min(count, _CHANNELS)
-    results = []
     for start in range(0, count, size):
         parts = [jnp.asarray(array[..., start : start + size]) for array in arrays]
         # One shape for all, so that one program serves all.
         pad = size - parts[0].shape[-1]
         parts = [jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, pad)]) for part in parts]
-        results.append([np.array(result) for result in function(*parts)])
-    return [np.concatenate(columns, axis=-1)[..., :count] for columns in zip(*results, strict=True)]
-
-
-@cache
-def _gather() -> Callable:
-    """The jitted W^T m; made late, as the others, because its options ask which machine this is."""
-
-    def gather(gaussians: Gaussians, cameras: Camera, plan: Plan, maps, valid):
-        nothing = jnp.zeros((gaussians.num, maps.shape[-1]), maps.dtype)
-        none, damping = nothing[:, 0], jnp.zeros((), maps.dtype)
-        batch = FeatureBatch(gaussians, cameras, maps, valid, nothing, none, damping, plan)
-        return _splat(nothing, batch)[1](valid[..., None] * maps)
-
-    return jax.jit(gather, compiler_options=host_options())
-
-
-@cache
-def _begin() -> Callable:
-    def begin(batch: FeatureBatch):
-        return feature_distiller(batch).init(batch.prior)
-
-    return jax.jit(begin, compiler_options=host_options())
-
-
-@cache
-def _advance() -> Callable:
-    def advance(features, state: DistillState, batch: FeatureBatch, i):
-        return feature_distiller(batch).update(features, state, batch, step=i, key=None)
-
-    return jax.jit(advance, compiler_options=host_options())
+        results.append(np.array(function(*parts)))
+    return np.concatenate(results, axis=-1)[..., :count]
