@@ -104,7 +104,7 @@ def highlight(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """One thing in its own colours with an outline of `color`, the rest grey and dim."""
     image = to_uint8(image)
-    dim = np.broadcast_to(image.mean(axis=-1, keepdims=True) * 0.45, image.shape).astype(np.uint8)
+    dim = np.broadcast_to(image.mean(axis=-1, keepdims=True) * 0.6, image.shape).astype(np.uint8)
     picture = np.where(mask[..., None], image, dim)
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     thick = 1 + image.shape[0] // 400
@@ -149,7 +149,7 @@ def side_by_side(
     if labels is not None:
         pictures.append(overlay_labels(image, labels))
     columns = 2 if len(pictures) == 4 and image.shape[1] > 1.2 * image.shape[0] else len(pictures)
-    framed = [_captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
+    framed = [captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
     rows = [np.concatenate(framed[i : i + columns], axis=1) for i in range(0, len(framed), columns)]
     panel = np.concatenate(rows, axis=0)
     return np.pad(panel, ((0, panel.shape[0] % 2), (0, panel.shape[1] % 2), (0, 0)))
@@ -173,7 +173,7 @@ def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
     return matplotlib.colormaps[name](values, bytes=True)[..., :3].copy()
 
 
-def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
     height, width = picture.shape[:2]
     scale = max(height / 650, 0.42)
