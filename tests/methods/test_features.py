@@ -115,6 +115,7 @@ def test_distilled_features_render_closer_to_the_maps_than_projected_ones(little
 
     projected, distilled = error(project_features(*little, maps)), error(distill_features(*little, maps))
     assert distilled < 0.7 * projected
+    assert error(distill_features(*little, maps, iterations=40)) == pytest.approx(distilled, rel=0.02)
     assert projected < 0.2 * float(np.square(maps).mean())
 
 
