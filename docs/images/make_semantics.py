@@ -1,7 +1,7 @@
 """Makes docs/images/semantics.jpg out of a run: three moments from a held-out camera.
 
     .venv/bin/gsjax track "simulated:tabletop" --frames 0:37 --cameras 0 2 --mask-camera 0 --eval-cameras 1 \\
-        --out runs/semantics
+        --tracker.start.iterations 60 --out runs/semantics
     .venv/bin/gsjax grasp runs/semantics "blue can"
     .venv/bin/python docs/images/make_semantics.py runs/semantics
 """
