@@ -31,8 +31,8 @@ from gsjax.scene.frame import Frame
 FAST = PRESETS["fast"]
 # Colours come straight from the pixels, and nothing joins objects: fewer programs to compile a trial.
 CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))
-WIDTH, HEIGHT, MASK_CAMERA = 320, 240, 0
-MOVING, STILL = 5120, 16384
+WIDTH, HEIGHT, MASK_CAMERA = 240, 180, 0
+MOVING, STILL = 3072, 10240
 OWN, OTHERS, NEAR = 512, 1024, 0.25  # points of the object and around it, and how far that is, metres
 GRIPPER, KEY = Gripper(), jax.random.key(0)
 TILT = 0.35  # of the approach away from straight down, radians
@@ -145,9 +145,15 @@ class Aim:
         cloud = [np.asarray(a, bool if a.dtype == bool else np.float32) for a in cloud]
         held, due = np.asarray(motion @ self.held, np.float32), len(self.track) % SEARCH == 0
         grasp = search(held, *cloud) if due or not self.grasp.feasible else score(held, *cloud)
-        self.grasp = jax.tree.map(np.asarray, grasp)
+        self.grasp = jax.tree.map(np.array, grasp)
         self.held = np.linalg.inv(motion) @ self.grasp.pose
         self.track.append(center)
+
+    def coast(self) -> None:
+        """The fingers hide the object: it is taken to go on as it did."""
+        step = self.ahead(PERIOD)[:3, 3] - self.grasp.pose[:3, 3]
+        self.grasp.pose[:3, 3] += step
+        self.track.append(self.track[-1] + step)
 
     def ahead(self, seconds: float) -> np.ndarray:
         """The grasp's pose after `seconds`, if the object goes on as it does."""
@@ -239,7 +245,7 @@ class Attempt:
         before = self.errors[-1] if self.errors else None
         for _ in range(CLOSING if there else 0):
             self.act(self.goal(LEAD), CLOSED)
-            self.look()
+            self.aim.coast()
         score, tool = float(self.aim.grasp.score), arm.pose()
         for i in range(LIFTING + HOLDING if there else 0):
             raised = tool.copy()
@@ -252,7 +258,6 @@ class Attempt:
             "seconds_to_grasp": periods * PERIOD if there else None,
             "error_mm": float(np.median(self.errors)) if self.errors else None,
             "error_before_mm": before,
-            "error_held_mm": self.errors[-1] if there and self.errors else None,
             "score": score,
             "feasible_at_first": float(possible),
             "target": self.trial.target,
