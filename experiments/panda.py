@@ -7,16 +7,16 @@ Without a display, set MUJOCO_GL=egl before starting Python.
 
 from collections.abc import Iterator
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.object_tracker import EMPTY, TrackedScene, with_slots
+from gsjax.methods.object_tracker import StartConfig, TrackedScene
+from gsjax.methods.object_tracker.scene import assemble, labelled_cloud
 from gsjax.scene.frame import Frame
+from gsjax.scene.initialize import gaussians_from_points
 
 ARM, TOOL = "robot0_joint", "gripper0_right_grip_site"
 ROBOT = ("robot0", "gripper0", "fixed_mount0")
@@ -196,25 +196,29 @@ def set_body(model: mujoco.MjModel, data: mujoco.MjData, name: str, position, ya
     data.qvel[model.jnt_dofadr[joint] :][:6] = 0
 
 
-def padded(scene: TrackedScene, moving: int, still: int) -> TrackedScene:
-    """The scene with transparent Gaussians up to fixed numbers, so that one program serves all scenes.
+def start(
+    frame: Frame, mask: np.ndarray, mask_camera: int, config: StartConfig, per_object: int, background: int
+) -> TrackedScene:
+    """What `gsjax.start_scene` makes, with the pixels' own colours and as many Gaussians for every scene.
+
+    Arrays of the same shapes let one compiled program serve all trials. Where an object shows fewer points,
+    some come twice.
 
     Raises:
-        ValueError: there are more already.
+        ValueError: an object of the mask, or the background, has no points.
     """
-    extra, more = moving - scene.num_moving, still - (scene.gaussians.num - scene.num_moving)
-    if extra < 0 or more < 0:
-        raise ValueError(f"padded: the scene has {-extra} moving or {-more} still Gaussians too many")
-    scene = with_slots(scene, extra)
-
-    def grow(leaf):
-        return jnp.concatenate([leaf, jnp.broadcast_to(leaf[-1:], (more, *leaf.shape[1:]))])
-
-    gaussians = jax.tree.map(grow, scene.gaussians)
-    logits = gaussians.logit_opacities.at[len(gaussians.means) - more :].set(EMPTY)
-    gaussians = eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
-    labels = jnp.concatenate([scene.labels, jnp.zeros(more, scene.labels.dtype)])
-    return eqx.tree_at(lambda s: (s.gaussians, s.labels), scene, (gaussians, labels))
+    cloud = labelled_cloud(frame, mask, mask_camera, config)
+    rng, parts, labels, towards = np.random.default_rng(0), [], [], []
+    values = [int(value) for value in np.unique(mask) if value]
+    for label, value in enumerate([*values, 0], 1):
+        rows = rng.permutation(np.flatnonzero(cloud.labels == value))
+        if len(rows) == 0:
+            raise ValueError(f"start: nothing is labelled {value}; the mask has {values}")
+        rows = np.resize(rows, per_object if value else background)
+        parts.append(gaussians_from_points(cloud.points[rows], cloud.colors[rows], normals="pca"))
+        labels.append(np.full(len(rows), label if value else 0))
+        towards.append(cloud.eyes[rows] - cloud.points[rows])
+    return assemble(parts, labels, (0, *values), towards)
 
 
 def fed(box: list[Frame]) -> Iterator[Frame]:

@@ -17,14 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from conveyor import HOME, PERIOD, Conveyor, Trial, draw_trial
-from panda import CLOSED, LAG, OPEN, fed, motion_between, padded
+from panda import CLOSED, LAG, OPEN, fed, motion_between, start
 from scipy.spatial.transform import Rotation
 
 import gsjax
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp, score_grasp
 from gsjax.methods.object_tracker import PRESETS, TrackedScene
-from gsjax.methods.object_tracker.scene import labelled_cloud, scene_from_cloud
 from gsjax.methods.planning import straight_line
 from gsjax.scene.frame import Frame
 
@@ -32,9 +31,12 @@ FAST = PRESETS["fast"]
 # Colours come straight from the pixels, and nothing joins objects: fewer programs to compile a trial.
 CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))
 WIDTH, HEIGHT, MASK_CAMERA = 240, 180, 0
-MOVING, STILL = 3072, 10240
-OWN, OTHERS, NEAR = 512, 1024, 0.25  # points of the object and around it, and how far that is, metres
-GRIPPER, KEY = Gripper(), jax.random.key(0)
+OWN, BACKGROUND = 512, 8192  # Gaussians of an object and of the background
+OTHERS, NEAR = 1024, 0.25  # points around an object that may be in the way, and how far that is, metres
+# robosuite's hand: its palm begins 31 mm behind the tool's point and its fingers end 9 mm beyond it.
+# Both are taken to be nearer to what they might hit, by 4 and 2 mm.
+GRIPPER = Gripper(finger_thickness=0.027, finger_height=0.038, tip=0.011, palm_height=0.092)
+KEY = jax.random.key(0)
 TILT = 0.35  # of the approach away from straight down, radians
 SEARCH = 4  # the held grasp is scored at every update, and new ones are drawn at every fourth
 BETTER = 0.1  # a new grasp replaces the held one if its score is this much larger
@@ -49,12 +51,11 @@ LEAD = LAG + 2 * PERIOD  # from a frame to where the arm is once it has done wha
 
 
 class Body(NamedTuple):
-    """The object in the first frame: rows among the moving Gaussians, points, normals, and which are real."""
+    """The object in the first frame: its rows among the moving Gaussians, their points and normals."""
 
     rows: np.ndarray
     points: np.ndarray
     normals: np.ndarray
-    valid: np.ndarray
 
 
 class Begun(NamedTuple):
@@ -77,36 +78,22 @@ def begun(trial_seed: int, moving: bool) -> Begun:
     conveyor.begin(trial)
     frame = conveyor.cameras.frame(conveyor.data)
     mask = conveyor.cameras.mask(conveyor.data, MASK_CAMERA, conveyor.rows)
-    # What `gsjax.start_scene` does without iterations, but for planning a render that is then not made.
-    cloud = labelled_cloud(frame, mask, MASK_CAMERA, CONFIG.start)
-    scene = scene_from_cloud(cloud, CONFIG.start)
+    scene = start(frame, mask, MASK_CAMERA, CONFIG.start, OWN, BACKGROUND)
     label = conveyor.rows.index(conveyor.bodies[trial.target]) + 1
-    groups = [k for k, value in enumerate(scene.label_ids) if value == label]
-    rows = np.flatnonzero(np.isin(np.asarray(scene.labels[: scene.num_moving]), groups))
-    rows, valid = fixed(rows, OWN)
+    rows = np.flatnonzero(np.asarray(scene.labels) == scene.label_ids.index(label))
     axes = quats_to_matrices(scene.gaussians.quats[rows])
     normals = np.asarray(jnp.einsum("nij,nj->ni", axes, scene.normals[rows]))
-    body = Body(rows, np.asarray(scene.gaussians.means)[rows], normals, valid)
-    return Begun(padded(scene, MOVING, STILL), frame, body)
-
-
-def fixed(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """`count` of the rows, spread evenly, or all of them and padding; and which are no padding."""
-    if len(rows) > count:
-        rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
-    valid = np.arange(count) < len(rows)
-    return np.resize(rows, count) if len(rows) else np.zeros(count, int), valid
+    return Begun(scene, frame, Body(rows, np.asarray(scene.gaussians.means)[rows], normals))
 
 
 def around(begun: Begun, means: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points near the object that are not its own, and which of them count."""
     label = begun.scene.labels[begun.body.rows[0]]
-    other = np.asarray(begun.scene.labels != label) & (
-        np.asarray(begun.scene.gaussians.logit_opacities) > -20
-    )
     near = np.linalg.norm(means - center, axis=1) < NEAR
-    rows, valid = fixed(np.flatnonzero(other & near), OTHERS)
-    return means[rows], valid
+    rows = np.flatnonzero(np.asarray(begun.scene.labels != label) & near)
+    if len(rows) > OTHERS:
+        rows = rows[np.linspace(0, len(rows) - 1, OTHERS).astype(int)]
+    return means[np.resize(rows, OTHERS)], np.arange(OTHERS) < len(rows)
 
 
 OPTIONS = {"approach": jnp.array([0.0, 0.0, -1.0]), "max_angle": TILT}
@@ -139,9 +126,9 @@ class Aim:
         """The object has moved by `motion` since the first frame, and all Gaussians are at `means`."""
         body = self.begun.body
         points = body.points @ motion[:3, :3].T + motion[:3, 3]
-        center = points[body.valid].mean(0)
+        center = points.mean(0)
         near, is_near = around(self.begun, means, center)
-        cloud = (points, body.normals @ motion[:3, :3].T, body.valid, near, is_near)
+        cloud = (points, body.normals @ motion[:3, :3].T, np.ones(len(points), bool), near, is_near)
         cloud = [np.asarray(a, bool if a.dtype == bool else np.float32) for a in cloud]
         held, due = np.asarray(motion @ self.held, np.float32), len(self.track) % SEARCH == 0
         grasp = search(held, *cloud) if due or not self.grasp.feasible else score(held, *cloud)
@@ -176,21 +163,19 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """One trial."""
     moving = options["object"] == "moving"
     trial = draw_trial(seed, moving)
-    start = begun(seed, moving)
-    conveyor = world()
+    first, conveyor = begun(seed, moving), world()
     conveyor.begin(trial)
-    return Attempt(conveyor, trial, start, options["grasp from"]).run()
+    return Attempt(conveyor, trial, first, options["grasp from"]).run()
 
 
 class Attempt:
     """Reach, close, lift: the arm's side of a trial."""
 
-    def __init__(self, conveyor: Conveyor, trial: Trial, start: Begun, source: str):
-        self.conveyor, self.trial, self.start, self.source = conveyor, trial, start, source
-        self.aim = Aim(start)
-        self.first = conveyor.pose(trial.target)
+    def __init__(self, conveyor: Conveyor, trial: Trial, first: Begun, source: str):
+        self.conveyor, self.trial, self.start, self.source = conveyor, trial, first, source
+        self.aim, self.first = Aim(first), conveyor.pose(trial.target)
         self.box: list[Frame] = []
-        self.tracking = gsjax.track(start.scene, start.frame, fed(self.box), CONFIG)
+        self.tracking = gsjax.track(first.scene, first.frame, fed(self.box), CONFIG)
         self.errors: list[float] = []
         self.waiting = HOME
 
@@ -204,13 +189,13 @@ class Attempt:
         if self.source == "tracker":
             self.box.append(self.conveyor.cameras.frame(self.conveyor.data))
             tracked = next(self.tracking)
-            means[:MOVING] = np.asarray(tracked.pose.means)
-            rows = body.rows[body.valid]
-            motion = motion_between(body.points[body.valid], means[rows])
+            means[: len(tracked.pose.means)] = tracked.pose.means
+            motion = motion_between(body.points, means[body.rows])
         else:  # the other objects ride on the belt as well
-            means[:MOVING] = means[:MOVING] @ truth[:3, :3].T + truth[:3, 3]
+            moving = means[: self.start.scene.num_moving]
+            moving[:] = moving @ truth[:3, :3].T + truth[:3, 3]
         self.aim.see(motion, means)
-        center = np.append(body.points[body.valid].mean(0), 1)
+        center = np.append(body.points.mean(0), 1)
         self.errors.append(1e3 * float(np.linalg.norm(((motion - truth) @ center)[:3])))
 
     def act(self, pose: np.ndarray, finger: float) -> None:
@@ -235,7 +220,7 @@ class Attempt:
     def run(self) -> dict[str, Any]:
         """The whole attempt, and what is said of it."""
         arm, heights, there = self.conveyor.arm, [], False
-        possible, start = bool(self.aim.grasp.feasible), self.first[2, 3]
+        possible, height = bool(self.aim.grasp.feasible), self.first[2, 3]
         periods = 0
         while periods < REACHING and not there:
             periods += 1
@@ -251,7 +236,7 @@ class Attempt:
             raised = tool.copy()
             raised[2, 3] += LIFT * min(1.0, (i + 1) / (LIFTING - HOLDING))
             self.act(raised, CLOSED)
-            heights.append(self.conveyor.pose(self.trial.target)[2, 3] - start)
+            heights.append(self.conveyor.pose(self.trial.target)[2, 3] - height)
         return {
             "success": float(there and min(heights[-HOLDING:]) >= LIFTED),
             "reached": float(there),
