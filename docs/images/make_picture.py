@@ -21,13 +21,13 @@ def main(run: Path) -> None:
     for t in np.linspace(0, len(panels) - 1, MOMENTS).round().astype(int):
         # A panel is 2 x 2: input and render above, error and labels below.
         parts = [panels[t, :height, :width], panels[t, :height, width:], panels[t, height:, width:]]
-        columns.append(_join(parts, axis=0))
-    picture = _join(columns, axis=1)
+        columns.append(join(parts, axis=0))
+    picture = join(columns, axis=1)
     path = Path(__file__).with_name("tracking.jpg")
     cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
-def _join(parts: list[np.ndarray], axis: int) -> np.ndarray:
+def join(parts: list[np.ndarray], axis: int) -> np.ndarray:
     """The parts beside each other with a white gap between them."""
     shape = list(parts[0].shape)
     shape[axis] = GAP

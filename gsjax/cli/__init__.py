@@ -15,6 +15,8 @@ COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
+    "query": ("gsjax.cli.query", "find the object of a run that a text means, and show it over time"),
+    "grasp": ("gsjax.cli.grasp", "find the best grasp of the object that a text means, in every frame"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
@@ -36,7 +38,8 @@ def entry() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that `arguments` (those of the process unless given) ask for; returns the exit code.
 
-    0: done. 1: a fault of gsjax. 2: the user's mistake, said in a sentence. 130: Ctrl-C.
+    0: done. 1: a fault of gsjax. 2: the user's mistake, said in a sentence. 3: done, but what was looked for
+    is not there (no feasible grasp). 130: Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])

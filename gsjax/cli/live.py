@@ -127,7 +127,7 @@ def _open(options: Options, console: Console) -> Source:
         camera = open_camera(int(number))
         stream = snapshots([camera])
         first = next(stream).frame
-        image, depth = (np.asarray(a[0]) for a in (first.images, first.depths))
+        image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         mask = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K)
         return Source(first, start_scene(first, mask.astype(np.int32)), {}, stream)
     recording = open_recording(options.source, options.cameras, (), options.frames)

@@ -32,6 +32,7 @@ def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> 
     folder.write_trajectory(
         means=tracking.means().astype(np.float32),
         quats=tracking.quats().astype(np.float32),
+        normals=np.asarray(tracking.scene.normals, np.float32),
         labels=labels,
         label_ids=label_ids.astype(np.int32),
         times=times[: tracking.num_frames],
@@ -46,7 +47,7 @@ def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -
         return None
     image = recording.tracked.image(0, recording.tracked.camera_ids.index(mask.camera))
     path = folder.plot("first_mask", ".png")
-    _write_png(path, overlay_labels(image, mask.labels))
+    write_png(path, overlay_labels(image, mask.labels))
     return path
 
 
@@ -76,7 +77,7 @@ class Film:
         self._videos[view.camera].write(panel)
         if view.t in self._kept:
             path = self._folder.render(view.camera, self._frame_ids[view.t])
-            _write_png(path, to_uint8(view.render))
+            write_png(path, to_uint8(view.render))
 
     def __enter__(self) -> "Film":
         return self
@@ -165,7 +166,13 @@ def _true_paths(
     return true
 
 
-def _write_png(path: Path, picture: np.ndarray) -> None:
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Writes an RGB picture [H,W,3] or a grey one [H,W], uint8.
+
+    Raises:
+        OSError: it could not be written.
+    """
     with atomic_write(path) as temporary:
-        if not cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        rows = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        if not cv2.imwrite(str(temporary), rows):
             raise OSError(f"{path}: the picture could not be written; is there space, and permission?")

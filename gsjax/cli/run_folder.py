@@ -13,9 +13,9 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "trajectory.npz", "scene.ply", "report.html")
-_FOLDERS = ("renders", "plots", "resume")
+_FOLDERS = ("renders", "plots", "query", "grasp", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
-_SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
+SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
 class RunFolder:
@@ -24,13 +24,15 @@ class RunFolder:
         RUN/
           config.yml              the settings, written first; its first line marks the folder as a run's
           metrics.json            every score; what could not be computed is null
-          trajectory.npz          means [T,N,3], labels [N], label_ids [K+1], times [T], update_s [T]
+          trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
+                                  times [T], update_s [T]
           scene.ply               the Gaussians of the first frame, with their labels
           renders/CAM/FRAME.png   rendered images
           video_CAM.mp4           input, render, error and labels side by side
           plots/NAME.svg|png      update time, error over frames, ...
           report.html             all of it on one page, written last
           resume/                 what an unfinished run goes on from; a finished one has none
+          query/, grasp/          what `gsjax query` and `gsjax grasp` found afterwards
 
     A run is finished when it has its report, and metrics.json does not say that it was stopped.
 
@@ -44,7 +46,7 @@ class RunFolder:
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
             overwrite: clear an earlier run although it is finished. What a run does not write beside it is
-                kept; renders/ and plots/ are cleared whole.
+                kept; its folders are cleared whole.
             resume: keep an unfinished run.
 
         Raises:
@@ -65,10 +67,10 @@ class RunFolder:
     def _claim(self, overwrite: bool, resume: bool) -> None:
         # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
         config = self.config
-        if not config.is_file() or not config.read_bytes().startswith(_SIGNATURE.encode()):
+        if not config.is_file() or not config.read_bytes().startswith(SIGNATURE.encode()):
             raise FileExistsError(
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
-                f"with {_SIGNATURE!r}), found other files; name another folder"
+                f"with {SIGNATURE!r}), found other files; name another folder"
             )
         if self.finished and not overwrite:
             raise FileExistsError(
@@ -133,7 +135,7 @@ class RunFolder:
         """
         text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
         with atomic_write(self.config) as temporary:
-            temporary.write_text(f"{_SIGNATURE}\n{text}", encoding="utf-8")
+            temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError where config.yml says something else than `config`, the settings `but` apart."""

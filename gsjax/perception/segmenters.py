@@ -16,6 +16,7 @@ from skimage.color import rgb2lab
 from skimage.segmentation import felzenszwalb
 
 from gsjax.geometry.cameras import unproject
+from gsjax.perception.pictures import unit_floats
 from gsjax.perception.planes import find_levels, find_planes, surface_normals
 
 
@@ -144,7 +145,7 @@ class RegionSegmenter:
             image: uint8, or floats 0 to 1.
             depth, K: not used; they stand here so that all segmenters are called alike.
         """
-        lab = rgb2lab(_unit_floats(image))
+        lab = rgb2lab(unit_floats(image))
         # In CIELAB over 100, a distance of 1 is as much as black to white, which is what `scale` is made for.
         regions = felzenszwalb(
             lab / 100.0, scale=self.scale, sigma=self.sigma, min_size=self.min_pixels, channel_axis=-1
@@ -205,14 +206,8 @@ def _relative_jumps(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _color_jumps(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances of smoothed CIELAB colour from each pixel to its right and lower neighbour."""
-    lab = ndimage.gaussian_filter(rgb2lab(_unit_floats(image)), (1, 1, 0))
+    lab = ndimage.gaussian_filter(rgb2lab(unit_floats(image)), (1, 1, 0))
     return np.linalg.norm(np.diff(lab, axis=1), axis=-1), np.linalg.norm(np.diff(lab, axis=0), axis=-1)
-
-
-def _unit_floats(image: np.ndarray) -> np.ndarray:
-    image = np.asarray(image)
-    scale = 255.0 if np.issubdtype(image.dtype, np.integer) else 1.0
-    return np.clip(np.nan_to_num(image / scale), 0.0, 1.0)
 
 
 def _components(

@@ -4,6 +4,7 @@ All pictures are uint8 RGB `[H,W,3]`; colour inputs are floats in 0 to 1 or uint
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import matplotlib
@@ -58,6 +59,58 @@ def colorize_depth(
     return colors
 
 
+class PcaColors(NamedTuple):
+    """Which colour a feature has: its three principal components as red, green and blue."""
+
+    mean: Float[np.ndarray, "d"]
+    axes: Float[np.ndarray, "d three"]
+    low: Float[np.ndarray, "three"]
+    high: Float[np.ndarray, "three"]
+
+
+def fit_pca_colors(features: Float[np.ndarray, "n d"]) -> PcaColors:
+    """Colours that tell these features apart; use one fit for all pictures that are to be compared.
+
+    The colours span the 2nd to the 98th percentile of each component. Features that are not finite do not
+    count, and the signs of the axes are fixed, so the same features always have the same colours.
+
+    Raises:
+        ValueError: no feature is finite.
+    """
+    finite = np.asarray(features, np.float64)[np.isfinite(features).all(axis=1)]
+    if len(finite) == 0:
+        raise ValueError(f"features: got {len(features)} of which none is finite, want at least one")
+    mean = finite.mean(axis=0)
+    values, axes = np.linalg.eigh((finite - mean).T @ (finite - mean))
+    axes = axes[:, np.argsort(-values)[:3]]
+    axes *= np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(axes.shape[1])])
+    axes = np.pad(axes, ((0, 0), (0, 3 - axes.shape[1])))  # fewer than three dimensions: the rest is black
+    low, high = np.percentile((finite - mean) @ axes, [2, 98], axis=0)
+    return PcaColors(mean, axes, low, high)
+
+
+def colorize_features(features: Float[np.ndarray, "h w d"], pca: PcaColors) -> UInt8[np.ndarray, "h w 3"]:
+    """A feature map as colours; what is not finite is near black."""
+    known = np.isfinite(features).all(axis=-1)
+    components = (np.where(known[..., None], features, 0.0) - pca.mean) @ pca.axes
+    shares = (components - pca.low) / np.maximum(pca.high - pca.low, 1e-12)
+    picture = to_uint8(np.where(pca.high > pca.low, shares, 0.0))
+    picture[~known] = INVALID
+    return picture
+
+
+def highlight(
+    image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """One thing in its own colours with an outline of `color`, the rest grey and dim."""
+    image = to_uint8(image)
+    dim = np.broadcast_to(image.mean(axis=-1, keepdims=True) * 0.6, image.shape).astype(np.uint8)
+    picture = np.where(mask[..., None], image, dim)
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    thick = 1 + image.shape[0] // 400
+    return cv2.drawContours(np.ascontiguousarray(picture), contours, -1, color, thick, cv2.LINE_AA)
+
+
 def error_heatmap(
     a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"], limit: float = 0.3
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -96,7 +149,7 @@ def side_by_side(
     if labels is not None:
         pictures.append(overlay_labels(image, labels))
     columns = 2 if len(pictures) == 4 and image.shape[1] > 1.2 * image.shape[0] else len(pictures)
-    framed = [_captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
+    framed = [captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
     rows = [np.concatenate(framed[i : i + columns], axis=1) for i in range(0, len(framed), columns)]
     panel = np.concatenate(rows, axis=0)
     return np.pad(panel, ((0, panel.shape[0] % 2), (0, panel.shape[1] % 2), (0, 0)))
@@ -120,7 +173,7 @@ def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
     return matplotlib.colormaps[name](values, bytes=True)[..., :3].copy()
 
 
-def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
     height, width = picture.shape[:2]
     scale = max(height / 650, 0.42)

@@ -85,6 +85,9 @@ def test_finished_run_is_not_overwritten(finished):
 
 
 def test_overwriting_clears_the_run_and_nothing_else(finished):
+    for name in ("query", "grasp"):  # what was asked of the old run is no answer for the new one
+        (finished.path / name).mkdir()
+        (finished.path / name / "video.mp4").touch()
     run = RunFolder(finished.path, overwrite=True)
     assert contents(run) == ["my notes.txt"]
     assert not run.finished

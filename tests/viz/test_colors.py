@@ -72,3 +72,37 @@ def test_panel_does_not_write_into_its_inputs():
     image = np.full((40, 60, 3), 200, np.uint8)
     colors.side_by_side(image, image)
     assert (image == 200).all()
+
+
+def test_features_that_differ_have_colours_that_differ_and_always_the_same():
+    rng = np.random.default_rng(0)
+    kinds = rng.normal(size=(3, 12))
+    image = kinds[np.arange(60).reshape(6, 10) // 20] + 0.01 * rng.normal(size=(6, 10, 12))
+    pca = colors.fit_pca_colors(image.reshape(-1, 12))
+    picture = colors.colorize_features(image, pca).astype(int)
+    again = colors.fit_pca_colors(image.reshape(-1, 12))
+    np.testing.assert_array_equal(picture, colors.colorize_features(image, again))
+    means = picture.reshape(3, 20, 3).mean(1)
+    assert np.linalg.norm(means[:, None] - means, axis=-1)[~np.eye(3, dtype=bool)].min() > 60
+    image[0, 0, 3] = np.nan
+    assert tuple(colors.colorize_features(image, pca)[0, 0]) == colors.INVALID
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_features_of_few_dimensions_are_drawn(size):
+    features = np.linspace(0, 1, 20 * size).reshape(20, size)
+    picture = colors.colorize_features(features[None], colors.fit_pca_colors(features))
+    assert len(np.unique(picture[..., 0])) > 10
+    with pytest.raises(ValueError, match="got 2 of which none is finite"):
+        colors.fit_pca_colors(np.full((2, size), np.nan))
+
+
+def test_what_is_highlighted_keeps_its_colours_and_the_rest_loses_them():
+    image = np.full((40, 60, 3), (200, 40, 40), np.uint8)
+    mask = np.zeros((40, 60), bool)
+    mask[10:30, 10:30] = True
+    picture = colors.highlight(image, mask, (0, 255, 0))
+    assert tuple(picture[20, 20]) == (200, 40, 40)
+    assert np.ptp(picture[5, 50].astype(int)) == 0
+    assert picture[10, 20, 1] > 150  # the outline
+    assert (image == (200, 40, 40)).all()

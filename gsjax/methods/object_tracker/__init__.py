@@ -1,7 +1,7 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
 Read the files as the data flows: config, scene, fit, shapes, motion, layers, matching, points, align,
-search, region, refine, tracker, grow, budget, tracking.
+search, region, refine, tracker, grow, budget, tracking; and what it is for: features, query.
 """
 
 from gsjax.methods.object_tracker.config import (
@@ -13,9 +13,18 @@ from gsjax.methods.object_tracker.config import (
     StartConfig,
     TrackerConfig,
 )
+from gsjax.methods.object_tracker.features import (
+    DistillState,
+    FeatureBatch,
+    distill_features,
+    feature_distiller,
+    project_features,
+    render_features,
+)
 from gsjax.methods.object_tracker.grow import EMPTY, with_slots
 from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.query import Match, find_object
 from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.shapes import scene_from_shapes
@@ -31,7 +40,10 @@ __all__ = [
     "EMPTY",
     "PRESETS",
     "AlignConfig",
+    "DistillState",
+    "FeatureBatch",
     "GrowConfig",
+    "Match",
     "MatchConfig",
     "Pose",
     "RefineConfig",
@@ -42,11 +54,16 @@ __all__ = [
     "TrackerConfig",
     "TrackerPlan",
     "TrackerState",
+    "distill_features",
+    "feature_distiller",
+    "find_object",
     "first_pose",
     "first_state",
     "object_tracker",
     "place",
     "plan_tracker",
+    "project_features",
+    "render_features",
     "render_labels",
     "scene_from_shapes",
     "start_scene",

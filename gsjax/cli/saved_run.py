@@ -1,0 +1,145 @@
+"""A run folder read back: the scene, where it went, and the recording that it came from."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+
+from gsjax.cli.loop import Tracking
+from gsjax.cli.recording import Recording, open_recording
+from gsjax.cli.run_folder import SIGNATURE
+from gsjax.data.errors import DataError
+from gsjax.io.ply import read_ply
+from gsjax.methods.object_tracker import Pose, TrackedScene
+
+_AGAIN = "track again with this version of gsjax, or name another folder"
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """What `gsjax track` left.
+
+    Attributes:
+        path: the folder.
+        tracking: the scene and its poses; parts of one object are one group here.
+        recording: the same frames and cameras as then.
+        mask_camera: id of the camera whose first mask named the objects; the first tracked one if none did.
+        names: of each object, by its group, 1 to K.
+    """
+
+    path: Path
+    tracking: Tracking
+    recording: Recording
+    mask_camera: int
+    names: dict[int, str]
+
+    def seen_by(self, camera: int | None) -> Recording:
+        """The recording with one camera only; the first held out one, else the first tracked, unless given.
+
+        Raises:
+            ValueError: the run had no such camera.
+        """
+        known = list(self.recording.judged.camera_ids)
+        if camera is None:
+            camera = [*self.recording.held_out, *known][0]
+        if camera not in known:
+            raise ValueError(f"--camera: {self.path} has no camera {camera}; it has {known}.")
+        one = self.recording.judged.select(cameras=[camera])
+        return Recording(one, one, self.recording.frames_in_data, self.recording.simulated)
+
+
+def open_run(path: Path) -> SavedRun:
+    """Read the folder of a run.
+
+    Raises:
+        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+    """
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing there"
+        raise FileNotFoundError(f"{path}: expected the folder of a run of `gsjax track`, found {found}")
+    config = path / "config.yml"
+    if not config.is_file() or not config.read_bytes().startswith(SIGNATURE.encode()):
+        raise FileNotFoundError(
+            f"{path}: expected the folder of a run of `gsjax track`, whose config.yml begins with "
+            f"{SIGNATURE!r}, found other files; name its --out"
+        )
+    missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
+    if missing:
+        raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
+    tracking = _read_tracking(path)
+    recording = _reopen(config)
+    if recording.tracked.num_frames < tracking.num_frames:
+        found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
+        raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")
+    camera, names = _read_metrics(path / "metrics.json", tracking.scene)
+    if camera is None:
+        camera = recording.tracked.camera_ids[0]
+    return SavedRun(path, tracking, recording, camera, names)
+
+
+def _read_tracking(path: Path) -> Tracking:
+    """The scene of scene.ply with the poses of trajectory.npz."""
+    file = path / "trajectory.npz"
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            arrays = dict(saved)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{file}: expected plain arrays, found a file that cannot be read; {_AGAIN}"
+        ) from error
+    missing = [name for name in ("means", "quats", "normals", "labels", "label_ids") if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
+    means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
+    gaussians, report = read_ply(path / "scene.ply")
+    count, moving = means.shape[1], quats.shape[1]
+    if gaussians.num != count or report.stored != count or len(labels) != count:
+        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
+        raise ValueError(f"{path}: expected {count} Gaussians as in trajectory.npz, found {found}; {_AGAIN}")
+    scene = TrackedScene(
+        gaussians=gaussians,
+        normals=jnp.asarray(arrays["normals"]),
+        labels=jnp.asarray(labels, jnp.int32),
+        label_ids=tuple(arrays["label_ids"].tolist()),
+        num_moving=moving,
+    )
+    poses = jax.device_get(
+        [Pose(jnp.asarray(m[:moving]), jnp.asarray(q)) for m, q in zip(means, quats, strict=True)]
+    )
+    return Tracking(scene, poses)
+
+
+def _reopen(config: Path) -> Recording:
+    """The recording of a run, by what its config.yml says."""
+    names = ("dataset", "cameras", "eval_cameras", "frames")
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        return open_recording(*(settings[name] for name in names))
+    except (yaml.YAMLError, KeyError, TypeError) as error:
+        listed = ", ".join(names)
+        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {_AGAIN}") from error
+    except DataError as error:
+        raise ValueError(
+            f"{config}: its recording cannot be opened: {error} A path that is not absolute is looked for "
+            "from the folder you are in."
+        ) from error
+
+
+def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:
+    """The camera whose mask named the objects, and the names that the recording has for its labels; those
+    of the segmenter have none."""
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+        camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]
+        known = {found["label"]: name for name, found in metrics["objects"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
+    if source == "segment":
+        known = {}
+    return camera, {k: known.get(scene.label_ids[k], f"object {k}") for k in range(1, scene.num_objects + 1)}

@@ -1,0 +1,68 @@
+"""What methods ask of others: who says what belongs together, what a pixel is like, and what words mean.
+
+`gsjax.perception` has a default without weights for each, and adapters of foundation models. Nobody needs to
+inherit: whatever can be called like this fits. All of them work on the host, in numpy.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Labels of a picture."""
+
+    def __call__(
+        self,
+        image: Num[np.ndarray, "H W 3"],
+        depth: Num[np.ndarray, "H W"] | None,
+        K: Float[np.ndarray, "3 3"] | None,
+    ) -> Int[np.ndarray, "H W"]:
+        """0 background, then 1, 2, ... from the largest object to the smallest.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            depth: metres, 0 where unknown; None without a depth camera.
+            K: intrinsics; None where unknown.
+        """
+        ...
+
+
+@runtime_checkable
+class DenseEncoder(Protocol):
+    """A feature for each pixel."""
+
+    def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C H W D"]:
+        """Features of pictures that are to be comparable with each other.
+
+        Args:
+            images: RGB, uint8 or floats 0 to 1.
+        """
+        ...
+
+
+@runtime_checkable
+class LanguageEncoder(Protocol):
+    """Objects and words in one vector space, in which likeness is the cosine.
+
+    Attributes:
+        min_score: a query whose best cosine is less means none of the objects.
+    """
+
+    min_score: float
+
+    def embed_objects(
+        self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
+    ) -> Float[np.ndarray, "count D"]:
+        """A vector for each of the labels 1 to `count`; zeros for one that no pixel has."""
+        ...
+
+    def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
+        """The vector of a query.
+
+        Raises:
+            ValueError: the text says nothing that this encoder knows; the message says what it does know.
+        """
+        ...

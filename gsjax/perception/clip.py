@@ -1,0 +1,90 @@
+"""CLIP (Radford et al., 2021) through transformers: objects and words in one space. Weights are local files.
+
+Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from gsjax.perception.pictures import square_crop, to_bytes
+from gsjax.perception.weights import foundation_modules, weights_folder
+
+_FILES = ("preprocessor_config.json|processor_config.json", "tokenizer.json|vocab.json")
+
+
+@dataclass(frozen=True)
+class ClipEncoder:
+    """Unit vectors of object crops and of texts; from `load_clip`.
+
+    Attributes:
+        model, processor, tokenizer: of transformers.
+        torch: the module.
+        device: where the model is.
+        min_score: a query whose best cosine is less means none of the objects. CLIP's cosines between
+            pictures and texts that fit lie around 0.25 to 0.3, and those that do not around 0.15 to 0.2.
+    """
+
+    model: Any
+    processor: Any
+    tokenizer: Any
+    torch: Any
+    device: str = "cpu"
+    min_score: float = 0.2
+
+    def embed_images(self, images: list[np.ndarray]) -> Float[np.ndarray, "n D"]:
+        """Unit vectors of RGB pictures [h,w,3], uint8 or floats 0 to 1."""
+        pixels = self.processor([to_bytes(image) for image in images], return_tensors="pt")["pixel_values"]
+        with self.torch.inference_mode():
+            seen = self.model.vision_model(pixel_values=pixels.to(self.device)).pooler_output
+            return _unit(self.model.visual_projection(seen).float().cpu().numpy())
+
+    def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
+        """The unit vector of a text.
+
+        Raises:
+            ValueError: the text is empty.
+        """
+        if not text.strip():
+            raise ValueError("text: got nothing, want words that say which object")
+        tokens = self.tokenizer([text], truncation=True, return_tensors="pt").to(self.device)
+        with self.torch.inference_mode():
+            read = self.model.text_model(**tokens).pooler_output
+            return _unit(self.model.text_projection(read).float().cpu().numpy())[0]
+
+    def embed_objects(
+        self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
+    ) -> Float[np.ndarray, "count D"]:
+        """The vector of a square crop around each of the labels 1 to `count`; zeros for one without pixels.
+
+        What surrounds an object stays in its crop: CLIP was trained on pictures, not on cut-outs.
+        """
+        vectors = np.zeros((count, self.model.config.projection_dim), np.float32)
+        there = [label for label in range(1, count + 1) if (labels == label).any()]
+        if there:
+            crops = [square_crop(np.asarray(image), labels == label) for label in there]
+            vectors[np.array(there) - 1] = self.embed_images(crops)
+        return vectors
+
+
+def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
+    """CLIP from a folder of weights in the layout of Hugging Face.
+
+    Raises:
+        FileNotFoundError: the folder or a file of it is missing.
+        ImportError: torch or transformers is not installed.
+    """
+    folder = weights_folder(path, "CLIP's weights", _FILES, "openai/clip-vit-base-patch32")
+    torch, transformers = foundation_modules("CLIP")
+    model = transformers.CLIPModel.from_pretrained(folder, local_files_only=True).eval().to(device)
+    # The processor that needs no torchvision.
+    processor = transformers.AutoImageProcessor.from_pretrained(folder, local_files_only=True, backend="pil")
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, local_files_only=True)
+    return ClipEncoder(model, processor, tokenizer, torch, device)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

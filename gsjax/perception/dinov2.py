@@ -1,0 +1,67 @@
+"""DINOv2 (Oquab et al., 2024) through transformers: a feature for each pixel. Weights are local files.
+
+Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+
+from gsjax.perception.pictures import to_bytes
+from gsjax.perception.weights import foundation_modules, weights_folder
+
+
+@dataclass(frozen=True)
+class Dinov2Encoder:
+    """Features of the last layer's patches, interpolated to pixels; from `load_dinov2`.
+
+    Attributes:
+        model, processor: of transformers.
+        torch: the module.
+        device: where the model is.
+        resolution: pixels of the shorter side that the model sees, rounded to whole patches. More see more.
+    """
+
+    model: Any
+    processor: Any
+    torch: Any
+    device: str = "cpu"
+    resolution: int = 518
+
+    def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C H W D"]:
+        """Features of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen, nothing is cropped."""
+        height, width = images.shape[1:3]
+        patch = self.model.config.patch_size
+        scale = self.resolution / min(height, width)
+        rows, columns = (max(1, round(size * scale / patch)) for size in (height, width))
+        size = {"height": rows * patch, "width": columns * patch}
+        pixels = self.processor(
+            [to_bytes(image) for image in images], size=size, do_center_crop=False, return_tensors="pt"
+        )["pixel_values"]
+        with self.torch.inference_mode():
+            tokens = self.model(pixel_values=pixels.to(self.device)).last_hidden_state
+            # Before the patches stand the class token and, in some models, registers.
+            grid = tokens[:, -rows * columns :].float().unflatten(1, (rows, columns)).permute(0, 3, 1, 2)
+            maps = self.torch.nn.functional.interpolate(
+                grid, (height, width), mode="bilinear", align_corners=False
+            )
+            return maps.permute(0, 2, 3, 1).cpu().numpy()
+
+
+def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 518) -> Dinov2Encoder:
+    """DINOv2, with or without registers, from a folder of weights in the layout of Hugging Face.
+
+    Raises:
+        FileNotFoundError: the folder or a file of it is missing.
+        ImportError: torch or transformers is not installed.
+    """
+    files = ("preprocessor_config.json|processor_config.json",)
+    folder = weights_folder(path, "DINOv2's weights", files, "facebook/dinov2-base")
+    torch, transformers = foundation_modules("DINOv2")
+    model = transformers.AutoModel.from_pretrained(folder, local_files_only=True).eval().to(device)
+    # The processor that needs no torchvision.
+    processor = transformers.AutoImageProcessor.from_pretrained(folder, local_files_only=True, backend="pil")
+    return Dinov2Encoder(model, processor, torch, device, resolution)

@@ -1,0 +1,165 @@
+"""Grounded SAM (Ren et al., 2024) through transformers: boxes for a text by Grounding DINO (Liu et al.,
+2024), and the mask of each by SAM (Kirillov et al., 2023). Weights are local files.
+
+Needs the extra `foundation`; torch and transformers are imported when models are loaded.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Num
+
+from gsjax.perception.pictures import to_bytes
+from gsjax.perception.segmenters import name_by_size
+from gsjax.perception.weights import foundation_modules, weights_folder
+
+_PROCESSOR = "preprocessor_config.json|processor_config.json"
+
+
+class Found(NamedTuple):
+    """What the two models found, before it becomes labels."""
+
+    boxes: Float[np.ndarray, "n 4"]  # x0, y0, x1, y1 in pixels
+    scores: Float[np.ndarray, "n"]  # of the boxes, 0 to 1
+    masks: Bool[np.ndarray, "n H W"]
+
+
+@dataclass(frozen=True)
+class GroundedSam:
+    """A segmenter by words; from `load_grounded_sam`.
+
+    Attributes:
+        detector, detector_processor, segmenter, segmenter_processor: of transformers.
+        torch: the module.
+        device: where the models are.
+        prompt: what to look for; several things are separated by full stops. The paper of the object-aware
+            tracker asks for "object".
+        min_box_score, min_text_score: weaker boxes, and weaker words for a box, are dropped.
+        max_fraction: a mask with more of the picture is no object (a table, a wall).
+        max_overlap: of two masks with a larger intersection over union the weaker one is dropped.
+        min_pixels: smaller objects are dropped.
+    """
+
+    detector: Any
+    detector_processor: Any
+    segmenter: Any
+    segmenter_processor: Any
+    torch: Any
+    device: str = "cpu"
+    prompt: str = "object"
+    min_box_score: float = 0.25
+    min_text_score: float = 0.25
+    max_fraction: float = 0.5
+    max_overlap: float = 0.8
+    min_pixels: int = 60
+
+    def __call__(
+        self,
+        image: Num[np.ndarray, "H W 3"],
+        depth: Num[np.ndarray, "..."] | None = None,
+        K: Float[np.ndarray, "3 3"] | None = None,
+    ) -> Int[np.ndarray, "H W"]:
+        """Labels of a picture: 0 background, then 1, 2, ... from the largest object to the smallest.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            depth, K: not used; they stand here so that all segmenters are called alike.
+        """
+        found = self.find(image)
+        return name_by_size(
+            labels_of_masks(found.masks, found.scores, self.max_fraction, self.max_overlap), self.min_pixels
+        )
+
+    def find(self, image: Num[np.ndarray, "H W 3"]) -> Found:
+        """Boxes that fit the prompt, and their masks."""
+        image, size = to_bytes(image), image.shape[:2]
+        text = self.prompt.strip().lower().rstrip(".") + "."
+        inputs = self.detector_processor(images=image, text=text, return_tensors="pt").to(self.device)
+        with self.torch.inference_mode():
+            outputs = self.detector(**inputs)
+        found = self.detector_processor.post_process_grounded_object_detection(
+            outputs,
+            inputs["input_ids"],
+            threshold=self.min_box_score,
+            text_threshold=self.min_text_score,
+            target_sizes=[size],
+        )[0]
+        boxes, scores = found["boxes"].cpu().numpy(), found["scores"].cpu().numpy()
+        if len(boxes) == 0:
+            return Found(boxes, scores, np.zeros((0, *size), bool))
+        return Found(boxes, scores, self._masks(image, boxes))
+
+    def _masks(
+        self, image: Num[np.ndarray, "H W 3"], boxes: Float[np.ndarray, "n 4"]
+    ) -> Bool[np.ndarray, "n H W"]:
+        """One mask a box; the box says enough, so SAM is asked for its single best answer."""
+        inputs = self.segmenter_processor(image, input_boxes=[boxes.tolist()], return_tensors="pt")
+        with self.torch.inference_mode():
+            outputs = self.segmenter(
+                pixel_values=inputs["pixel_values"].to(self.device),
+                input_boxes=inputs["input_boxes"].to(self.device, self.torch.float32),
+                multimask_output=False,
+            )
+        masks = self.segmenter_processor.image_processor.post_process_masks(
+            outputs.pred_masks.cpu(), inputs["original_sizes"], inputs["reshaped_input_sizes"]
+        )
+        return masks[0][:, 0].numpy()
+
+
+def labels_of_masks(
+    masks: Bool[np.ndarray, "n H W"],
+    scores: Float[np.ndarray, "n"],
+    max_fraction: float = 1.0,
+    max_overlap: float = 1.0,
+) -> Int[np.ndarray, "H W"]:
+    """One label image from masks that may overlap: 0 background, 1 + the row of the mask elsewhere.
+
+    A mask with more than `max_fraction` of the picture is left out, and so is one that overlaps a mask of a
+    higher score by more than `max_overlap` (intersection over union). Where masks overlap the smaller is on
+    top: a thing lies on its tray.
+    """
+    kept: list[int] = []
+    for row in np.argsort(-scores, kind="stable"):
+        mask = masks[row]
+        overlaps = [(mask & masks[k]).sum() / max((mask | masks[k]).sum(), 1) for k in kept]
+        if 0 < mask.mean() <= max_fraction and max(overlaps, default=0.0) <= max_overlap:
+            kept.append(int(row))
+    labels = np.zeros(masks.shape[1:], np.int32)
+    for row in sorted(kept, key=lambda k: -int(masks[k].sum())):
+        labels[masks[row]] = row + 1
+    return labels
+
+
+def load_grounded_sam(
+    detector: str | os.PathLike, segmenter: str | os.PathLike, device: str = "cpu", prompt: str = "object"
+) -> GroundedSam:
+    """Grounding DINO and SAM from two folders of weights in the layout of Hugging Face.
+
+    Raises:
+        FileNotFoundError: a folder or a file of it is missing.
+        ImportError: torch or transformers is not installed.
+    """
+    files = (_PROCESSOR, "tokenizer.json|vocab.txt")
+    boxes = weights_folder(detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny")
+    masks = weights_folder(segmenter, "SAM's weights", (_PROCESSOR,), "facebook/sam-vit-base")
+    torch, transformers = foundation_modules("Grounded SAM")
+    local = {"local_files_only": True}
+    # Processors that need no torchvision.
+    pictures = [
+        transformers.AutoImageProcessor.from_pretrained(folder, **local, backend="pil")
+        for folder in (boxes, masks)
+    ]
+    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **local)
+    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **local)
+    sam = transformers.SamModel.from_pretrained(masks, **local)
+    return GroundedSam(
+        detector=dino.eval().to(device),
+        detector_processor=transformers.GroundingDinoProcessor(pictures[0], tokenizer),
+        segmenter=sam.eval().to(device),
+        segmenter_processor=transformers.SamProcessor(pictures[1]),
+        torch=torch,
+        device=device,
+        prompt=prompt,
+    )

@@ -1,0 +1,40 @@
+"""Small things that all who look at pictures need."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Num, UInt8
+
+
+def unit_floats(image: Num[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Colours as floats 0 to 1; integers are taken as bytes, NaN as black."""
+    image = np.asarray(image)
+    scale = 255.0 if np.issubdtype(image.dtype, np.integer) else 1.0
+    return np.clip(np.nan_to_num(image / scale), 0.0, 1.0)
+
+
+def to_bytes(image: Num[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Colours as bytes."""
+    image = np.asarray(image)
+    return image if image.dtype == np.uint8 else np.round(255 * unit_floats(image)).astype(np.uint8)
+
+
+def square_crop(
+    image: Num[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], margin: float = 0.15
+) -> Num[np.ndarray, "side side 3"]:
+    """The smallest square around a mask, `margin` of its side wider on all sides; what sticks out of the
+    picture repeats its border.
+
+    Raises:
+        ValueError: the mask is empty.
+    """
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0:
+        raise ValueError("mask: no pixel is set, so there is nothing to crop")
+    low = np.array([rows.min(), columns.min()])
+    high = np.array([rows.max(), columns.max()]) + 1
+    side = int(np.ceil((high - low).max() * (1 + 2 * margin)))
+    start = np.floor((low + high - side) / 2).astype(int)
+    take: list[Int[np.ndarray, "side"]] = [
+        np.clip(np.arange(begin, begin + side), 0, size - 1)
+        for begin, size in zip(start, mask.shape, strict=True)
+    ]
+    return image[np.ix_(*take)]

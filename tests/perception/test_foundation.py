@@ -1,0 +1,265 @@
+"""Adapters against transformers itself, on tiny models with random weights that the tests save to disk."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+
+from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
+from gsjax.perception.clip import load_clip
+from gsjax.perception.dinov2 import load_dinov2
+from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
+
+there = all(importlib.util.find_spec(name) for name in ("torch", "transformers"))
+needs_foundation = pytest.mark.skipif(
+    not there, reason="torch and transformers are not installed: pip install 'gsjax[foundation]'"
+)
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (37, 52, 3), dtype=np.uint8)
+NORMAL = {"image_mean": [0.5, 0.4, 0.3], "image_std": [0.2, 0.3, 0.4]}
+
+
+def save_bert_tokenizer(folder):
+    from transformers import BertTokenizer
+
+    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "?", "object", "can", "red"]
+    (folder / "vocab.txt").write_text("\n".join(words))
+    BertTokenizer(str(folder / "vocab.txt")).save_pretrained(folder)
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory):
+    import torch
+    from transformers import CLIPConfig, CLIPImageProcessorPil, CLIPModel, CLIPTokenizer
+
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("clip")
+    size = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    vocabulary = [*letters, *(letter + "</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    tokens = {word: i for i, word in enumerate(vocabulary)}
+    special = {"bos_token_id": tokens["<|startoftext|>"], "eos_token_id": tokens["<|endoftext|>"]}
+    config = CLIPConfig(
+        text_config={**size, **special, "vocab_size": len(tokens), "max_position_embeddings": 24},
+        vision_config={**size, "image_size": 32, "patch_size": 8},
+        projection_dim=12,
+    )
+    CLIPModel(config).save_pretrained(folder)
+    (folder / "vocab.json").write_text(json.dumps(tokens))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+    crop = {"height": 32, "width": 32}
+    CLIPImageProcessorPil(size={"shortest_edge": 32}, crop_size=crop).save_pretrained(folder)
+    return folder
+
+
+@needs_foundation
+def test_clip_is_that_of_transformers(clip_folder):
+    import torch
+    from transformers import CLIPImageProcessorPil, CLIPModel, CLIPTokenizer
+
+    encoder = load_clip(clip_folder)
+    assert isinstance(encoder, LanguageEncoder)
+    model = CLIPModel.from_pretrained(clip_folder).eval()
+    images = [IMAGE, IMAGE[::-1, :30]]
+    pixels = CLIPImageProcessorPil.from_pretrained(clip_folder)(images, return_tensors="pt")
+    tokens = CLIPTokenizer.from_pretrained(clip_folder)(["red can"], return_tensors="pt")
+    with torch.no_grad():
+        wanted = model(**pixels, **tokens)
+    np.testing.assert_allclose(encoder.embed_images(images), wanted.image_embeds, atol=1e-5)
+    np.testing.assert_allclose(encoder.embed_text("red can"), wanted.text_embeds[0], atol=1e-5)
+    cosines = encoder.embed_images(images) @ encoder.embed_text("red can")
+    scale = model.logit_scale.exp().item()
+    np.testing.assert_allclose(cosines, wanted.logits_per_image[:, 0] / scale, atol=1e-5)
+
+
+@needs_foundation
+def test_clip_sees_a_square_around_each_object(clip_folder):
+    encoder = load_clip(clip_folder)
+    labels = np.zeros(IMAGE.shape[:2], int)
+    labels[10:20, 20:30] = 3
+    vectors = encoder.embed_objects(IMAGE, labels, 3)
+    assert not vectors[:2].any()
+    side, start = 13, (8, 18)  # 10 pixels, and 15% more on each side, rounded up
+    crop = IMAGE[start[0] : start[0] + side, start[1] : start[1] + side]
+    np.testing.assert_allclose(vectors[2], encoder.embed_images([crop])[0], atol=1e-6)
+    with pytest.raises(ValueError, match="got nothing"):
+        encoder.embed_text("  ")
+
+
+@needs_foundation
+@pytest.mark.parametrize("registers", [0, 3])
+def test_dinov2_is_that_of_transformers(tmp_path, registers):
+    import torch
+    from transformers import (
+        BitImageProcessorPil,
+        Dinov2Config,
+        Dinov2Model,
+        Dinov2WithRegistersConfig,
+        Dinov2WithRegistersModel,
+    )
+
+    torch.manual_seed(0)
+    size = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 32}
+    if registers:
+        config = Dinov2WithRegistersConfig(**size, patch_size=8, num_register_tokens=registers)
+        model = Dinov2WithRegistersModel(config)
+    else:
+        model = Dinov2Model(Dinov2Config(**size, patch_size=8))
+    model.eval().save_pretrained(tmp_path)
+    BitImageProcessorPil(**NORMAL).save_pretrained(tmp_path)
+
+    encoder = load_dinov2(tmp_path, resolution=40)
+    assert isinstance(encoder, DenseEncoder)
+    images = np.stack([IMAGE, IMAGE[:, ::-1]])
+    found = encoder(images)
+
+    # 37 pixels become 40, and 52 become 56: five rows of seven patches.
+    exact = BitImageProcessorPil(**NORMAL, size={"height": 40, "width": 56}, do_center_crop=False)
+    with torch.no_grad():
+        hidden = model(**exact(list(images), return_tensors="pt")).last_hidden_state
+    grid = hidden[:, 1 + registers :].reshape(2, 5, 7, 16).permute(0, 3, 1, 2)
+    upsampled = torch.nn.Upsample((37, 52), mode="bilinear", align_corners=False)(grid)
+    np.testing.assert_allclose(found, upsampled.permute(0, 2, 3, 1), atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def sam_folders(tmp_path_factory):
+    import torch
+    from transformers import (
+        GroundingDinoConfig,
+        GroundingDinoForObjectDetection,
+        GroundingDinoImageProcessorPil,
+        SamConfig,
+        SamImageProcessorPil,
+        SamModel,
+    )
+
+    torch.manual_seed(1)
+    dino, sam = tmp_path_factory.mktemp("dino"), tmp_path_factory.mktemp("sam")
+    text = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    swin = {"embed_dim": 8, "depths": [1, 1, 1], "num_heads": [1, 2, 2], "window_size": 2}
+    config = GroundingDinoConfig(
+        backbone_config={"model_type": "swin", **swin, "out_features": ["stage2", "stage3"]},
+        text_config={"model_type": "bert", "vocab_size": 10, **text},
+        d_model=32,
+        encoder_layers=1,
+        decoder_layers=2,
+        encoder_attention_heads=2,
+        decoder_attention_heads=2,
+        encoder_ffn_dim=16,
+        decoder_ffn_dim=16,
+        num_queries=6,
+        num_feature_levels=3,
+    )
+    GroundingDinoForObjectDetection(config).save_pretrained(dino)
+    GroundingDinoImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 96}).save_pretrained(dino)
+    save_bert_tokenizer(dino)
+    vision = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "mlp_dim": 16}
+    vision |= {"image_size": 64, "patch_size": 8, "output_channels": 8, "num_pos_feats": 4}
+    decoder = {"hidden_size": 8, "mlp_dim": 8, "num_attention_heads": 2, "iou_head_hidden_dim": 8}
+    prompt = {"hidden_size": 8, "image_size": 64, "patch_size": 8, "image_embedding_size": 8}
+    prompt |= {"mask_input_channels": 4}
+    SamModel(
+        SamConfig(vision_config=vision, mask_decoder_config=decoder, prompt_encoder_config=prompt)
+    ).save_pretrained(sam)
+    pad = {"height": 64, "width": 64}
+    SamImageProcessorPil(size={"longest_edge": 64}, pad_size=pad).save_pretrained(sam)
+    return dino, sam
+
+
+@needs_foundation
+def test_grounded_sam_is_that_of_transformers(sam_folders):
+    import dataclasses
+
+    import torch
+    from transformers import (
+        BertTokenizer,
+        GroundingDinoForObjectDetection,
+        GroundingDinoImageProcessorPil,
+        GroundingDinoProcessor,
+        SamImageProcessorPil,
+        SamModel,
+        SamProcessor,
+    )
+
+    dino, sam = sam_folders
+    loaded = load_grounded_sam(dino, sam)
+    assert isinstance(loaded, Segmenter)
+    assert loaded.prompt == "object"
+    # Random weights are sure of nothing.
+    adapter = dataclasses.replace(loaded, min_box_score=0.0, min_text_score=0.0, min_pixels=1)
+    found = adapter.find(IMAGE)
+
+    processor = GroundingDinoProcessor(
+        GroundingDinoImageProcessorPil.from_pretrained(dino), BertTokenizer.from_pretrained(dino)
+    )
+    inputs = processor(images=IMAGE, text=[["object"]], return_tensors="pt")
+    with torch.no_grad():
+        outputs = GroundingDinoForObjectDetection.from_pretrained(dino).eval()(**inputs)
+    wanted = processor.post_process_grounded_object_detection(
+        outputs, threshold=0.0, text_threshold=0.0, input_ids=inputs.input_ids, target_sizes=[(37, 52)]
+    )[0]
+    assert len(found.boxes) == 6
+    np.testing.assert_allclose(found.boxes, wanted["boxes"], atol=1e-5)
+    np.testing.assert_allclose(found.scores, wanted["scores"], atol=1e-5)
+
+    segment = SamProcessor(SamImageProcessorPil.from_pretrained(sam))
+    prompted = segment(IMAGE, input_boxes=[wanted["boxes"].tolist()], return_tensors="pt")
+    prompted["input_boxes"] = prompted["input_boxes"].float()
+    sizes = prompted["original_sizes"], prompted["reshaped_input_sizes"]
+    with torch.no_grad():
+        outputs = SamModel.from_pretrained(sam).eval()(
+            pixel_values=prompted["pixel_values"],
+            input_boxes=prompted["input_boxes"],
+            multimask_output=False,
+        )
+    masks = segment.image_processor.post_process_masks(outputs.pred_masks, *sizes)[0][:, 0].numpy()
+    assert 0 < masks.mean() < 1
+    np.testing.assert_array_equal(found.masks, masks)
+    labels = adapter(IMAGE)
+    assert labels.shape == (37, 52)
+    assert ((labels > 0) <= masks.any(0)).all()
+
+
+@needs_foundation
+def test_grounded_sam_that_finds_nothing_labels_nothing(sam_folders):
+    import dataclasses
+
+    adapter = dataclasses.replace(load_grounded_sam(*sam_folders), min_box_score=1.0)
+    assert not adapter(IMAGE).any()
+
+
+def test_of_two_masks_the_smaller_is_on_top_and_doubles_are_dropped():
+    masks = np.zeros((5, 20, 20), bool)
+    masks[0, 2:12, 2:12] = True  # a tray
+    masks[1, 4:8, 4:8] = True  # a thing in it
+    masks[2, 4:8, 4:9] = True  # the same thing again, with a lower score
+    masks[3] = True  # the table
+    scores = np.array([0.6, 0.9, 0.5, 0.99, 0.8])  # the last mask is empty
+    labels = labels_of_masks(masks, scores, max_fraction=0.5, max_overlap=0.7)
+    assert np.unique(labels).tolist() == [0, 1, 2]
+    assert (labels[4:8, 4:8] == 2).all()
+    assert (labels > 0).sum() == 100
+
+
+LOADERS = [load_clip, load_dinov2, lambda path: load_grounded_sam(path, path)]
+
+
+@pytest.mark.parametrize("load", LOADERS)
+def test_a_wrong_path_says_what_was_looked_for_and_how_to_get_it(load, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere: expected a folder of .*config\.json.*hf download"):
+        load(tmp_path / "nowhere")
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(FileNotFoundError, match=r"it lacks model\.safetensors or .*found config\.json"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("load", LOADERS)
+def test_without_the_extra_it_is_named(load, tmp_path, monkeypatch):
+    for name in ("config.json", "model.safetensors", "preprocessor_config.json", "tokenizer.json"):
+        (tmp_path / name).write_text("{}")
+    monkeypatch.setitem(__import__("sys").modules, "torch", None)
+    with pytest.raises(ImportError, match=r"torch is not installed: pip install 'gsjax\[foundation\]'"):
+        load(tmp_path)
