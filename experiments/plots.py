@@ -1,9 +1,106 @@
 """Figures of the experiments with a robot."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+INK, FAINT, GRID = "#22262b", "#6b7280", "#e4e7eb"
+BLUE, GREEN, GREY, ORANGE = "#0072b2", "#009e73", "#9aa0a8", "#d55e00"
+GRASPING = {"tracker": BLUE, "true poses": GREEN, "first frame": GREY}
+POLICIES = {"tracked Gaussians": BLUE, "images": ORANGE, "true poses": GREEN}
 
 
-def draw_grasping(rows: list[dict], path: Path) -> None:
-    from matplotlib.figure import Figure
+def wilson(successes: float, count: int) -> tuple[float, float]:
+    """The 95 % interval of a rate (Wilson, JASA 1927), which keeps its width where all or none succeed."""
+    z, rate = 1.96, successes / count
+    middle = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * np.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
+    return middle - half, middle + half
 
-    Figure().savefig(path)
+
+def draw_grasping(rows: list[dict[str, Any]], path: Path) -> None:
+    """Rates of success, and the tracker's errors as shares of trials."""
+    drawing = Figure(figsize=(9.8, 3.8), facecolor="white", layout="constrained")
+    left, right = drawing.subplots(1, 2, width_ratios=(1.25, 1))
+    _axes(left, "Lifted by 10 cm and held", "", "share of trials")
+    groups = [kind for kind in ("still", "moving") if any(row["object"] == kind for row in rows)]
+    for i, (source, color) in enumerate(GRASPING.items()):
+        found = [
+            [r["success"] for r in rows if (r["object"], r["grasp from"]) == (g, source)] for g in groups
+        ]
+        _bars(left, [g + 0.27 * (i - 1) for g in range(len(groups))], found, color, source, 0.24)
+    counts = [sum(r["object"] == g and r["grasp from"] == "tracker" for r in rows) for g in groups]
+    names = {"still": "object lies still", "moving": "on a belt, 3 to 8 cm/s"}
+    ticks = [f"{names[g]}\n{n} trials each" for g, n in zip(groups, counts, strict=True)]
+    left.set_xticks(range(len(groups)), ticks, color=INK)
+    left.set(ylim=(0, 1.17), yticks=np.linspace(0, 1, 6))
+    left.grid(axis="x", visible=False)
+    _axes(right, "The tracker, as the fingers close", "centroid error (mm)", "share of trials")
+    for group, style in zip(groups, ("-", (0, (4, 2))), strict=False):
+        mine = [row for row in rows if (row["object"], row["grasp from"]) == (group, "tracker")]
+        errors = np.sort([row["error_before_mm"] for row in mine if row["error_before_mm"] is not None])
+        shares = np.arange(1, len(errors) + 1) / max(len(errors), 1)
+        right.step(errors, shares, where="post", color=BLUE, ls=style, lw=1.8, label=names[group])
+    right.set(xscale="log", ylim=(0, 1.03))
+    right.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    right.legend(frameon=False, fontsize=9.5, labelcolor=INK, loc="lower right")
+    handles, labels = left.get_legend_handles_labels()
+    style = {"frameon": False, "fontsize": 9.5, "labelcolor": INK, "columnspacing": 1.4, "handlelength": 1.1}
+    titles = [
+        f"grasp from {label}" if label != "first frame" else "first frame's, no updates" for label in labels
+    ]
+    drawing.legend(handles, titles, loc="outside lower left", ncols=3, **style)
+    drawing.savefig(path, dpi=160)
+
+
+def draw_policies(rows: list[dict[str, Any]], path: Path) -> None:
+    """Rates of success: a bar of all rollouts, and a dot for each training seed."""
+    drawing = Figure(figsize=(6.4, 3.7), facecolor="white", layout="constrained")
+    axes = drawing.subplots()
+    _axes(axes, "A can put into its bin", "", "share of rollouts")
+    kinds = [kind for kind in POLICIES if any(row["sees"] == kind for row in rows)]
+    ticks = []
+    for place, kind in enumerate(kinds):
+        mine = [row for row in rows if row["sees"] == kind]
+        seeds = sorted({row["trained"] for row in mine})
+        _bars(axes, [place], [[row["success"] for row in mine]], POLICIES[kind], None, 0.5)
+        for i, seed in enumerate(seeds):
+            rate = np.mean([row["success"] for row in mine if row["trained"] == seed])
+            at = place + 0.1 * (i - (len(seeds) - 1) / 2)
+            axes.plot(at, rate, "o", ms=6, mfc="white", mec=INK, mew=1.2, zorder=4, clip_on=False)
+        plural = "" if len(seeds) == 1 else "s"
+        ticks.append(f"{kind}\n{len(mine)} rollouts, {len(seeds)} training seed{plural}")
+    axes.set_xticks(range(len(kinds)), ticks, color=INK)
+    axes.set(ylim=(0, 1.17), yticks=np.linspace(0, 1, 6), xlim=(-0.5, len(kinds) - 0.5))
+    axes.grid(axis="x", visible=False)
+    drawing.savefig(path, dpi=160)
+
+
+def _bars(
+    axes: Axes, at: Sequence[float], found: list[list[float]], color: str, label: str | None, width: float
+) -> None:
+    """Bars of rates, their 95 % intervals, and the rates in words above those."""
+    rates = [float(np.mean(values)) if values else np.nan for values in found]
+    axes.bar(at, rates, width, color=color, label=label, zorder=2)
+    for x, values, rate in zip(at, found, rates, strict=True):
+        if values:
+            low, high = wilson(sum(values), len(values))
+            axes.plot([x, x], [low, high], color=INK, lw=1.2, zorder=3)
+            axes.text(x, high + 0.02, f"{rate:.0%}", ha="center", va="bottom", fontsize=9.5, color=INK)
+
+
+def _axes(axes: Axes, title: str, xlabel: str, ylabel: str) -> None:
+    """The package's look of a plot."""
+    axes.set_title(title, loc="left", fontsize=11.5, fontweight="bold", color=INK, pad=10)
+    axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
+    axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
+    axes.tick_params(colors=FAINT, labelsize=9.5, length=0, which="both")
+    axes.grid(color=GRID, lw=0.8)
+    axes.set_axisbelow(True)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    axes.spines["bottom"].set_color(GRID)

@@ -4,7 +4,7 @@ After Object-Aware Gaussian Splatting for Robotic Manipulation, section III-B: s
 object's points and take the one with the largest antipodal score. Two contacts hold an object if the line
 between them lies in both friction cones (Nguyen, Constructing force-closure grasps, IJRR 1988); for curved
 surfaces these are the antipodal points (Chen and Burdick, Finding antipodal point grasps on irregularly
-shaped objects, T-RO 1993). The score of a grasp is therefore the smaller of its two contacts' cosines between
+shaped objects, T-RA 1993). The score of a grasp is therefore the smaller of its two contacts' cosines between
 outward normal and closing axis. It has to be that of friction's cone at least: cos(arctan(friction)).
 
 Tool axes: z is the approach, from the palm to the fingertips; y is the closing axis, from one finger to the

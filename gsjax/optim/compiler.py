@@ -25,7 +25,7 @@ def has_avx512() -> bool:
     return cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _KEPT = 2**30  # bytes: the largest array, and how much freed memory
 
 
@@ -34,10 +34,11 @@ def keep_freed_memory() -> bool:
 
     XLA:CPU allocates a program's temporary arrays anew in every call. glibc takes large ones from the kernel
     and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
-    for 110,000 Gaussians at 648x420. This raises its thresholds, and has all threads share one heap, for what
-    threads have of their own ends at 64 MB. It holds for the whole process, but for threads that are there
-    already: call it once, before JAX computes anything. The command line does. MALLOC_MMAP_THRESHOLD_,
-    MALLOC_TRIM_THRESHOLD_ and MALLOC_ARENA_MAX in the environment do the same.
+    for 110,000 Gaussians at 648x420. This raises its thresholds. Threads keep their own heaps: in one for all,
+    what a compiler leaves behind makes every later allocation longer (a third of a tracker's update).
+    It holds for the whole process, but for threads that are there already: call it once, before JAX computes
+    anything. The command line does. MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ in the environment do
+    the same.
 
     Returns:
         whether it could: False where the C library is not glibc of 2.35 or later, and nothing is changed.
@@ -48,4 +49,4 @@ def keep_freed_memory() -> bool:
         return False
     if not mallopt(_MMAP_THRESHOLD, _KEPT):  # older ones refuse that, and the rest alone would do harm
         return False
-    return bool(mallopt(_TRIM_THRESHOLD, _KEPT)) and bool(mallopt(_ARENA_MAX, 1))
+    return bool(mallopt(_TRIM_THRESHOLD, _KEPT))

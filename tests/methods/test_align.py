@@ -28,7 +28,6 @@ from gsjax.methods.object_tracker.points import (
     join,
     pixels_of_groups,
     renewed,
-    sample_groups,
     sight_of,
     tones,
 )
@@ -159,16 +158,6 @@ def test_the_first_members_of_a_group_are_distinct_members_and_as_many_as_there_
         found = rows[group - 1][real[group - 1]]
         assert len(set(found)) == len(found) == min(per_group, groups.count(group))
         assert all(groups[row] == group for row in found)
-
-
-def test_samples_are_capped_and_never_strangers():
-    groups = jnp.asarray([1] * 30 + [2] * 3 + [4] * 7)
-    means = jnp.tile(groups[:, None].astype(jnp.float32), (1, 3))
-    few = sample_groups(means, means, jnp.ones((2, 40)), groups, 4, 8)
-    assert few.means.shape == (4, 2, 3, 8)
-    real = np.asarray(few.seen) > 0
-    np.testing.assert_array_equal(real.sum(2), [[8, 8], [3, 3], [0, 0], [7, 7]])
-    np.testing.assert_array_equal(few.means[:, :, 0][real], np.nonzero(real)[0] + 1)
 
 
 def test_without_turns_only_translation_is_sought_and_found(moved):

@@ -19,7 +19,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, Sight, carry
+from gsjax.methods.object_tracker.points import Points, Sight, carry, rotated
 
 
 class Read(NamedTuple):
@@ -63,9 +63,9 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
     scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
 
     def one(means, tones, viewmat, K, image):
-        local = viewmat[:3, :3] @ means + viewmat[:3, 3:]
+        local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = jnp.maximum(local[2], 1e-6)
-        x, y = (K[:2] @ local) / z
+        x, y, _ = rotated(K, local) / z
         inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
         found, (across, along), nearest = bilinear(image, x, y)
         wanted, counts = tones, jnp.broadcast_to(inside, tones.shape)
@@ -81,8 +81,8 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
         gradients = gradients.at[2].add(-(x * across + y * along) / z)
         if channels == 4:
             gradients = gradients.at[2, 3].add(-1.0)
-        in_world = jnp.einsum("ji,jdp->idp", viewmat[:3, :3], gradients / scales)
-        return Residuals((found - wanted) / scales, counts, in_world)
+        gradients = jnp.swapaxes(rotated(viewmat[:3, :3].T, jnp.swapaxes(gradients / scales, 0, 1)), 0, 1)
+        return Residuals((found - wanted) / scales, counts, gradients)
 
     return jax.vmap(one)(points.means, points.tones, sight.cameras.viewmat, sight.cameras.K, sight.pixels)
 

@@ -45,7 +45,7 @@ def ladder(config: TrackerConfig, num_cameras: int) -> dict[str, TrackerConfig]:
     """Settings from the richest to the cheapest; how a scene starts and grows is always as in `config`."""
     shared = {"start": config.start, "headroom": config.headroom}
     rungs = {name: replace(preset, **shared) for name, preset in PRESETS.items()}
-    small = replace(rungs["fast"], shrink=2, coarseness=1)
+    small = replace(rungs["fast"], shrink=2)
     rungs["fast, half the resolution"] = small
     for count in range(num_cameras - 1, 0, -1):
         cameras = "1 camera" if count == 1 else f"{count} cameras"
@@ -76,8 +76,9 @@ def choose(
         at -= 1
     while cost(names[at], 1) > _USED * budget and at + 1 < len(names):
         at += 1
-    name = names[at]
-    return Chosen(name, rungs[name], tried[name], tried, cost(name, 1) <= budget)
+    fits = cost(names[at], 1) <= budget
+    name = names[at] if fits else min(tried, key=lambda name: tried[name].base)
+    return Chosen(name, rungs[name], tried[name], tried, fits)
 
 
 class Governor:

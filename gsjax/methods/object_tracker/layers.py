@@ -134,14 +134,13 @@ def show_moving(
 
 
 def seen_from(
-    scene: TrackedScene, pose: Pose, shown: Shown, cameras: Camera, gap: float
+    means: Float[Array, "m 3"], groups: Int[Array, "m"], shown: Shown, cameras: Camera, gap: float
 ) -> Float[Array, "c m"]:
-    """1 for each moving Gaussian that a camera sees: its label is on top there and its depth agrees."""
-    groups = scene.labels[: scene.num_moving]
+    """1 for each Gaussian of a group that a camera sees: its label is on top there and its depth agrees."""
     width, height = cameras.width, cameras.height
 
     def one(viewmat, K, labels, depths):
-        pixels, z = project(pose.means, viewmat, K)
+        pixels, z = project(means, viewmat, K)
         column, row = jnp.floor(pixels).astype(jnp.int32).T
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
         column, row = jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1)

@@ -90,34 +90,33 @@ def look_everywhere(
 
     Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
     match. Then turns to all sides are tried from the best, because a knock changes a spin from one frame to
-    the next, and a round thing may roll without its shape changing.
+    the next, and a round thing may roll without its shape changing. Half the points choose among these; all
+    of them have the last word.
     """
-    wide = widened(config)
+    wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 
-    def judged(twists, points, config):
-        return jax.vmap(disagreement, in_axes=(0, None, None, None, None))(
-            twists, points, center, sight, config
-        )
+    def judged(twists, points, config) -> Found:
+        over_twists = jax.vmap(disagreement, in_axes=(0, None, None, None, None))
+        return least(over_twists(twists, points, center, sight, config), twists)
 
-    def better(known: Found, twists, with_config) -> Found:
-        """`known`, or what of `twists` agrees better once aligned."""
-        aligned = jax.vmap(align, in_axes=(0, None, None, None, None))(
-            twists, points, center, sight, with_config
-        )
-        residuals = jnp.append(known.residuals, judged(aligned, points, config))
-        return least(residuals, jnp.concatenate([known.twists[None], aligned]))
+    def aligned(twists):
+        over_twists = jax.vmap(align, in_axes=(0, None, None, None, None))
+        return over_twists(twists, half, center, sight, wide)
 
     starts = jnp.concatenate([starts, known.twists[None]])
     # By colour alone, a plain thing would slide about within its outline.
     if sight.depths is not None and config.reach:
         shifts = jnp.asarray(ball(config.reach, config.spacing), starts.dtype)
         shifts = jnp.zeros((len(shifts), 6), starts.dtype).at[:, :3].set(shifts)
-        some = jax.tree.map(lambda a: a[..., ::4], points)
-        starts = jnp.concatenate([starts, least(judged(shifts, some, wide), shifts).twists[None]])
-    best = better(known, starts, wide)
+        few = jax.tree.map(lambda a: a[..., ::4], points)
+        starts = jnp.concatenate([starts, judged(shifts, few, wide).twists[None]])
+    best = judged(aligned(starts), half, config).twists
     if config.max_turn and config.turns:
-        best = better(best, turned(best.twists, principal_axes(points, center), config.turns), wide)
-    return better(best, best.twists[None], config)
+        best = judged(
+            aligned(turned(best, principal_axes(points, center), config.turns)), half, config
+        ).twists
+    tried = jnp.stack([known.twists, align(best, points, center, sight, config)])
+    return judged(tried, points, config)
 
 
 class Watch(NamedTuple):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.geometry.cameras import Camera
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.layers import (
@@ -30,11 +31,11 @@ from gsjax.methods.object_tracker.points import (
     carry_keyframe,
     faded,
     first_keyframe,
+    first_members,
     join,
     pixel_counts,
     pixels_of_groups,
     renewed,
-    sample_groups,
     sight_of,
     tones,
 )
@@ -83,23 +84,27 @@ class TrackerBatch(NamedTuple):
     everywhere: Int[Array, ""] | None = None  # groups to look for everywhere; None: as the config says
 
 
-def _named(scene: TrackedScene, pose: Pose, seen: Float[Array, "c m"], config: TrackerConfig) -> Points:
+def _named(scene: TrackedScene, pose: Pose, last: "_Last", config: TrackerConfig) -> Points:
     """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
+    groups = scene.labels[: scene.num_moving]
+    rows, real = first_members(groups, scene.num_objects, min(config.align.centers, scene.num_moving))
     # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
-    named = with_normal | ~with_normal.any()
-    colors = scene.gaussians.sh0[: scene.num_moving, 0] * SH_C0 + 0.5
-    groups = scene.labels[: scene.num_moving]
-    seen = config.align.center_weight * seen * named
-    of_colors = tones(colors, config.align.shading)
-    return sample_groups(pose.means, of_colors, seen, groups, scene.num_objects, config.align.centers)
+    named = (with_normal | ~with_normal.any())[rows] & real
+    own = (pose.means[rows.ravel()], groups[rows.ravel()])
+    seen = seen_from(*own, last.shown, last.cameras, config.start.depth_gap)
+    seen = config.align.center_weight * jnp.moveaxis(seen.reshape(-1, *rows.shape), 0, 1) * named[:, None]
+    colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.align.shading)
+    in_all = (*seen.shape[:2], 3, seen.shape[2])
+    of_each = (jnp.swapaxes(a, 1, 2)[:, None] for a in (pose.means[rows], colors))
+    return Points(*(jnp.broadcast_to(a, in_all) for a in of_each), seen)
 
 
 class _Last(NamedTuple):
     """The last scene, before it has moved."""
 
-    seen: Float[Array, "c m"]  # 1 for each moving Gaussian that a camera saw
-    shown: Float[Array, "k"]  # pixels of each group, all cameras together
+    shown: Shown
+    cameras: Camera  # it is shown to
     template: Template | None
     rendered: Rendered | None  # where the whole scene was drawn
 
@@ -155,23 +160,19 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
     def look_back(params: Pose, state: TrackerState, batch: TrackerBatch) -> _Last:
         """What the last scene shows."""
         scene, frame, plan, _ = batch
-        gap = config.start.depth_gap
         if keep:
             assert state.shown is not None
             assert state.backdrop is not None
-            seen = seen_from(scene, params, state.shown, state.backdrop.cameras, gap)
-            count = pixel_counts(state.shown.labels, num_objects)
-            if state.images is None:
-                return _Last(seen, count, None, None)
-            weights = jax.nn.one_hot(state.shown.labels - 1, num_objects)
-            return _Last(seen, count, Template(state.images, state.shown.depths, weights), None)
+            shown, cameras, template = state.shown, state.backdrop.cameras, None
+            if state.images is not None:
+                template = Template(state.images, shown.depths, jax.nn.one_hot(shown.labels - 1, num_objects))
+            return _Last(shown, cameras, template, None)
         last = render_labels(scene, params, frame, plan.full, one_sided=True)
         assert last.features is not None
         mostly = last.features.max(-1) > 0.5
         labels = jnp.where(mostly, jnp.argmax(last.features, axis=-1), 0).astype(jnp.int32)
-        seen = seen_from(scene, params, Shown(labels, last.depths, mostly), frame.cameras, gap)
-        count = pixel_counts(labels, num_objects)
-        return _Last(seen, count, Template(last.colors, last.depths, last.features[..., 1:]), last)
+        template = Template(last.colors, last.depths, last.features[..., 1:])
+        return _Last(Shown(labels, last.depths, mostly), frame.cameras, template, last)
 
     def update(params: Pose, state: TrackerState, batch: TrackerBatch, *, step: Any, key: Any):
         scene, frame, plan, everywhere = batch
@@ -181,11 +182,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
         last = look_back(params, state, batch)
         enough = _ENOUGH_PIXELS / config.coarseness**2
-        visible = last.shown > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)
+        counts = pixel_counts(last.shown.labels, num_objects)
+        visible = counts > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)
         jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
-        points = join(_named(scene, params, last.seen, config), state.pixels, remembered)
+        points = join(_named(scene, params, last, config), state.pixels, remembered)
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
@@ -238,7 +240,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, looked_for, last.shown)
+        watch = state.watch.after(residual, looked_for, counts)
         new_state = TrackerState(kept, pixels, keyframe, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {

@@ -1,0 +1,60 @@
+"""Behaviour cloning on what the tracker says of an object, beside images and the truth."""
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with a robot share
+
+import numpy as np
+from bins import HORIZON, Bins
+from demonstrations import HOME
+from learning import CHUNK, act, trained, vector_of
+from sight import Tracking, small
+
+
+@cache
+def world() -> Bins:
+    return Bins()
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """One rollout of the policy that sees `options["sees"]`, trained from the seed `options["trained"]`."""
+    seen, bins = options["sees"], world()
+    policy = trained(HOME, seen, options["trained"])
+    bins.begin(seed)
+    tracking, first, errors, chunk, start = Tracking(bins), None, [], [], bins.can()
+    periods = 0
+    while periods < HORIZON and not bins.success():
+        periods += 1
+        pose, images = bins.can(), np.zeros((0, 1, 1, 3), np.float32)
+        if seen == "tracked Gaussians":  # in every period, or what it follows jumps
+            pose = tracking.see(*bins.cameras.images(bins.data))
+            offset = np.linalg.inv(start) @ (first if first is not None else pose)
+            errors.append(1e3 * float(np.linalg.norm((bins.can() @ offset - pose)[:3, 3])))
+        first = pose if first is None else first
+        if not chunk:
+            if seen == "images":
+                images = small(bins.cameras.images(bins.data)[0]).astype(np.float32) / 255
+            vector = vector_of(seen, bins.feel().vector(), pose, first)
+            chunk = list(np.asarray(act(policy, vector.astype(np.float32), images)))
+        bins.move(chunk.pop(0), guarded=True)
+    made = json.loads((HOME / "demonstrations.json").read_text())
+    return {
+        "success": float(bins.success()),
+        "lifted": float(bins.lifted),
+        "periods": periods,
+        "error_mm": float(np.median(errors)) if errors else None,
+        "chunk": CHUNK,
+        "demonstrations": made["kept"],
+        "tried": made["tried"],
+    }
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """How often each policy succeeds."""
+    from plots import draw_policies
+
+    draw_policies(rows, path)

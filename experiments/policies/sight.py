@@ -1,0 +1,60 @@
+"""What policies are shown of the can: by the tracker, in truth, or only images."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from bins import CAN, Bins
+from panda import as_frame, fed, motion_between, start
+
+import gsjax
+from gsjax.methods.object_tracker import PRESETS
+from gsjax.scene.frame import Frame
+
+FAST = PRESETS["fast"]
+# `fast` goes on from where things were and loses what a gripper lifts: it is looked for up to 3 cm around.
+CONFIG = replace(FAST, align=replace(FAST.align, reach=0.03), grow=replace(FAST.grow, slots=0))
+OWN, BACKGROUND = 256, 4096  # Gaussians of the can and of everything else
+SMALL = (80, 60)  # width and height of what the image policy sees
+
+
+class Tracking:
+    """The can as the tracker follows it from the mask of the first frame, which is the simulator's."""
+
+    def __init__(self, world: Bins):
+        self.world, self.box, self.frames = world, [], None
+        self.begun = world.can()
+
+    def see(self, colors: np.ndarray, depths: np.ndarray) -> np.ndarray:
+        """Object to world [4, 4]: axes of the first frame, origin at the centroid of its Gaussians."""
+        frame = as_frame(colors, depths, self.world.cameras.cameras)
+        if self.frames is None:
+            return self._start(frame)
+        self.box.append(frame)
+        now = np.asarray(next(self.frames).pose.means)[self.rows]
+        pose = motion_between(self.first, now)
+        pose[:3, 3] = now.mean(0)
+        return pose
+
+    def _start(self, frame: Frame) -> np.ndarray:
+        mask = self.world.cameras.mask(self.world.data, 0, [CAN])
+        scene = start(frame, mask, 0, CONFIG.start, OWN, BACKGROUND)
+        self.rows = np.flatnonzero(np.asarray(scene.labels) > 0)
+        self.first = np.asarray(scene.gaussians.means)[self.rows]
+        self.frames = gsjax.track(scene, frame, fed(self.box), CONFIG)
+        pose = np.eye(4)
+        pose[:3, 3] = self.first.mean(0)
+        return pose
+
+
+def small(colors: np.ndarray) -> np.ndarray:
+    """Images of 8 bits [C, h, w, 3] as the image policy sees them."""
+    return np.stack([cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA) for image in colors])
+
+
+def described(pose: np.ndarray, first: np.ndarray, felt: np.ndarray) -> np.ndarray:
+    """An object's pose as a policy reads it: centre, way from the tool, and turn since the first frame (its
+    first two columns, Zhou et al., On the continuity of rotation representations, CVPR 2019)."""
+    center = pose[:3, 3]
+    turn = pose[:3, :3] @ first[:3, :3].T
+    return np.concatenate([center, center - felt[3:6], turn[:, 0], turn[:, 1]]).astype(np.float32)
