@@ -34,8 +34,8 @@ def keep_freed_memory() -> bool:
 
     XLA:CPU allocates a program's temporary arrays anew in every call. glibc takes large ones from the kernel
     and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
-    for 110,000 Gaussians at 648x420. This raises its thresholds. Threads keep their own heaps: in one for all,
-    what a compiler leaves behind makes every later allocation longer (a third of a tracker's update).
+    for 110,000 Gaussians at 648x420. This raises its thresholds. Threads keep heaps of their own: in one for
+    all, what a compiler leaves behind makes every later allocation longer (a third of a tracker's update).
     It holds for the whole process, but for threads that are there already: call it once, before JAX computes
     anything. The command line does. MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ in the environment do
     the same.

@@ -217,9 +217,9 @@ class TrackerConfig:
 
 FAST = TrackerConfig(
     start=StartConfig(object_pixels=2.5, background_pixels=6.0),
-    align=AlignConfig(iterations=5, pixels=96, centers=64, everywhere=2),
+    align=AlignConfig(iterations=4, pixels=96, centers=64, everywhere=2),
     refine=RefineConfig(iterations=0),
-    grow=GrowConfig(candidates=32),
+    grow=GrowConfig(candidates=16),
     matching=False,
     redraw="moving",
     coarseness=2,
