@@ -22,12 +22,13 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import budget_metrics
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, Newest, Snapshot, replay
-from gsjax.methods.object_tracker import Tracked, TrackedScene, start_scene, track
+from gsjax.methods.object_tracker import PRESETS, Tracked, TrackedScene, start_scene, track
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 
 CAMERA_PREFIX = "camera:"
 _MEMORY_EVERY_S = 1.0
+CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the budget
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def _open(options: Options, console: Console) -> Source:
         first = next(stream).frame
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         mask = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K)
-        return Source(first, start_scene(first, mask.astype(np.int32)), {}, stream)
+        return Source(first, start_scene(first, mask.astype(np.int32), 0, CONFIG), {}, stream)
     recording = open_recording(options.source, options.cameras, (), options.frames)
     mask = first_mask(recording.tracked, options.mask_camera, options.masks)
     if mask.labels is None:
@@ -139,7 +140,7 @@ def _open(options: Options, console: Console) -> Source:
     draw_ahead(recording, console)
     frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
     with console.status("fitting the scene to the first frame"):
-        scene = start_scene(frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera))
+        scene = start_scene(frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera), CONFIG)
     names = label_names(recording, mask.source)
     return Source(frames[0], scene, names, replay(frames, options.hz, options.seconds))
 
@@ -240,7 +241,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
 
     try:
         with console.status("measuring what updates cost") as status:
-            updates = track(source.scene, source.first, frames(), budget_ms=budget_ms)
+            updates = track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms)
             for update in updates:
                 if not arrived:
                     continue

@@ -59,16 +59,19 @@ class Options:
     """Replace a finished run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
-    preset: Literal["accurate", "fast"] = "accurate"
+    preset: Literal["accurate", "balanced", "fast"] = "accurate"
     """What the tracker's settings are unless given: for small errors, or for 30 Hz."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """The tracker's own settings."""
 
 
 def options_for(arguments: list[str]) -> type[Options]:
-    """The options where a preset is named: the tracker's are those of the preset unless given."""
+    """The options where a preset is named: the tracker's are those of the preset unless given. A budget names
+    `fast`, for a scene of fewer Gaussians to start from."""
     named = [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
     named += [after for a, after in itertools.pairwise(arguments) if a == "--preset"]
+    if not named and any(a.split("=")[0].replace("_", "-") == "--budget-ms" for a in arguments):
+        named = ["fast"]
     if not named or named[-1] not in PRESETS:
         return Options
     tracker = ("tracker", TrackerConfig, field(default=PRESETS[named[-1]]))
