@@ -274,9 +274,9 @@ def _print(found: dict[str, Any], folder: RunFolder) -> None:
         table.add_row("[bold]rate[/]", f"{found['hz']:.1f} Hz" if found["hz"] else "one update")
         spread = ", ".join(f"{name} {value:.0f} ms" for name, value in latency.items())
         table.add_row("[bold]latency[/]", f"from arrival to the new state: {spread}")
-        table.add_row(
-            "[bold]late[/]", f"{found['late']} updates over the budget; settings: {found['budget']['chosen']}"
-        )
+        table.add_row("[bold]late[/]", f"{found['late']} updates were over the budget")
+    if found["budget"]:
+        table.add_row("[bold]settings[/]", found["budget"]["chosen"])
     if memory:
         table.add_row(
             "[bold]memory[/]", f"{memory['first']:.0f} MB at first, {memory['last']:.0f} MB at last"

@@ -92,11 +92,10 @@ def load(folder: Path, first: Frame, config: TrackerConfig) -> tuple[Tracking, T
     chosen = _chosen(found["chosen"], config, len(first.images))
     scene, final = _blank_scene(**found["first"]), _blank_scene(**found["final"])
     pose = first_pose(final)
-    state = jax.eval_shape(
-        lambda: first_state(final, pose, first, config if chosen is None else chosen.config)
-    )
+    state = first_state(final, pose, first, config if chosen is None else chosen.config)
     (scene, final, pose, state), _ = load_checkpoint(path, (scene, final, pose, state))
-    poses = [jax.device_get(first_pose(scene)), *_saved_poses(folder, found["frames"])]
+    start = jax.device_get(first_pose(scene))
+    poses = [start, *_saved_poses(folder, found["frames"], jax.tree.structure(start))]
     tracking = Tracking(
         scene,
         poses,
@@ -117,14 +116,14 @@ def _part(folder: Path, frames: int) -> Path:
     return folder / f"poses_{frames:06d}.npz"
 
 
-def _saved_poses(folder: Path, frames: int) -> list[Pose]:
+def _saved_poses(folder: Path, frames: int, structure: Any) -> list[Pose]:
     """The poses after the first one. Parts that were written after the state are of another life."""
     poses = []
     for path in sorted(folder.glob("poses_*.npz")):
         if int(path.stem.removeprefix("poses_")) <= frames:
             with np.load(path, allow_pickle=False) as part:
-                rows = zip(part["means"], part["quats"], strict=True)
-                poses.extend(Pose(means, quats) for means, quats in rows)
+                rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
+                poses.extend(jax.tree.unflatten(structure, row) for row in rows)
     if len(poses) != frames - 1:
         raise CheckpointError(
             f"{folder}: expected the poses of {frames - 1} updates, found {len(poses)}; parts are missing. "

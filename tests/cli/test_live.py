@@ -1,0 +1,88 @@
+"""`gsjax live` around a tracker that stands still: what is counted, written and said."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsjax.cli.live
+import gsjax.data.stream
+from gsjax.cli import main
+from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+
+
+def standing_still(scene, first, frames, config, *, budget_ms):
+    """`track` for objects that never move."""
+    groups = scene.num_objects
+    info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
+    for _ in frames:
+        yield Tracked(scene, first_pose(scene), None, info, 0.001, 0.0, None, 2)
+
+
+def unfitted(frame, mask, camera, config):
+    """`start_scene` without the optimisation."""
+    return start_scene(frame, mask, camera, replace(config, start=replace(config.start, iterations=0)))
+
+
+@pytest.fixture
+def live(tmp_path, capfd, monkeypatch):
+    """Runs `gsjax live` in this process; returns the exit code, what was said, and the run's folder."""
+    monkeypatch.setattr(gsjax.cli.live, "track", standing_still)
+    monkeypatch.setattr(gsjax.cli.live, "start_scene", unfitted)
+
+    def call(source, *options: str):
+        code = main(["live", str(source), "--out", str(tmp_path / "run"), *options])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err, tmp_path / "run"
+
+    return call
+
+
+def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live):
+    code, said, folder = live(pristine, "--seconds", "0.5", "--hz", "20", "--cameras", "0", "1")
+    assert code == 0, said
+    found = json.loads((folder / "metrics.json").read_text())
+    frames = found["frames"]
+    assert frames["offered"] == 10
+    assert frames["used"] + frames["dropped"] == 10
+    assert found["complete"]
+    assert found["latency_ms"]["median"] > 0
+    assert found["memory_mb"]["max"] > 10
+    assert "10 offered" in said
+    with np.load(folder / "trajectory.npz") as stored:
+        assert len(stored["times"]) == len(stored["centers"]) == frames["used"]
+        np.testing.assert_allclose(stored["quats"], np.broadcast_to([1, 0, 0, 0], stored["quats"].shape))
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "says"),
+    [
+        ("camera:x", (), "expected camera:NUMBER"),
+        ("camera:97", (), "replay a folder"),
+        (None, ("--hz", "0"), "--hz: expected more than 0"),
+        (None, ("--cameras", "9"), "has no camera 9"),
+    ],
+)
+def test_what_cannot_be_followed_is_said(pristine, live, source, options, says):
+    code, said, _ = live(pristine if source is None else source, *options)
+    assert code == 2
+    assert says in " ".join(said.split())
+
+
+def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatch):
+    def failing(frames, hz, seconds):
+        yield from gsjax.data.stream.replay(frames, hz, 0.2)
+        raise OSError("the camera was unplugged")
+
+    monkeypatch.setattr(gsjax.cli.live, "replay", failing)
+    code, said, folder = live(pristine, "--cameras", "0", "--hz", "20")
+    assert code == 2
+    assert "unplugged" in said
+    found = json.loads((folder / "metrics.json").read_text())
+    assert not found["complete"]
+    assert "unplugged" in found["stopped"]
+    assert (folder / "trajectory.npz").exists()
