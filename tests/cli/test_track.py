@@ -31,8 +31,8 @@ def opened(monkeypatch):
         log.append((sequence.frame_ids[t], sequence.camera_ids[c]))
         return mask(sequence, t, c)
 
-    def followed(*arguments):
-        result = follow(*arguments)
+    def followed(*arguments, **options):
+        result = follow(*arguments, **options)
         log.append(None)
         return result
 
