@@ -18,6 +18,12 @@ _PATTERNS = ("video_*.mp4", ".*.partial*")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a run has written its settings there."""
+    config = folder / "config.yml"
+    return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
+
+
 class RunFolder:
     """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
 
@@ -66,8 +72,7 @@ class RunFolder:
 
     def _claim(self, overwrite: bool, resume: bool) -> None:
         # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
-        config = self.config
-        if not config.is_file() or not config.read_bytes().startswith(SIGNATURE.encode()):
+        if not is_run(self.path):
             raise FileExistsError(
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
                 f"with {SIGNATURE!r}), found other files; name another folder"

@@ -12,7 +12,7 @@ import yaml
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Recording, open_recording
-from gsjax.cli.run_folder import SIGNATURE
+from gsjax.cli.run_folder import SIGNATURE, is_run
 from gsjax.data.errors import DataError
 from gsjax.io.ply import read_ply
 from gsjax.methods.object_tracker import Pose, TrackedScene
@@ -63,8 +63,7 @@ def open_run(path: Path) -> SavedRun:
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing there"
         raise FileNotFoundError(f"{path}: expected the folder of a run of `gsjax track`, found {found}")
-    config = path / "config.yml"
-    if not config.is_file() or not config.read_bytes().startswith(SIGNATURE.encode()):
+    if not is_run(path):
         raise FileNotFoundError(
             f"{path}: expected the folder of a run of `gsjax track`, whose config.yml begins with "
             f"{SIGNATURE!r}, found other files; name its --out"
@@ -73,7 +72,7 @@ def open_run(path: Path) -> SavedRun:
     if missing:
         raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
     tracking = _read_tracking(path)
-    recording = _reopen(config)
+    recording = _reopen(path / "config.yml")
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
         raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")

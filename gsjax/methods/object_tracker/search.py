@@ -115,8 +115,9 @@ def look_everywhere(
         best = judged(
             aligned(turned(best, principal_axes(points, center), config.turns)), half, config
         ).twists
-    tried = jnp.stack([known.twists, align(best, points, center, sight, config)])
-    return judged(tried, points, config)
+    last = align(best, points, center, sight, config)
+    residuals = jnp.stack([known.residuals, disagreement(last, points, center, sight, config)])
+    return least(residuals, jnp.stack([known.twists, last]))
 
 
 class Watch(NamedTuple):
@@ -174,8 +175,8 @@ def search(
     over_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
     aligned = over_groups(best.twists, points, centers, sight, widened(config))
     aligned = over_groups(aligned, points, centers, sight, config)
-    tried = jnp.stack([best.twists, aligned])
-    found = least(judged(tried, points, centers, sight, config), tried)
+    residuals = jnp.stack([best.residuals, judge(aligned, points, centers, sight, config)])
+    found = least(residuals, jnp.stack([best.twists, aligned]))
 
     urgency = jnp.where(visible, found.residuals / watch.usual + _PATIENCE * watch.waited, -jnp.inf)
     order = jnp.argsort(-urgency)

@@ -87,10 +87,12 @@ def _first_state(pose, batch, config: TrackerConfig, num_objects: int):
     return object_tracker(config, num_objects, batch).init(pose)
 
 
-def first_state(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> TrackerState:
-    """What the first frame leaves behind, for `pose`, which it shows."""
+def first_state(
+    scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig, plan: TrackerPlan | None = None
+) -> TrackerState:
+    """What the first frame leaves behind, for `pose`, which it shows; planned here unless it has been."""
     first, _ = without_broken(part_of(first, config.cameras, config.shrink))
-    plan = plan_tracker(scene, pose, first, config)
+    plan = plan_tracker(scene, pose, first, config) if plan is None else plan
     return _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
 
 
@@ -167,7 +169,7 @@ def track(
             chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
         config, governor = chosen.config, Governor(budget_ms / 1e3, chosen.costs, count)
     run = _Runner(scene, pose, first, config)
-    state = first_state(scene, pose, first, config) if after is None else after.state
+    state = first_state(scene, pose, first, config, run.plan) if after is None else after.state
     usually = count if config.align.everywhere is None else min(config.align.everywhere, count)
     for index, frame in enumerate(frames):
         _check_alike(frame, first, index + 1)
@@ -214,7 +216,7 @@ class _Runner:
 def _measured(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> Costs:
     """What updates cost: on the first frame again, which changes nothing."""
     run, count = _Runner(scene, pose, first, config), scene.num_objects
-    state = first_state(scene, pose, first, config)
+    state = first_state(scene, pose, first, config, run.plan)
 
     def median(everywhere: int) -> float:
         return float(np.median([run(scene, pose, state, first, 0, everywhere)[1] for _ in range(_TRIALS)]))
