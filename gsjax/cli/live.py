@@ -161,6 +161,7 @@ class Log:
         self._turned = Rotation.identity(groups)
         self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
         self._memory_at = 0.0
+        self._lost = np.zeros(groups, int)
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
         """One update."""
@@ -173,6 +174,7 @@ class Log:
         self.everywhere.append(update.everywhere)
         self.chosen = update.chosen
         self.plans.add(update.plan)
+        self._lost += np.asarray(update.info["lost"])
         twists, centers = jax.device_get((update.info["motion"].twists, update.info["centers"]))
         self._turned = Rotation.from_rotvec(twists[:, 3:]) * self._turned
         quats = self._turned.as_quat(scalar_first=True)
@@ -208,8 +210,15 @@ class Log:
             "memory_mb": {"first": self.memory_mb[0], "last": self.memory_mb[-1], "max": max(self.memory_mb)}
             if self.memory_mb
             else None,
-            "objects": {str(v): self._names.get(v, f"object {v}") for v in sorted({*self._ids} - {0})},
+            "objects": {str(v): self._name(v) for v in sorted({*self._ids} - {0})},
+            "frames_lost": {
+                self._name(v): int(self._lost[np.asarray(self._ids[1:]) == v].max())
+                for v in sorted({*self._ids} - {0})
+            },
         }
+
+    def _name(self, value: int) -> str:
+        return self._names.get(value, f"object {value}")
 
 
 def _spread(seconds: list[float]) -> dict[str, float] | None:
@@ -275,6 +284,9 @@ def _print(found: dict[str, Any], folder: RunFolder) -> None:
         spread = ", ".join(f"{name} {value:.0f} ms" for name, value in latency.items())
         table.add_row("[bold]latency[/]", f"from arrival to the new state: {spread}")
         table.add_row("[bold]late[/]", f"{found['late']} updates were over the budget")
+    lost = {name: count for name, count in found["frames_lost"].items() if count}
+    if lost:
+        table.add_row("[bold]lost[/]", ", ".join(f"{n} in {count} updates" for n, count in lost.items()))
     if found["budget"]:
         table.add_row("[bold]settings[/]", found["budget"]["chosen"])
     if memory:

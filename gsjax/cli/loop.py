@@ -45,6 +45,7 @@ class Tracking:
         loop_s: seconds of the whole loop.
         plans: how many plans there were; more than one means that it had to plan again.
         visible: [K] of each update, which objects some camera saw.
+        lost: [K] of each update, which objects were not where they were believed to be.
         skipped: updates that changed nothing, because a number in them was not finite.
         everywhere: of each update, how many groups it was allowed to look for everywhere.
         chosen: the settings chosen for a budget, or None.
@@ -63,6 +64,7 @@ class Tracking:
     loop_s: float = 0.0
     plans: int = 0
     visible: list[np.ndarray] = field(default_factory=list)
+    lost: list[np.ndarray] = field(default_factory=list)
     skipped: int = 0
     everywhere: list[int] = field(default_factory=list)
     chosen: Chosen | None = None
@@ -162,6 +164,7 @@ def follow(
                     known = update.seconds + update.compile_seconds + frames.waited
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)
                 tracking.visible.append(np.asarray(update.info["visible"]))
+                tracking.lost.append(np.asarray(update.info["lost"]))
                 tracking.skipped += int(update.info["skipped"])
                 plans.add(update.plan)
                 saved(tracking, update, False)

@@ -73,7 +73,7 @@ def open_recording(dataset: str, cameras: Indices[int], eval_cameras: Indices[in
     sequence = sequence.select(frames=chosen_frames)
     simulated = dataset.startswith(SIMULATED_PREFIX)
     if simulated:
-        sequence = _remember(sequence)
+        sequence = remembered(sequence)
     return Recording(
         tracked=sequence.select(cameras=chosen),
         judged=sequence.select(cameras=[*chosen, *eval_cameras]),
@@ -100,7 +100,7 @@ def parse_frames(text: str) -> slice:
     return slice(*parts)
 
 
-def _remember(sequence: Sequence) -> Sequence:
+def remembered(sequence: Sequence) -> Sequence:
     """The same sequence with what was loaded kept in memory: a simulated picture is slow to draw twice."""
 
     def kept(loader: Callable | None) -> Callable | None:

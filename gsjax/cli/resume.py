@@ -66,6 +66,7 @@ class Saver:
             "compile_s": tracking.compile_s,
             "skipped": tracking.skipped,
             "visible": [seen.tolist() for seen in tracking.visible],
+            "lost": [lost.tolist() for lost in tracking.lost],
             "everywhere": tracking.everywhere,
             "chosen": _chosen_metadata(update.chosen),
         }
@@ -105,6 +106,7 @@ def load(folder: Path, first: Frame, config: TrackerConfig) -> tuple[Tracking, T
         compile_s=found["compile_s"],
         skipped=found["skipped"],
         visible=[np.asarray(seen) for seen in found["visible"]],
+        lost=[np.asarray(lost) for lost in found["lost"]],
         everywhere=found["everywhere"],
         resumed=found["frames"],
     )

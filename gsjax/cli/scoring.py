@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import FirstMask, Recording, label_names
@@ -136,6 +137,7 @@ def metrics(
             "gaussians": _count_gaussians(tracking, values, label),
             "mask_pixels": _pixels(mask, tracking, values, label),
             "travelled_mm": _travelled_mm(tracking, values, label),
+            "frames_lost": int(lost_over_frames(tracking, values, label).sum()),
             **_motion_metrics(motion.get(label)),
         }
         for label, name in names.items()
@@ -220,6 +222,15 @@ def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> 
         return None
     centroids = tracking.means()[:, members].mean(axis=1)
     return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
+
+
+def lost_over_frames(
+    tracking: Tracking, values: np.ndarray | None, label: int
+) -> Bool[np.ndarray, "updates"]:
+    """In which updates the tracker held the object, or a part of it, for lost."""
+    ids = np.asarray(tracking.scene.label_ids) if values is None else values
+    lost = np.asarray(tracking.lost).reshape(len(tracking.lost), len(ids) - 1)
+    return lost[:, ids[1:] == label].any(axis=1)
 
 
 def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:

@@ -28,6 +28,7 @@ OBJECT_COLUMNS = (
     Column("moved", "moved_mm", "mm", 1),
     Column("turned", "turned_deg", "°", 1),
     Column("travelled", "travelled_mm", "mm", 1),
+    Column("lost", "frames_lost", "frames"),
     Column("IoU", "iou", "", 3),
     Column("IoU held out", "iou_held_out", "", 3),
     Column("mask", "mask_pixels", "pixels"),

@@ -26,7 +26,15 @@ from gsjax.cli.recording import (
 from gsjax.cli.report import format_number
 from gsjax.cli.resume import Saver, load
 from gsjax.cli.run_folder import RunFolder
-from gsjax.cli.scoring import Scores, budget_metrics, group_values, metrics, object_names, score_motion
+from gsjax.cli.scoring import (
+    Scores,
+    budget_metrics,
+    group_values,
+    lost_over_frames,
+    metrics,
+    object_names,
+    score_motion,
+)
 from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, start_scene
@@ -324,6 +332,12 @@ def _note_what_is_missing(
     counts = np.bincount(np.concatenate([*unseen, []]).astype(int), minlength=tracking.scene.num_objects)
     names = object_names(tracking, recording, mask, values)
     ids = tracking.scene.label_ids if values is None else values.tolist()
+    for label in sorted({*ids} - {0}):
+        lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
+        if len(lost):
+            name = names.get(label, f"object {label}")
+            ended = "to the end" if lost[-1] == tracking.num_frames - 1 else f"to {lost[-1]}"
+            notes.add(f"{name}: lost in {len(lost)} frames, from {lost[0]} {ended}.")
     for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
         name = names.get(label, f"object {label}")
         frames = max(counts[group] for group in range(len(counts)) if ids[group + 1] == label)

@@ -15,9 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.align import align, disagreement
 from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.lost import FOUND, LOST, Confidence, Missing, guesses
 from gsjax.methods.object_tracker.points import Points, Sight
+from gsjax.optim.step import keep_if
 
 _LEAST_USUAL = 0.02  # a residual below this is noise
+_WHILE_LOST = 1.0  # what being lost counts beside a residual as usual
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 
 
@@ -78,6 +81,14 @@ def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
     return grid[np.linalg.norm(grid, axis=1) <= radius]
 
 
+def coarse_shifts(config: AlignConfig) -> Float[Array, "n 6"]:
+    """Twists that shift to all sides, for depth to choose from: by colour a plain thing slides about."""
+    if not config.reach:
+        return jnp.zeros((0, 6))
+    shifts = jnp.asarray(ball(config.reach, config.spacing), float)
+    return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
+
+
 def look_everywhere(
     known: Found,
     starts: Float[Array, "h 6"],
@@ -85,13 +96,14 @@ def look_everywhere(
     center: Float[Array, "3"],
     sight: Sight,
     config: AlignConfig,
+    elsewhere: Float[Array, "n 6"],
 ) -> Found:
     """`known` of one group, or what agrees better.
 
-    Every start is aligned, and with depth so is the best shift of a coarse grid, for what has no texture to
-    match. Then turns to all sides are tried from the best, because a knock changes a spin from one frame to
-    the next, and a round thing may roll without its shape changing. Half the points choose among these; all
-    of them have the last word.
+    Every start is aligned, and so is the best of `elsewhere`, for what has no texture to match. Then turns to
+    all sides are tried from the best, because a knock changes a spin from one frame to the next, and a round
+    thing may roll without its shape changing. Half the points choose among these; all of them have the last
+    word.
     """
     wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 
@@ -104,12 +116,9 @@ def look_everywhere(
         return over_twists(twists, half, center, sight, wide)
 
     starts = jnp.concatenate([starts, known.twists[None]])
-    # By colour alone, a plain thing would slide about within its outline.
-    if sight.depths is not None and config.reach:
-        shifts = jnp.asarray(ball(config.reach, config.spacing), starts.dtype)
-        shifts = jnp.zeros((len(shifts), 6), starts.dtype).at[:, :3].set(shifts)
+    if len(elsewhere):
         few = jax.tree.map(lambda a: a[..., ::4], points)
-        starts = jnp.concatenate([starts, judged(shifts, few, wide).twists[None]])
+        starts = jnp.concatenate([starts, judged(elsewhere, few, wide).twists[None]])
     best = judged(aligned(starts), half, config).twists
     if config.max_turn and config.turns:
         best = judged(
@@ -126,9 +135,15 @@ class Watch(NamedTuple):
     usual: Float[Array, "k"]  # residual of late
     waited: Float[Array, "k"]  # frames since it was last looked for everywhere
     largest: Float[Array, "k"]  # pixels that showed it when it was seen best, all cameras together
+    agrees: Float[Array, "k"]  # how much of what was last seen of it looked as at first, 0 to 1
+    lost: Bool[Array, "k"]
 
     def after(
-        self, residuals: Float[Array, "k"], looked_for: Bool[Array, "k"], shown: Float[Array, "k"]
+        self,
+        residuals: Float[Array, "k"],
+        looked_for: Bool[Array, "k"],
+        shown: Float[Array, "k"],
+        sure: Confidence,
     ) -> "Watch":
         """One frame later.
 
@@ -136,15 +151,24 @@ class Watch(NamedTuple):
             residuals: as in `Found`.
             looked_for: which groups were looked for everywhere.
             shown: pixels that showed each group.
+            sure: whether each group is where it is believed to be.
         """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
+        lost = jnp.where(self.lost, sure.shows < FOUND, sure.agrees < LOST)
         waited = jnp.where(looked_for, 0.0, self.waited + 1.0)
-        return Watch(usual, waited, jnp.maximum(self.largest, shown))
+        return Watch(
+            usual,
+            waited,
+            jnp.maximum(self.largest, shown),
+            jnp.where(sure.tells, sure.agrees, self.agrees),
+            jnp.where(sure.tells, lost, self.lost),
+        )
 
 
 def first_watch(num_groups: int) -> Watch:
     """Before the first frame."""
-    return Watch(jnp.full(num_groups, 0.1), jnp.zeros(num_groups), jnp.zeros(num_groups))
+    nothing, certain = jnp.zeros(num_groups), jnp.ones(num_groups)
+    return Watch(jnp.full(num_groups, 0.1), nothing, nothing, certain, jnp.zeros(num_groups, bool))
 
 
 def search(
@@ -156,9 +180,10 @@ def search(
     watch: Watch,
     visible: Bool[Array, "k"],
     everywhere: Int[Array, ""],
-) -> tuple[Found, Bool[Array, "k"]]:
-    """The twist of each group that agrees best with the images, no worse than any start; and which
-    groups were looked for everywhere.
+    missing: Missing,
+) -> tuple[Found, Float[Array, "k 6"], Bool[Array, "k"]]:
+    """The twist of each group that agrees best with the images, no worse than any start; of a lost one that
+    was looked for, where it may be instead; and which groups were looked for everywhere.
 
     Args:
         starts: hypotheses: translation, metres, and rotation vector, radians, of each group.
@@ -169,6 +194,7 @@ def search(
         visible: groups that a camera sees; no other is looked for.
         everywhere: how many groups are looked for everywhere, those first that agree worst beside what is
             usual for them, or that have waited longest.
+        missing: what lost ones are looked for with.
     """
     judged = jax.vmap(judge, in_axes=(0, None, None, None, None))
     best = least(judged(starts, points, centers, sight, config), starts)
@@ -178,15 +204,26 @@ def search(
     residuals = jnp.stack([best.residuals, judge(aligned, points, centers, sight, config)])
     found = least(residuals, jnp.stack([best.twists, aligned]))
 
-    urgency = jnp.where(visible, found.residuals / watch.usual + _PATIENCE * watch.waited, -jnp.inf)
+    shifts = coarse_shifts(config) if sight.depths is not None else jnp.zeros((0, 6))
+
+    urgency = found.residuals / watch.usual + _PATIENCE * watch.waited + _WHILE_LOST * watch.lost
+    urgency = jnp.where(visible, urgency, -jnp.inf)
     order = jnp.argsort(-urgency)
     count = jnp.minimum(everywhere, visible.sum())
 
-    def look(i, found: Found) -> Found:
+    def look(i, carried):
+        found, again = carried
         group = order[i]
-        known, own = jax.tree.map(lambda a: a[group], (found, points))
-        better = look_everywhere(known, starts[:, group], own, centers[group], sight, config)
-        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better)
+        lost, center = watch.lost[group], centers[group]
+        known, own, firsts = jax.tree.map(lambda a: a[group], (found, points, missing.points))
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), missing.count), group)
+        guessed = guesses(key, shifts, firsts, center, missing.strangers)
+        own, around = keep_if(lost, (firsts, guessed), (own, shifts))
+        start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
+        better = look_everywhere(start, starts[:, group], own, center, sight, config, around)
+        again = again.at[group].set(jnp.where(lost, better.twists, again[group]))
+        better = keep_if(lost, known, better)
+        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better), again
 
-    found = jax.lax.fori_loop(0, count, look, found)
-    return found, jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
+    found, again = jax.lax.fori_loop(0, count, look, (found, jnp.zeros_like(found.twists)))
+    return found, again, jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)

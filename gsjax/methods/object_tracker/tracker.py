@@ -23,11 +23,14 @@ from gsjax.methods.object_tracker.layers import (
     shown_by,
     thinned,
 )
+from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, confidence, with_strangers
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
 from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
+    Sight,
+    carry,
     carry_keyframe,
     faded,
     first_keyframe,
@@ -68,6 +71,7 @@ class TrackerState(NamedTuple):
     motion: Motion  # of the last frame: where delta starts, and the constant-velocity hypothesis
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
+    strangers: Points  # pixels of the last frame that no group explains
     watch: Watch
     count: Int[Array, ""]  # frames so far
     shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
@@ -93,7 +97,7 @@ def _named(scene: TrackedScene, pose: Pose, last: "_Last", config: TrackerConfig
     named = (with_normal | ~with_normal.any())[rows] & real
     own = (pose.means[rows.ravel()], groups[rows.ravel()])
     seen = seen_from(*own, last.shown, last.cameras, config.start.depth_gap)
-    seen = config.align.center_weight * jnp.moveaxis(seen.reshape(-1, *rows.shape), 0, 1) * named[:, None]
+    seen = jnp.moveaxis(seen.reshape(-1, *rows.shape), 0, 1) * named[:, None]
     colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.align.shading)
     in_all = (*seen.shape[:2], 3, seen.shape[2])
     of_each = (jnp.swapaxes(a, 1, 2)[:, None] for a in (pose.means[rows], colors))
@@ -135,16 +139,23 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         backdrop = draw_backdrop(scene, views, plan.full)[0] if keep else None
         shown, _ = show(scene, params, frame, backdrop, plan)
         sight = sight_of(frame, config.align.shading)
-        how = (num_objects, config.align, config.coarseness)
-        pixels = pixels_of_groups(sight, shown.labels, shown.depths, *how)
+        pixels, strangers = look_at(shown, sight)
         return TrackerState(
             nowhere,
             pixels,
             first_keyframe(pixels),
+            strangers,
             first_watch(num_objects),
             jnp.int32(0),
             *memory(shown, backdrop, frame),
         )
+
+    def look_at(shown: Shown, sight: Sight) -> tuple[Points, Points]:
+        """Pixels that show each group, and those that none explains."""
+        labelled = with_strangers(shown, sight, num_objects, config.grow.min_gap, config.coarseness)
+        how = (num_objects + 1, config.align, config.coarseness)
+        pixels = pixels_of_groups(sight, labelled.labels, labelled.depths, *how)
+        return jax.tree.map(lambda a: a[:-1], pixels), jax.tree.map(lambda a: a[-1], pixels)
 
     def memory(shown: Shown, backdrop: Backdrop | None, frame: Frame):
         """What the next frame looks back on where the last scene is not drawn again."""
@@ -187,7 +198,14 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
-        points = join(_named(scene, params, last, config), state.pixels, remembered)
+        named, since = _named(scene, params, last, config), join(state.pixels, remembered)
+        weighted = named._replace(seen=config.align.center_weight * named.seen)
+        points = join(weighted, since)
+
+        def sure_of(twists) -> Confidence:
+            moved = jax.vmap(carry)(named, twists, centers)
+            return confidence(moved, sight, config.start.depth_gap)
+
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
         going = state.motion.twists
@@ -203,8 +221,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             everywhere = jnp.int32(
                 num_objects if config.align.everywhere is None else config.align.everywhere
             )
-        seen = (config.align, state.watch, visible, everywhere)
-        aligned, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
+        # Of what is lost only the centres say where it is: the pixels show what it was taken for.
+        firsts = join(weighted, since._replace(seen=jnp.zeros_like(since.seen)))
+        missing = Missing(firsts, state.strangers, state.count)
+        seen = (config.align, state.watch, visible, everywhere, missing)
+        aligned, again, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
         residual = aligned.residuals
         kept = begun = Motion(aligned.twists, delta)
         needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
@@ -221,6 +242,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
+        better = state.watch.lost & (sure_of(again).shows > jnp.maximum(FOUND, sure_of(kept.twists).shows))
+        kept = _select(better, Motion(again, jnp.zeros_like(delta)), kept, groups)
+        sure = sure_of(kept.twists)
 
         pose = move(params, kept, centers, groups)
         backdrop, drawn = state.backdrop, jnp.int32(0)
@@ -235,13 +259,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, shown_needed))
         overflow = needed.exceeds(plan)
         sound = all_finite((pose, shifts)) & ~overflow
-        how = (num_objects, config.align, config.coarseness)
-        pixels = pixels_of_groups(sight, shown.labels, shown.depths, *how)
+        pixels, strangers = look_at(shown, sight)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, looked_for, counts)
-        new_state = TrackerState(kept, pixels, keyframe, watch, state.count + 1, *told)
+        watch = state.watch.after(residual, looked_for, counts, sure)
+        new_state = TrackerState(kept, pixels, keyframe, strangers, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
@@ -251,6 +274,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "found": found,
             "visible": visible,
             "residual": residual,
+            "agrees": watch.agrees,
+            "lost": watch.lost,
             "looked_for": looked_for,
             "motion": kept,
             "centers": centers + kept.twists[:, :3],

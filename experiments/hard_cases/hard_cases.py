@@ -1,0 +1,190 @@
+"""The tracker where it may lose an object: does it, does it say so, and does it find it again?"""
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from faults import noisy_depth, without_cameras, without_frames
+from rich.console import Console
+from stages import STAGES, gripper, stage
+
+from gsjax.cli.loop import Tracking, begin, follow
+from gsjax.cli.recording import Recording, first_mask, remembered
+from gsjax.cli.scoring import lost_over_frames, score_motion
+from gsjax.data import Sequence, open_sequence
+from gsjax.data.simulated import tabletop
+from gsjax.methods.object_tracker import PRESETS, TrackedScene, start_scene
+from gsjax.scene.frame import Frame
+
+DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
+MASK_CAMERA = 1
+ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
+FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
+MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
+
+
+def table(**how: bool) -> Sequence:
+    """The scene that comes with the package."""
+    return tabletop(frames=48, **how)
+
+
+def recorded(step: int) -> Sequence:
+    """Every so-manieth frame of a MuJoCo recording in which boxes are knocked over."""
+    path = DATA / "tabletop_1"
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: not there; set GSJAX_DATA to the folder that holds it")
+    return open_sequence(str(path)).select(slice(None, None, step))
+
+
+CASES = {
+    **{name: lambda name=name: stage(name) for name in STAGES},
+    "hidden in a garage": lambda: table(hide=True),
+    "leaves for good": lambda: table(leave=True),
+    "gripper that closes": gripper,
+    "moving cameras": lambda: table(moving_cameras=True),
+    "depth of a Kinect": lambda: noisy_depth(table(), 1.0),
+    "depth three times as bad": lambda: noisy_depth(table(), 3.0),
+    "every fifth frame lost": lambda: without_frames(table(), {t for t in range(48) if t % 5 == 4}),
+    "five frames lost at once": lambda: without_frames(table(), {*range(10, 15), *range(28, 33)}),
+    "a camera drops out": lambda: without_cameras(table(), (1,), range(10, 25)),
+    "two cameras drop out": lambda: without_cameras(table(), (1, 2), range(10, 25)),
+    "tabletop_1": lambda: recorded(1),
+    "tabletop_1, every other frame": lambda: recorded(2),
+    "tabletop_1, every third frame": lambda: recorded(3),
+}
+
+
+class Start(NamedTuple):
+    """What all presets begin with."""
+
+    recording: Recording
+    frame: Frame
+    scene: TrackedScene
+
+
+@cache
+def started(case: str) -> Start:
+    """The recording and its scene at the first frame."""
+    sequence = remembered(CASES[case]())
+    recording = Recording(sequence, sequence, sequence.num_frames)
+    mask, frame = first_mask(sequence, MASK_CAMERA, "files"), sequence.frame(0)
+    assert mask.labels is not None
+    for t in range(sequence.num_frames):
+        sequence.frame(t)  # drawn ahead, which the tracker need not wait for
+    config = PRESETS["fast"]  # as every preset but `accurate` starts
+    return Start(recording, frame, start_scene(frame, mask.labels, MASK_CAMERA, config))
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """Follow the objects of one case, and say of each what became of it."""
+    recording, frame, scene = started(options["case"])
+    quiet = Console(stderr=True, quiet=True)
+    tracking = follow(begin(scene), frame, recording.tracked, PRESETS[options["preset"]], quiet)
+    if tracking.stopped is not None:
+        raise tracking.stopped
+    truth = recording.tracked.truth
+    assert truth is not None
+    names = dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
+    motion, pixels = score_motion(tracking, recording), seen_pixels(recording.tracked)
+    objects = {
+        names[label]: judge(score.centroid_errors_mm, pixels[label], said(tracking, label))
+        for label, score in motion.items()
+        if score.num_scored
+    }
+    worst = max(objects, key=lambda name: (objects[name]["silent"], *objects[name]["order"]))
+    total = sum(o["sound_frames"] for o in objects.values())
+    alarms = sum(o["false_alarms"] for o in objects.values())
+    return {
+        **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "off", "silent")},
+        "worst": worst,
+        "false_alarms": 100 * alarms / max(total, 1),
+        "objects": {name: {k: v for k, v in o.items() if k != "order"} for name, o in objects.items()},
+        "update_ms": 1e3 * np.median(tracking.update_s[3:]),
+    }
+
+
+def seen_pixels(sequence: Sequence) -> dict[int, np.ndarray]:
+    """How many pixels of all cameras truly show each label, frame by frame."""
+    views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
+    masks = np.stack([sequence.mask(t, c) for t, c in views])
+    masks = masks.reshape(sequence.num_frames, -1)
+    return {int(label): (masks == label).sum(axis=1) for label in sequence.truth.label_ids}
+
+
+def said(tracking: Tracking, label: int) -> np.ndarray:
+    """In which frames the tracker says that the object is lost, or that it sees none of it."""
+    mine = np.asarray(tracking.scene.label_ids)[1:] == label
+    unseen = ~np.asarray(tracking.visible)[:, mine].all(axis=1)
+    return np.concatenate([[False], lost_over_frames(tracking, None, label) | unseen])
+
+
+def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str, Any]:
+    """What became of one object.
+
+    Args:
+        errors: of its centroid, millimetres, frame by frame.
+        pixels: that truly show it.
+        said: whether the tracker said that it is lost or unseen.
+    """
+    there = pixels >= FEWEST_PIXELS
+    astray = (errors > ASTRAY_MM) & there
+    silent = longest(astray & ~said)
+    ends = bool(astray[-1] or (astray.any() and not there[-1]))
+    if not astray.any():
+        verdict = "sound"
+    elif silent > MOST_SILENT:
+        verdict = "astray, unsaid"
+    else:
+        verdict = "lost, said so" if ends else "lost, found again"
+    sound = there & ~astray
+    return {
+        "verdict": verdict,
+        "order": (ends, int(astray.sum()), float(np.max(errors[there]))),
+        "median_mm": float(np.median(errors[there])),
+        "end_mm": float(errors[there][-1]),
+        "off": int(astray.sum()),
+        "silent": silent,
+        "sound_frames": int(sound.sum()),
+        "false_alarms": int((sound & said).sum()),
+        "errors_mm": errors.round(2).tolist(),
+        "said": said.tolist(),
+        "there": there.tolist(),
+    }
+
+
+def longest(flags: np.ndarray) -> int:
+    """The longest run of True."""
+    runs = "".join("x" if flag else " " for flag in flags).split()
+    return max(map(len, runs), default=0)
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """A panel for each case and preset."""
+    from matplotlib.figure import Figure
+
+    cases, presets = (list(dict.fromkeys(row[key] for row in rows)) for key in ("case", "preset"))
+    columns = 2 * len(presets)
+    height = -(-len(cases) // 2)
+    drawing = Figure(figsize=(4.2 * columns, 2.1 * height), dpi=80, layout="constrained")
+    grid = drawing.subplots(height, columns, squeeze=False, sharex=False, sharey=True)
+    for axes in grid.ravel():
+        axes.set_visible(False)
+    for row in rows:
+        place = cases.index(row["case"])
+        axes = grid[place % height, place // height * len(presets) + presets.index(row["preset"])]
+        axes.set_visible(True)
+        for i, (name, found) in enumerate(row["objects"].items()):
+            errors, told = np.maximum(found["errors_mm"], 0.05), np.asarray(found["said"])
+            there, frames = np.asarray(found["there"]), np.arange(len(errors))
+            axes.plot(frames, np.where(there, errors, np.nan), color=f"C{i}", label=name, linewidth=1.5)
+            axes.plot(frames, np.where(there, np.nan, errors), color=f"C{i}", linewidth=1, alpha=0.25)
+            axes.plot(frames[told], errors[told], "o", color=f"C{i}", markersize=3.5)
+        axes.axhline(ASTRAY_MM, color="#888888", linewidth=0.8, linestyle=":")
+        axes.set(yscale="log", ylim=(0.05, 3000), yticks=(0.1, 1, 10, 100, 1000))
+        axes.set_title(f"{row['case']}, {row['preset']}: {row['verdict']}", fontsize=9)
+        axes.legend(fontsize=7, loc="upper left", ncols=2, frameon=False)
+    drawing.supylabel("centroid error [mm]")
+    drawing.supxlabel("frame")
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
