@@ -97,7 +97,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     total = sum(o["sound_frames"] for o in objects.values())
     alarms = sum(o["false_alarms"] for o in objects.values())
     return {
-        **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "off", "silent")},
+        **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "astray", "silent")},
         "worst": worst,
         "false_alarms": 100 * alarms / max(total, 1),
         "objects": {name: {k: v for k, v in o.items() if k != "order"} for name, o in objects.items()},
@@ -144,7 +144,7 @@ def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str,
         "order": (ends, int(astray.sum()), float(np.max(errors[there]))),
         "median_mm": float(np.median(errors[there])),
         "end_mm": float(errors[there][-1]),
-        "off": int(astray.sum()),
+        "astray": int(astray.sum()),
         "silent": silent,
         "sound_frames": int(sound.sum()),
         "false_alarms": int((sound & said).sum()),

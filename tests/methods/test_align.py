@@ -18,6 +18,7 @@ from gsjax.methods.object_tracker.align import (
     disagreement,
 )
 from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.lost import Confidence, Missing
 from gsjax.methods.object_tracker.points import (
     Points,
     carry,
@@ -33,7 +34,6 @@ from gsjax.methods.object_tracker.points import (
 )
 from gsjax.methods.object_tracker.search import (
     Found,
-    Watch,
     ball,
     first_watch,
     least,
@@ -79,7 +79,8 @@ def run(points, center, sight, config=CONFIG):
 def look(points, center, sight, config=CONFIG, everywhere=1):
     """The twist that a search of one group finds from standing still."""
     points = jax.tree.map(lambda a: a[None], points)
-    how = (config, first_watch(1), jnp.array([True]), jnp.int32(everywhere))
+    missing = Missing(points, jax.tree.map(lambda a: a[0], points), jnp.int32(0))
+    how = (config, first_watch(1), jnp.array([True]), jnp.int32(everywhere), missing)
     return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how)[0].twists[0]
 
 
@@ -321,19 +322,16 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
     """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
     *given, shift = jumped
     points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
-    visible = jnp.array([True, True, True])
+    visible, first = jnp.array([True, True, True]), first_watch(3)
     watches = [
-        (Watch(jnp.array([0.3, 0.1, 0.3]), jnp.zeros(3), jnp.ones(3)), visible, [1]),
-        (Watch(jnp.full(3, 0.3), jnp.array([0.0, 5.0, 100.0]), jnp.ones(3)), visible, [2]),
-        (
-            Watch(jnp.array([0.3, 0.1, 0.3]), jnp.array([2.0, 0.0, 0.0]), jnp.ones(3)),
-            ~visible.at[0].set(False),
-            [0],
-        ),
+        (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), visible, [1]),
+        (first._replace(waited=jnp.array([0.0, 5.0, 100.0])), visible, [2]),
+        (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), ~visible.at[0].set(False), [0]),
     ]
+    missing = Missing(points, given[0], jnp.int32(0))
     for watch, there, expected in watches:
-        one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
-        found, looked_for = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
+        one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1), missing)
+        found, _, looked_for = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
         np.testing.assert_array_equal(np.flatnonzero(looked_for), expected)
         right = jnp.linalg.norm(found.twists[:, :3] - shift, axis=1) < 1e-3
         np.testing.assert_array_equal(np.flatnonzero(right), expected)
@@ -344,7 +342,20 @@ def test_a_watch_knows_what_is_usual_and_who_waits():
     watch = first_watch(2)
     for t in range(60):
         shown = jnp.array([t, 60.0 - t])
-        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]), shown)
+        sure = Confidence(jnp.array([0.9, 0.2]), jnp.array([0.8, 0.1]), jnp.array([True, t > 0]))
+        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]), shown, sure)
+        np.testing.assert_array_equal(watch.lost, [False, t > 0])  # where nothing tells, all is as before
     np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
     np.testing.assert_allclose(watch.waited, [60, 0])
     np.testing.assert_allclose(watch.largest, [59, 60])
+    np.testing.assert_allclose(watch.agrees, [0.9, 0.2])
+
+
+def test_what_is_lost_is_found_only_when_it_shows_itself():
+    """Hidden by something nearer it may agree in the little that is seen, and is still lost."""
+    watch, none, one = first_watch(1), jnp.zeros(1), jnp.array([True])
+    told = [(0.2, 0.2, True), (0.9, 0.4, True), (0.9, 0.6, False), (0.4, 0.4, False), (0.3, 0.3, True)]
+    for agrees, shows, lost in told:
+        sure = Confidence(jnp.array([agrees]), jnp.array([shows]), one)
+        watch = watch.after(none, one, none, sure)
+        assert bool(watch.lost[0]) == lost, (agrees, shows)

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gsjax.methods.object_tracker.layers import Shown
-from gsjax.methods.object_tracker.points import Points, Sight, rotated
+from gsjax.methods.object_tracker.points import Points, Sight, join, rotated
 
 _COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
 _FEWEST = 6.0  # points that can tell
@@ -67,9 +68,20 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
 class Missing(NamedTuple):
     """What a lost group is looked for with."""
 
-    points: Points  # of each group; only its Gaussians of the first frame count
+    points: Points  # of each group, see `alone`
     strangers: Points  # pixels of the last frame that no group explains
     count: Int[Array, ""]  # frames so far, from which chance is drawn: a recording gives the same run again
+
+
+def alone(centers: Points, others: Points) -> Points:
+    """Both joined, where only the centres count: the others show what a lost group was taken for.
+
+    The centres stand where every fourth or every other point is chosen first.
+    """
+    both = join(centers, others._replace(seen=jnp.zeros_like(others.seen)))
+    count = both.seen.shape[-1]
+    places = np.concatenate([np.arange(0, count, 4), np.arange(2, count, 4), np.arange(1, count, 2)])
+    return jax.tree.map(lambda a: a[..., np.argsort(places)], both)
 
 
 def with_strangers(shown: Shown, sight: Sight, num_groups: int, gap: float, coarseness: int) -> Shown:

@@ -23,7 +23,7 @@ from gsjax.methods.object_tracker.layers import (
     shown_by,
     thinned,
 )
-from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, confidence, with_strangers
+from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, alone, confidence, with_strangers
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
 from gsjax.methods.object_tracker.points import (
@@ -221,9 +221,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             everywhere = jnp.int32(
                 num_objects if config.align.everywhere is None else config.align.everywhere
             )
-        # Of what is lost only the centres say where it is: the pixels show what it was taken for.
-        firsts = join(weighted, since._replace(seen=jnp.zeros_like(since.seen)))
-        missing = Missing(firsts, state.strangers, state.count)
+        missing = Missing(alone(named, since), state.strangers, state.count)
         seen = (config.align, state.watch, visible, everywhere, missing)
         aligned, again, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
         residual = aligned.residuals

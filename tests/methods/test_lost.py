@@ -1,0 +1,120 @@
+"""Whether a group is where it is believed to be, and where it is looked for when it is not."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.methods.object_tracker import GrowConfig, RefineConfig, track
+from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.layers import Shown
+from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, guesses, with_strangers
+from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, sight_of
+from gsjax.methods.object_tracker.search import coarse_shifts
+
+CARTON, GAP = 2, 0.015
+SIZE = {"width": 160, "height": 120}
+
+
+@pytest.fixture(scope="module")
+def carton(table):
+    """(sight, points that show the carton in it, as one group)."""
+    sequence, frames, _ = table(8, 2, **SIZE)
+    labels = np.stack([sequence.mask(6, c) for c in range(2)])
+    sight = sight_of(frames[6], 0.3)
+    labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
+    return sight, pixels_of_groups(sight, labels, sight.depths, 1, AlignConfig())
+
+
+def moved(points: Points, *twist: float) -> Points:
+    center = (points.means * points.seen[:, :, None]).sum((1, 3)) / points.seen.sum((1, 2))[:, None]
+    return jax.vmap(carry)(points, jnp.asarray([twist]), center)
+
+
+def test_what_is_where_it_was_agrees_and_what_is_elsewhere_does_not(carton):
+    sight, points = carton
+    here = confidence(points, sight, GAP)
+    assert here.agrees[0] > 0.95
+    assert here.shows[0] > 0.95
+    assert here.tells[0]
+    for shift in ((0.06, 0.0, 0.0), (0.0, -0.06, 0.0), (0.0, 0.0, 0.06)):
+        there = confidence(moved(points, *shift, 0, 0, 0), sight, GAP)
+        assert there.shows[0] < FOUND, shift
+    assert confidence(moved(points, 0, 0, 0.1, 0, 0, 0), sight, GAP).agrees[0] < LOST
+
+
+def test_what_hides_a_group_says_nothing_of_it(carton):
+    """A hand before the left camera: what the other sees decides, and both hidden, nobody tells."""
+    sight, points = carton
+    near = sight.pixels.at[0, ..., 3].set(0.2)
+    one = confidence(points, sight._replace(pixels=near), GAP)
+    assert one.agrees[0] > 0.95
+    assert one.tells[0]
+    share = points.seen[0, 1].sum() / points.seen.sum()
+    assert one.shows[0] == pytest.approx(float(share * one.agrees[0]), rel=1e-3)
+    both = confidence(points, sight._replace(pixels=sight.pixels.at[..., 3].set(0.2)), GAP)
+    assert not both.tells[0]
+    assert both.shows[0] == 0
+
+
+def test_without_depth_colour_alone_decides(carton):
+    sight, points = carton
+    sight = sight._replace(pixels=sight.tones)
+    assert confidence(points, sight, GAP).agrees[0] > 0.95
+    assert confidence(moved(points, 0.1, 0.1, 0, 0, 0, 0), sight, GAP).agrees[0] < 0.6
+
+
+def test_strangers_are_nearer_than_what_is_modelled(carton):
+    sight, _ = carton
+    model = jnp.full(sight.depths.shape, 0.9)
+    shown = Shown(jnp.ones(model.shape, jnp.int32), model, model > 0)
+    found = with_strangers(shown, sight, 1, GAP, 1)
+    strange = np.asarray((sight.depths > 0) & (sight.depths < 0.9 - GAP))
+    assert 0 < strange.mean() < 1
+    np.testing.assert_array_equal(found.labels, np.where(strange, 2, 1))
+    np.testing.assert_array_equal(found.depths, np.where(strange, sight.depths, 0.9))
+    blind = sight._replace(pixels=sight.tones)
+    assert with_strangers(shown, blind, 1, GAP, 1) is shown
+
+
+def test_guesses_bring_points_to_strangers_or_stay_near(carton):
+    _, points = carton
+    one = jax.tree.map(lambda a: a[0], points)
+    center = jnp.array([0.1, 0.0, 0.1])
+    strangers = one._replace(means=one.means + jnp.array([0.5, 0.3, 0.0])[:, None])
+    shifts = coarse_shifts(AlignConfig())
+    drawn = [guesses(jax.random.key(seed), shifts, one, center, strangers) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert np.abs(drawn[0] - drawn[2]).max() > 0.1
+    np.testing.assert_array_equal(drawn[0][::2, :3], shifts[::2, :3])
+    places = np.asarray(strangers.means).transpose(0, 2, 1)[np.asarray(strangers.seen) > 0]
+    for twist in drawn[0][1:20:2]:
+        reached = np.asarray(carry(one, twist, center).means).transpose(0, 2, 1)[np.asarray(one.seen) > 0]
+        apart = np.linalg.norm(reached[:, None] - places, axis=-1)
+        assert apart.min() < 1e-5
+    nowhere = strangers._replace(seen=jnp.zeros_like(strangers.seen))
+    np.testing.assert_array_equal(
+        guesses(jax.random.key(0), shifts, one, center, nowhere)[:, :3], shifts[:, :3]
+    )
+
+
+def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick):
+    """The scene has the carton 12 cm beside where it is, too far to be looked for from there."""
+    _, frames, _ = table()
+    config = replace(
+        quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
+    )
+    group = started.label_ids.index(CARTON)
+    mine = np.asarray(started.labels) == group
+    away = np.where(mine[:, None], [0.0, 0.12, 0.0], 0.0)
+    wrong = eqx.tree_at(lambda s: s.gaussians.means, started, started.gaussians.means + away)
+    updates = list(track(wrong, frames[0], [frames[0]] * 15, config))
+    assert updates[0].info["lost"][group - 1]
+    assert not updates[-1].info["lost"][group - 1]
+    others = np.delete(np.asarray(updates[-1].info["lost"]), group - 1)
+    assert not others.any()
+    found = np.asarray(updates[-1].pose.means)[mine[: started.num_moving]].mean(0)
+    assert np.linalg.norm(found - np.asarray(started.gaussians.means)[mine].mean(0)) < 0.01
