@@ -4,29 +4,23 @@
 of which every third frame is taken, so that objects move far from one to the next.
 """
 
-import os
+import sys
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
 
 import numpy as np
-from rich.console import Console
+from recordings import recorded, scored, started, tracked
 
-from gsjax.cli.loop import follow
-from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
-from gsjax.cli.scoring import Scores, group_values, metrics, score_motion
-from gsjax.cli.views import views
-from gsjax.methods.object_tracker import TrackedScene, TrackerConfig, start_scene
-from gsjax.scene.frame import Frame
+from gsjax.methods.object_tracker import TrackerConfig
 
-DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 RECORDINGS = {  # with the frames that are taken
-    "tabletop": ("simulated:tabletop?width=240&height=180", "0:24"),
-    "tabletop_0": (str(DATA / "tabletop_0"), "0:60:3"),
+    "tabletop": (lambda: "simulated:tabletop?width=240&height=180", "0:24"),
+    "tabletop_0": (lambda: str(recorded("tabletop_0")), "0:60:3"),
 }
-CAMERAS, MASK_CAMERA, HELD_OUT = (0, 1), 1, (2,)
-MOVED_MM = 30.0  # an object that moves less says little about a tracker
+CAMERAS, HELD_OUT = (0, 1), (2,)
 FULL = TrackerConfig()
 
 
@@ -50,55 +44,12 @@ VARIANTS = {
 }
 
 
-class Start(NamedTuple):
-    """What all variants begin with."""
-
-    recording: Recording
-    mask: FirstMask
-    frame: Frame
-    scene: TrackedScene
-
-
-@cache
-def started(name: str) -> Start:
-    """The recording and its scene at the first frame, which no switch changes: made once."""
-    dataset, frames = RECORDINGS[name]
-    if not dataset.startswith("simulated:") and not Path(dataset).exists():
-        raise FileNotFoundError(f"{dataset}: not there; set GSJAX_DATA to the folder that holds {name}")
-    recording = open_recording(dataset, CAMERAS, HELD_OUT, frames)
-    draw_ahead(recording, Console(stderr=True, quiet=True))
-    mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)
-    assert mask.labels is not None
-    return Start(recording, mask, frame, start_scene(frame, mask.labels, CAMERAS.index(MASK_CAMERA), FULL))
-
-
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Track with one variant, and score as `gsjax track` does."""
-    recording, mask, frame, scene = started(options["recording"])
-    quiet = Console(stderr=True, quiet=True)
-    tracking = follow(scene, frame, recording.tracked, VARIANTS[options["variant"]], quiet)
-    if tracking.stopped is not None:
-        raise tracking.stopped
-    values, truth = group_values(tracking, mask, recording), recording.tracked.truth
-    scores = Scores(values, None if truth is None else truth.robot)
-    for views_of_frame in views(tracking, recording):
-        for view in views_of_frame:
-            scores.add(view)
-    found = metrics(tracking, recording, mask, scores, score_motion(tracking, recording), values)
-    moved = {name: s for name, s in found["objects"].items() if (s["moved_mm"] or 0) > MOVED_MM}
-    centroids = {name: s["centroid_error_mm"] for name, s in moved.items()}
-    return {
-        "centroid_mm": np.mean(list(centroids.values())),
-        "worst_centroid_mm": max(centroids.values()),
-        "median_point_mm": np.mean([s["median_point_error_mm"] for s in moved.values()]),
-        "mean_point_mm": np.mean([s["point_error_mm"] for s in moved.values()]),
-        "iou": np.mean([found["iou"][name] for name in moved]),
-        "held_out_psnr": found["held_out"]["psnr_covered"],
-        "tracked_psnr": found["tracked"]["psnr"],
-        "update_ms": 1e3 * np.median(tracking.update_s[1:]),
-        "skipped": tracking.skipped,
-        "objects": [f"{name}: {mm:.1f} mm" for name, mm in centroids.items()],
-    }
+    dataset, frames = RECORDINGS[options["recording"]]
+    start = started(dataset(), frames, CAMERAS, HELD_OUT, FULL.start)
+    tracking = tracked(start, VARIANTS[options["variant"]])
+    return scored(start, tracking) | {"update_ms": 1e3 * np.median(tracking.update_s[1:])}
 
 
 PANELS = (

@@ -1,0 +1,84 @@
+"""What experiments with the tracker share: recordings, their scenes, and scores as `gsjax track` has them."""
+
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from gsjax.cli.loop import Tracking, begin, follow
+from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
+from gsjax.cli.scoring import Scores, group_values, metrics, score_motion
+from gsjax.cli.views import views
+from gsjax.methods.object_tracker import StartConfig, TrackedScene, TrackerConfig, start_scene
+from gsjax.scene.frame import Frame
+
+DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+MASK_CAMERA = 1
+MOVED_MM = 30.0  # an object that moves less says little about a tracker
+QUIET = Console(stderr=True, quiet=True)
+
+
+class Start(NamedTuple):
+    """What a tracker begins with."""
+
+    recording: Recording
+    mask: FirstMask
+    frame: Frame
+    scene: TrackedScene
+
+
+def recorded(name: str) -> Path:
+    """The folder of a recording that is not part of this repository."""
+    if not (DATA / name).exists():
+        raise FileNotFoundError(f"{DATA / name}: not there; set GSJAX_DATA to the folder that holds {name}")
+    return DATA / name
+
+
+@lru_cache(maxsize=4)
+def started(
+    dataset: str, frames: str, cameras: tuple[int, ...], held_out: tuple[int, ...], config: StartConfig
+) -> Start:
+    """A recording and its scene at the first frame, made once for several settings of the tracker."""
+    recording = open_recording(dataset, cameras, held_out, frames)
+    draw_ahead(recording, QUIET)
+    mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)
+    assert mask.labels is not None
+    scene = start_scene(frame, mask.labels, cameras.index(MASK_CAMERA), TrackerConfig(start=config))
+    return Start(recording, mask, frame, scene)
+
+
+def tracked(start: Start, config: TrackerConfig) -> Tracking:
+    """All of it followed; what stops it is raised."""
+    tracking = follow(begin(start.scene), start.frame, start.recording.tracked, config, QUIET)
+    if tracking.stopped is not None:
+        raise tracking.stopped
+    return tracking
+
+
+def scored(start: Start, tracking: Tracking, every: int = 1) -> dict[str, Any]:
+    """Means over the objects that move; pictures and labels of every so-manieth frame."""
+    recording = start.recording
+    values, truth = group_values(tracking, start.mask, recording), recording.tracked.truth
+    scores = Scores(values, None if truth is None else truth.robot)
+    for t, views_of_frame in enumerate(views(tracking, recording)):
+        for view in views_of_frame if t % every == 0 else ():
+            scores.add(view)
+    found = metrics(tracking, recording, start.mask, scores, score_motion(tracking, recording), values)
+    moved = {name: s for name, s in found["objects"].items() if (s["moved_mm"] or 0) > MOVED_MM}
+    centroids = {name: s["centroid_error_mm"] for name, s in moved.items()}
+    return {
+        "centroid_mm": np.mean(list(centroids.values())),
+        "worst_centroid_mm": max(centroids.values()),
+        "median_point_mm": np.mean([s["median_point_error_mm"] for s in moved.values()]),
+        "worst_median_point_mm": max(s["median_point_error_mm"] for s in moved.values()),
+        "mean_point_mm": np.mean([s["point_error_mm"] for s in moved.values()]),
+        "iou": np.mean([found["iou"][name] for name in moved]),
+        "held_out_psnr": found["held_out"]["psnr_covered"],
+        "tracked_psnr": found["tracked"]["psnr"],
+        "frames_lost": sum(s["frames_lost"] for s in moved.values()),
+        "skipped": tracking.skipped,
+        "objects": [f"{name}: {mm:.1f} mm" for name, mm in centroids.items()],
+    }

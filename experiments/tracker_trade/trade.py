@@ -1,0 +1,124 @@
+"""Update rate against accuracy, one knob of the tracker at a time around the preset `fast`."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
+
+import numpy as np
+from recordings import recorded, scored, started, tracked
+
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig, track
+
+FAST = PRESETS["fast"]
+CAMERAS = (0, 1, 2)
+REFERENCE = 20  # updates of `fast` that are timed beside each cell
+WARM = 3  # updates at the start that are left out: they fault their memory in
+
+
+def setting(knob: str, value: Any) -> TrackerConfig:
+    """`fast` with one knob turned."""
+
+    def align(**changes) -> TrackerConfig:
+        return replace(FAST, align=replace(FAST.align, **changes))
+
+    def start(**changes) -> TrackerConfig:
+        return replace(FAST, start=replace(FAST.start, **changes))
+
+    whole = replace(FAST, redraw="all", coarseness=1)
+    match knob:
+        case "preset":
+            return PRESETS[value]
+        case "iterations":
+            return align(iterations=value)
+        case "image size":
+            return replace(FAST, shrink=int(value.removeprefix("1/")))
+        case "Gaussians":  # the width of the voxels that keep one point each, in pixels
+            return start(object_pixels=value, background_pixels=2.4 * value)
+        case "cameras":  # the mask's first
+            return replace(FAST, cameras=(1, 0, 2)[:value])
+        case "redraw":
+            return whole if value == "all" else replace(FAST, coarseness=1)
+        case "everywhere":
+            return align(everywhere=None if value == "all" else value)
+        case "points":
+            return align(pixels=value, centers=max(1, 2 * value // 3))
+        case "refine":
+            return replace(whole, refine=replace(FAST.refine, iterations=value))
+    raise ValueError(f"knob: {knob} is none of this experiment")
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """Follow a recording with one setting, and a part of it with `fast` in the same minute."""
+    config, dataset = setting(options["knob"], options["value"]), str(recorded(options["recording"]))
+    start = started(dataset, ":", CAMERAS, (), config.start)
+    tracking = tracked(start, config)
+    milliseconds = 1e3 * np.asarray(tracking.update_s[1 + WARM :])
+    usual = started(dataset, ":", CAMERAS, (), FAST.start)
+    frames = [usual.recording.tracked.frame(t) for t in range(1, REFERENCE + WARM)]
+    reference = [1e3 * update.seconds for update in track(usual.scene, usual.frame, frames, FAST)][WARM:]
+    return scored(start, tracking, every=6) | {
+        "update_ms": float(np.median(milliseconds)),
+        "update_p95_ms": float(np.percentile(milliseconds, 95)),
+        "ratio": float(np.median(milliseconds) / np.median(reference)),
+        "gaussians": start.scene.gaussians.num,
+    }
+
+
+PANELS = (
+    ("centroid_mm", "centroid error [mm]", True),
+    ("median_point_mm", "median point error [mm]", True),
+    ("iou", "label IoU", False),
+    ("tracked_psnr", "PSNR, tracked cameras [dB]", False),
+)
+KNOBS = ("iterations", "image size", "Gaussians", "cameras", "redraw", "everywhere", "points", "refine")
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """A row of panels for each recording, a line for each knob."""
+    from matplotlib.figure import Figure
+
+    recordings = list(dict.fromkeys(row["recording"] for row in rows))
+    drawing = Figure(figsize=(18, 1 + 4.6 * len(recordings)), dpi=90, layout="constrained")
+    grid = drawing.subplots(len(recordings), len(PANELS), squeeze=False)
+    for panels, recording in zip(grid, recordings, strict=True):
+        mine = [row for row in rows if row["recording"] == recording]
+        presets = {row["value"]: row for row in mine if row["knob"] == "preset"}
+        for axes, (key, title, lower) in zip(panels, PANELS, strict=True):
+            draw_front(axes, mine, key, lower)
+            for i, knob in enumerate(KNOBS):
+                turned = [row for row in mine if row["knob"] == knob]
+                line = sorted([*turned, *([presets["fast"]] if "fast" in presets else [])], key=rate)
+                axes.plot([rate(r) for r in line], [r[key] for r in line], color=f"C{i}", linewidth=1.2)
+                axes.plot([rate(r) for r in turned], [r[key] for r in turned], "o", color=f"C{i}", label=knob)
+                for row in turned:
+                    place = {"textcoords": "offset points", "xytext": (4, 4), "fontsize": 8}
+                    axes.annotate(str(row["value"]), (rate(row), row[key]), color=f"C{i}", **place)
+            for name, row in presets.items():
+                axes.plot(rate(row), row[key], "*", color="black", markersize=13)
+                place = {"textcoords": "offset points", "xytext": (6, -12), "fontsize": 9, "weight": "bold"}
+                axes.annotate(name, (rate(row), row[key]), **place)
+            axes.axvline(30, color="#888888", linewidth=0.8, linestyle=":")
+            axes.set(xscale="log", title=f"{recording}: {title}", xlabel="updates a second")
+            if lower:
+                axes.set_yscale("log")
+    handles, names = grid[0, 0].get_legend_handles_labels()
+    drawing.legend(handles, names, loc="outside lower center", ncols=len(KNOBS), frameon=False)
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
+
+
+def rate(row: dict[str, Any]) -> float:
+    """Updates a second."""
+    return 1e3 / row["update_ms"]
+
+
+def draw_front(axes, rows: list[dict[str, Any]], key: str, lower: bool) -> None:
+    """The best value that any setting reaches at a rate or a higher one."""
+    best, ordered = [], sorted(rows, key=rate, reverse=True)
+    for row in ordered:
+        worst = np.inf if lower else -np.inf
+        known = best[-1] if best else worst
+        best.append(min(known, row[key]) if lower else max(known, row[key]))
+    axes.step([rate(row) for row in ordered], best, where="post", color="#bbbbbb", linewidth=5, zorder=0)
