@@ -81,10 +81,9 @@ def refine_residual(
     Args:
         motions: of each group, K of them, about its centre.
         batch: with a plan whose derivative is "forward" where the Jacobian is made by columns.
-        block: differences are means over blocks so many pixels wide. How one pixel of a rendered image changes
-            depends on the Gaussian whose edge it lies at; that is no part of the motion, and in J^T J it
-            counts like gradients of the picture, which makes steps short. Pixels that fill no block are left
-            out.
+        block: differences are means over blocks so many pixels wide. How one rendered pixel changes depends
+            on the Gaussian whose edge it lies at; that is no part of the motion, and in J^T J it counts like
+            gradients of the picture, which makes steps short. Pixels that fill no block are left out.
     """
     twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
     rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
@@ -97,7 +96,9 @@ def refine_residual(
         rounded = softness * limit
         return huber(jnp.clip(mean, -limit, limit), rounded) * jnp.sqrt(total / rounded)
 
-    residuals = {"color": residual(rendered.colors - frame.images, config.color_limit, weights[..., None] / 3)}
+    residuals = {
+        "color": residual(rendered.colors - frame.images, config.color_limit, weights[..., None] / 3)
+    }
     if frame.depths is not None:
         known = config.depth_weight * weights * (frame.depths > 0)
         gap = (rendered.depths - frame.depths)[..., None]
