@@ -20,7 +20,7 @@ from gsjax.cli.recording import open_recording
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 MASK_CAMERA = 1
 RECORDINGS = {  # with the frames that updates begin at
-    "built-in": ("simulated:tabletop", (12, 20)),
+    "built-in": ("simulated:tabletop", (12,)),
     "tabletop_1": (str(DATA / "tabletop_1"), (18, 34)),
 }
 COUNTS = [0, 1, 2, 4, 8, 16, 32]

@@ -27,6 +27,7 @@ from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
 from gsjax.methods.object_tracker.search import first_watch, search, widened
 from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import least_squares_step
+from gsjax.optim.step import Step
 from gsjax.scene.render import render
 
 ALIGN, REFINE = AlignConfig(), RefineConfig(delta_rate=3e-5)
@@ -114,25 +115,27 @@ def adam(
     return Trace(counts, motions, [count * each for count in counts])
 
 
+def rigid_step(block: int) -> Step:
+    return least_squares_step(
+        partial(refine_residual, config=REFINE, block=block, softness=SOFTNESS), jac="fwd"
+    )
+
+
 @partial(jitted, static_argnames="block")
 def least_squares(motions, state, batch, block):
     """One iteration of Levenberg-Marquardt on all groups at once."""
-    residual = partial(refine_residual, config=REFINE, block=block, softness=SOFTNESS)
-    step = least_squares_step(residual, jac="fwd")
-    state = step.init(motions) if state is None else state
-    return step.update(motions, state, batch, step=0, key=None)[:2]
+    return rigid_step(block).update(motions, state, batch, step=0, key=None)[:2]
 
 
-def levenberg_marquardt(update: Update, counts: list[int], blocks: tuple[int, ...] = BLOCKS) -> Trace:
+def levenberg_marquardt(update: Update, counts: list[int]) -> Trace:
     """On rendered residuals, coarse to fine, with a dense Jacobian by columns; rigid groups."""
     batch = update.batch._replace(plan=replace(update.batch.plan, derivative="forward"))
     motions, found, ms = jaxlie.SE3.identity((len(batch.centers),)), [standing(update)], []
     state, last = None, None
-    for block in blocks[: max(counts)]:
+    for block in BLOCKS[: max(counts)]:
         if block != last:  # another problem from here on
-            state, last = least_squares(motions, None, batch, block)[1], block
-            least_squares(motions, state, batch, block)
-            state = jax.tree.map(jnp.ones_like, state)
+            state, last = rigid_step(block).init(motions), block
+            timed(least_squares, motions, state, batch, block)  # compiles
         (motions, state), took = timed(least_squares, motions, state, batch, block)
         ms.append(took)
         twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
