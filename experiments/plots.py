@@ -148,9 +148,9 @@ def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> 
             for key, (label, color, dash) in COSINES.items():
                 if mine and mine[0].get(key) is not None:
                     slopes.plot(amounts, [row[key] for row in mine], color=color, ls=dash, lw=2, label=label)
-            slopes.set(ylim=(-0.35, 1.04))
+            slopes.set(ylim=(-0.1, 1.04))
             _axes(ends, f"{kind}: who comes home", unit, "" if i else "share of starts")
-            for width, (key, (label, color, marker)) in zip((6, 3, 3, 1.5), ARRIVALS.items(), strict=True):
+            for width, (key, (label, color, marker)) in zip((6, 3.5, 2.5, 1.5), ARRIVALS.items(), strict=True):
                 # What lies below stays in sight.
                 style = {"ms": 11 if marker == "*" else 6, "mec": "white", "mew": 0.8, "lw": width}
                 shares = [row[key] for row in mine]
@@ -160,6 +160,7 @@ def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> 
                 for axes in (slopes, ends):
                     scale = (lambda mm: mm * pixels_per_mm, lambda px: px / pixels_per_mm)
                     top = axes.secondary_xaxis("top", functions=scale)
+                    top.set_xticks(range(0, 21, 5))
                     top.tick_params(colors=FAINT, labelsize=8.5, length=0, pad=0)
                     top.set_xlabel("pixels", color=FAINT, fontsize=8.5, loc="right", labelpad=1)
                     top.spines["top"].set_visible(False)
