@@ -36,6 +36,7 @@ ARRIVALS = {
     "home_align": ("direct alignment", SKY, "o"),
     "home_search": ("direct alignment, searched", BLUE, "*"),
 }
+WIDTHS = (6, 3.5, 2.5, 1.5)  # of their lines: what lies below stays in sight
 
 
 def wilson(successes: float, count: int) -> tuple[float, float]:
@@ -150,8 +151,7 @@ def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> 
                     slopes.plot(amounts, [row[key] for row in mine], color=color, ls=dash, lw=2, label=label)
             slopes.set(ylim=(-0.1, 1.04))
             _axes(ends, f"{kind}: who comes home", unit, "" if i else "share of starts")
-            for width, (key, (label, color, marker)) in zip((6, 3.5, 2.5, 1.5), ARRIVALS.items(), strict=True):
-                # What lies below stays in sight.
+            for width, (key, (label, color, marker)) in zip(WIDTHS, ARRIVALS.items(), strict=True):
                 style = {"ms": 11 if marker == "*" else 6, "mec": "white", "mew": 0.8, "lw": width}
                 shares = [row[key] for row in mine]
                 ends.plot(amounts, shares, color=color, marker=marker, label=label, clip_on=False, **style)
