@@ -1,4 +1,4 @@
-"""Figures of the experiments with a robot."""
+"""Figures of the experiments with a robot, and of those with single updates."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +10,33 @@ from matplotlib.figure import Figure
 
 INK, FAINT, GRID = "#22262b", "#6b7280", "#e4e7eb"
 BLUE, GREEN, GREY, ORANGE = "#0072b2", "#009e73", "#9aa0a8", "#d55e00"
+SKY, PURPLE = "#56b4e9", "#8a5fbf"
 GRASPING = {"tracker": BLUE, "true poses": GREEN, "first frame": GREY}
 POLICIES = {"tracked Gaussians": BLUE, "images": ORANGE, "true poses": GREEN}
+
+OPTIMIZERS = {
+    "Adam, translation": (GREY, "s"),
+    "Adam, SE(3)": ("#e9a36b", "v"),
+    "Adam, SE(3), rigid": (ORANGE, "o"),
+    "Levenberg-Marquardt": (PURPLE, "D"),
+    "ICP": (GREEN, "^"),
+    "direct alignment": (SKY, "o"),
+    "direct, searched": (BLUE, "*"),
+}
+
+COSINES = {
+    "cos_single": ("single Gaussians, photometric", GREY, "-"),
+    "cos_photometric": ("photometric", ORANGE, "-"),
+    "cos_blocks": ("photometric, means of 8 x 8 pixels", ORANGE, (0, (4, 2))),
+    "cos_depth": ("photometric and depth", GREEN, "-"),
+}
+ARRIVALS = {
+    "home_adam": ("Adam, photometric", ORANGE, "s"),
+    "home_adam_depth": ("Adam, photometric and depth", GREEN, "D"),
+    "home_align": ("direct alignment", SKY, "o"),
+    "home_search": ("direct alignment, searched", BLUE, "*"),
+}
+WIDTHS = (6, 3.5, 2.5, 1.5)  # of their lines: what lies below stays in sight
 
 
 def wilson(successes: float, count: int) -> tuple[float, float]:
@@ -78,6 +103,72 @@ def draw_policies(rows: list[dict[str, Any]], path: Path) -> None:
     axes.set(ylim=(0, 1.17), yticks=np.linspace(0, 1, 6), xlim=(-0.5, len(kinds) - 0.5))
     axes.grid(axis="x", visible=False)
     drawing.savefig(path, dpi=160)
+
+
+def draw_optimizers(rows: list[dict[str, Any]], path: Path) -> None:
+    """Point error over time, a panel for each kind of update."""
+    drawing = Figure(figsize=(11.5, 7.6), facecolor="white", layout="constrained")
+    kinds = list(dict.fromkeys((row["recording"], row["gap"]) for row in rows))
+    grid = drawing.subplots(2, -(-len(kinds) // 2), squeeze=False, sharex=True, sharey=True)
+    for axes, (recording, gap) in zip(grid.flat, kinds, strict=False):
+        mine = [row for row in rows if (row["recording"], row["gap"]) == (recording, gap)]
+        away = f"{gap} frame" + "s" * (gap > 1)
+        _axes(axes, f"{recording}, {away} on", "", "")
+        axes.axhline(mine[0]["start_mm"], color=INK, lw=1, ls=":")
+        for row in mine:
+            color, marker = OPTIMIZERS[row["method"]]
+            draws = np.array(row["times_ms"][1:]) / row["draw_ms"]
+            errors, alone = row["point_errors_mm"][1:], len(draws) == 1
+            style = {"ms": 15 if alone else 5.5, "mec": "white", "mew": 0.8, "lw": 1.8, "zorder": 3 + alone}
+            axes.plot(draws, errors, color=color, marker=marker, label=row["method"], **style)
+        axes.set(xscale="log", yscale="log")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "25" else "")
+    drawing.supylabel("mean point error (mm)", color=FAINT, fontsize=10)
+    drawing.supxlabel("time, in draws of the scene", color=FAINT, fontsize=10)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    style = {"frameon": False, "fontsize": 10, "labelcolor": INK, "columnspacing": 1.6}
+    drawing.legend(handles, labels, loc="outside upper left", ncols=len(labels), **style)
+    drawing.savefig(path, dpi=130)
+
+
+def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> None:
+    """Where gradients point, and who comes home, over the displacement: a row of panels for each motion."""
+    drawing = Figure(figsize=(15, 7.4), facecolor="white", layout="constrained")
+    grid = drawing.subplots(2, 4, squeeze=False)
+    units = {"translation": "displaced by (mm)", "rotation": "turned by (°)"}
+    objects = list(dict.fromkeys(row["object"] for row in rows))
+    for panels, (motion, unit) in zip(grid, units.items(), strict=True):
+        for i, kind in enumerate(objects):
+            mine = [row for row in rows if (row["motion"], row["object"]) == (motion, kind)]
+            amounts = [row["amount"] for row in mine]
+            slopes, ends = panels[i], panels[2 + i]
+            _axes(slopes, f"{kind}: does down lead home?", unit, "" if i else "cosine")
+            slopes.axhline(0, color=INK, lw=0.8)
+            for key, (label, color, dash) in COSINES.items():
+                if mine and mine[0].get(key) is not None:
+                    slopes.plot(amounts, [row[key] for row in mine], color=color, ls=dash, lw=2, label=label)
+            slopes.set(ylim=(-0.1, 1.04))
+            _axes(ends, f"{kind}: who comes home", unit, "" if i else "share of starts")
+            for width, (key, (label, color, marker)) in zip(WIDTHS, ARRIVALS.items(), strict=True):
+                style = {"ms": 11 if marker == "*" else 6, "mec": "white", "mew": 0.8, "lw": width}
+                shares = [row[key] for row in mine]
+                ends.plot(amounts, shares, color=color, marker=marker, label=label, clip_on=False, **style)
+            ends.set(ylim=(0, 1.04))
+            if motion == "translation":
+                for axes in (slopes, ends):
+                    scale = (lambda mm: mm * pixels_per_mm, lambda px: px / pixels_per_mm)
+                    top = axes.secondary_xaxis("top", functions=scale)
+                    top.set_xticks(range(0, 21, 5))
+                    top.tick_params(colors=FAINT, labelsize=8.5, length=0, pad=0)
+                    top.set_xlabel("pixels", color=FAINT, fontsize=8.5, loc="right", labelpad=1)
+                    top.spines["top"].set_visible(False)
+    for panel, side in ((grid[0, 0], "left"), (grid[0, 2], "right")):
+        handles, labels = panel.get_legend_handles_labels()
+        style = {"frameon": False, "fontsize": 9.5, "labelcolor": INK, "columnspacing": 1.3}
+        drawing.legend(handles, labels, loc=f"outside lower {side}", ncols=2, **style)
+    drawing.savefig(path, dpi=120)
 
 
 def _bars(

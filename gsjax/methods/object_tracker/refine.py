@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import optax
 from jaxtyping import Array, Bool, Float
 
@@ -13,9 +14,10 @@ from gsjax.methods.object_tracker.config import RefineConfig
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
 from gsjax.methods.object_tracker.region import shift_background
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.optim.least_squares import huber
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
-from gsjax.scene.render import render
+from gsjax.scene.render import Rendered, render
 
 
 class RefineBatch(NamedTuple):
@@ -39,10 +41,7 @@ def refine_loss(
     """
     scene, frame = batch.scene, batch.frame
     groups = scene.labels[: scene.num_moving]
-    pose = move(batch.pose, motion, batch.centers, groups)
-    visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat))
-    rendered = render(place(scene, pose), frame.cameras, batch.plan, roi=batch.roi, visibility=visibility)
-    weights = jax.lax.stop_gradient(rendered.alphas) * batch.roi
+    rendered, weights = _moved(motion, batch)
     difference = jnp.minimum(jnp.abs(rendered.colors - frame.images), config.color_limit).mean(-1)
     # Sums over pixels, in units of a thousand: an object's pull does not depend on what else is in view.
     color = 1e-3 * jnp.sum(difference * weights)
@@ -61,6 +60,67 @@ def refine_loss(
         "needed": rendered.meta.needed.max(),
     }
     return loss, info
+
+
+def refine_residual(
+    motions: jaxlie.SE3,
+    batch: RefineBatch,
+    *,
+    step: Any,
+    key: Any,
+    config: RefineConfig,
+    block: int = 4,
+    softness: float = 0.1,
+) -> tuple[dict[str, Float[Array, "..."]], dict[str, Any]]:
+    """The differences of `refine_loss` as residuals of rigid motions, for `gsjax.optim.least_squares`.
+
+    Half their squares sum up to a thousand times that loss (with blocks of one pixel), but for differences
+    below `softness` times their limit, which are rounded off (Huber): an absolute value has no curvature that
+    Gauss-Newton could use.
+
+    Args:
+        motions: of each group, K of them, about its centre.
+        batch: with a plan whose derivative is "forward" where the Jacobian is made by columns.
+        block: differences are means over blocks so many pixels wide. How one rendered pixel changes depends
+            on the Gaussian whose edge it lies at; that is no part of the motion, and in J^T J it counts like
+            gradients of the picture, which makes steps short. Pixels that fill no block are left out.
+    """
+    twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
+    rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
+    frame = batch.frame
+
+    def residual(difference, limit, weights):
+        """Of differences [c, h, w, d] that count `weights` [c, h, w, 1]."""
+        total = _summed(weights, block)
+        mean = _summed(difference * weights, block) / jnp.maximum(total, 1e-6)
+        rounded = softness * limit
+        return huber(jnp.clip(mean, -limit, limit), rounded) * jnp.sqrt(total / rounded)
+
+    residuals = {
+        "color": residual(rendered.colors - frame.images, config.color_limit, weights[..., None] / 3)
+    }
+    if frame.depths is not None:
+        known = config.depth_weight * weights * (frame.depths > 0)
+        gap = (rendered.depths - frame.depths)[..., None]
+        residuals["depth"] = residual(gap, config.depth_limit, known[..., None])
+    return residuals, {"overflow": rendered.meta.overflow.any(), "needed": rendered.meta.needed.max()}
+
+
+def _summed(values: Float[Array, "c height width d"], block: int) -> Float[Array, "c rows columns d"]:
+    """Sums over blocks of `block` by `block` pixels."""
+    cameras, height, width, channels = values.shape
+    values = values[:, : height // block * block, : width // block * block]
+    values = values.reshape(cameras, height // block, block, width // block, block, channels)
+    return values.sum((2, 4))
+
+
+def _moved(motion: Motion, batch: RefineBatch) -> tuple[Rendered, Float[Array, "c height width"]]:
+    """The scene after the motion, and what each of its pixels counts."""
+    scene, cameras = batch.scene, batch.frame.cameras
+    pose = move(batch.pose, motion, batch.centers, scene.labels[: scene.num_moving])
+    visibility = facing(scene, pose, camera_centers(cameras.viewmat))
+    rendered = render(place(scene, pose), cameras, batch.plan, roi=batch.roi, visibility=visibility)
+    return rendered, jax.lax.stop_gradient(rendered.alphas) * batch.roi
 
 
 def refine(

@@ -1,0 +1,113 @@
+"""One update of the tracker as a problem with a known answer: a scene, the next images, the true motion."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.data import Sequence
+from gsjax.methods.object_tracker import (
+    StartConfig,
+    TrackedScene,
+    TrackerConfig,
+    first_pose,
+    first_state,
+    plan_tracker,
+    start_scene,
+)
+from gsjax.methods.object_tracker.layers import render_labels
+from gsjax.methods.object_tracker.motion import Motion, group_means, move, place
+from gsjax.methods.object_tracker.points import Points
+from gsjax.methods.object_tracker.refine import RefineBatch
+from gsjax.methods.object_tracker.region import near_background, near_scene, tiles_to_pixels, touched_tiles
+from gsjax.metrics.tracking import ObjectScore, score_object, true_labels
+from gsjax.rasterize.plan import rung
+from gsjax.scene.render import plan_render
+
+# Lighter than the tracker's own, for what is compared is one update. A robot is one group here: each group
+# is six columns of a Jacobian.
+CONFIG = TrackerConfig(
+    start=StartConfig(object_pixels=2.0, background_pixels=6.0, max_extent=1.0, iterations=30)
+)
+
+
+class Update(NamedTuple):
+    """What a method is given, and what it is judged by.
+
+    Attributes:
+        batch: scene, new images and region for what renders; pose and centres are of the last frame.
+        points: pixels that showed each group in the last frame, for what aligns.
+        scored: of each group that is, the Gaussians that truly belong to its object.
+        poses: that object's true poses in both frames.
+    """
+
+    batch: RefineBatch
+    points: Points
+    scored: dict[int, Int[np.ndarray, "n"]]
+    poses: dict[int, Float[np.ndarray, "2 4 4"]]
+
+    def scores(self, motion: Motion) -> list[ObjectScore]:
+        """Of each scored group."""
+        batch = self.batch
+        moved = move(batch.pose, motion, batch.centers, batch.scene.labels[: batch.scene.num_moving])
+        means = np.stack([batch.pose.means, moved.means])
+        return [score_object(means[:, rows], self.poses[group]) for group, rows in self.scored.items()]
+
+    def errors(self, motion: Motion) -> tuple[float, float]:
+        """Centroid error and mean point error in the new frame, mm: means over the scored groups."""
+        scores = self.scores(motion)
+        centroids = [score.centroid_errors_mm[1] for score in scores]
+        # The mean is over both frames, and the first has no error.
+        return float(np.mean(centroids)), float(np.mean([2 * score.point_error_mm for score in scores]))
+
+
+def scene_at(sequence: Sequence, t: int, mask_camera: int) -> TrackedScene:
+    """The scene fitted to frame `t`, with labels from one camera's true mask."""
+    mask = sequence.mask(t, mask_camera)
+    assert mask is not None
+    return start_scene(sequence.frame(t), mask, mask_camera, CONFIG)
+
+
+def update_of(
+    sequence: Sequence,
+    scene: TrackedScene,
+    t: int,
+    gap: int,
+    *,
+    least_mm: float = 3.0,
+    reach: float = 0.0,
+) -> Update:
+    """The update from frame `t`, which `scene` was fitted to, to frame `t + gap`.
+
+    Args:
+        least_mm: objects that move less are followed but not scored.
+        reach: how far from the last pose methods may begin, metres: the region holds that too.
+    """
+    last, frame = (sequence.frame(at) for at in (t, t + gap))
+    pose, groups = first_pose(scene), np.asarray(scene.labels[: scene.num_moving])
+    plan = plan_tracker(scene, pose, last, CONFIG)
+    # As the tracker refines: in tiles that moving Gaussians touch, with the background that reaches there.
+    sides = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.float32)
+    tiles = touched_tiles([pose.means + side for side in sides], last)
+    near = near_background(scene, render_labels(scene, pose, last, plan.full), tiles)
+    around = near_scene(scene, near, rung(int(near.sum())))
+    centers = group_means(pose.means, jnp.asarray(groups), scene.num_objects)
+    near_plan = plan_render(place(around, pose), last.cameras, headroom=CONFIG.headroom)
+    batch = RefineBatch(around, frame, near_plan, pose, centers, tiles_to_pixels(tiles, last))
+    points = first_state(scene, pose, last, CONFIG, plan).pixels
+
+    truth, cameras = sequence.truth, range(sequence.num_cameras)
+    assert truth is not None
+    views = [(sequence.mask(t, c), sequence.depth(t, c)) for c in cameras]
+    labels = true_labels(pose.means, *zip(*views, strict=True), sequence.viewmats[t], sequence.Ks[t])
+    scored, poses = {}, {}
+    for group, value in enumerate(scene.label_ids):
+        which = np.flatnonzero(truth.label_ids == value)
+        rows = np.flatnonzero((groups == group) & (labels == value))
+        if group == 0 or not len(which) or not len(rows):
+            continue
+        both = truth.poses[[t, t + gap], which[0]]
+        if score_object(np.asarray(pose.means)[None, rows].repeat(2, 0), both).moved_mm >= least_mm:
+            scored[group], poses[group] = rows, both
+    return Update(batch, points, scored, poses)

@@ -1,0 +1,214 @@
+"""The methods that are compared: what each has found after 0, 1, 2, 4, ... iterations, and what that takes.
+
+All begin by standing still. Times are from images in memory, and medians of calls that are warm.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import optax
+from one_update import Update
+from scipy.spatial import cKDTree
+from trimesh.registration import procrustes
+
+from gsjax.geometry.cameras import pixel_grid, unproject
+from gsjax.methods.object_tracker.align import align
+from gsjax.methods.object_tracker.config import AlignConfig, RefineConfig
+from gsjax.methods.object_tracker.motion import Motion, place
+from gsjax.methods.object_tracker.points import sight_of
+from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
+from gsjax.methods.object_tracker.search import first_watch, search, widened
+from gsjax.optim.compiler import host_options
+from gsjax.optim.least_squares import least_squares_step
+from gsjax.optim.step import Step
+from gsjax.scene.render import render
+
+ALIGN, REFINE = AlignConfig(), RefineConfig(delta_rate=3e-5)
+# Tuned on other updates than those of the table: see docs/results-optimizers.md.
+TRANSLATION_RATE, ROTATION_RATE = 6e-3, 3e-2  # Adam's at first, metres and radians
+BLOCKS, SOFTNESS = (8,) * 6 + (4,) * 4, 0.3  # Levenberg-Marquardt's, iteration by iteration
+ICP_REACH, ICP_MARGIN = (
+    0.03,
+    0.05,
+)  # pairs further apart than this, and points further off, do not count, metres
+CALLS = 7
+
+
+class Trace(NamedTuple):
+    """What a method has found.
+
+    Attributes:
+        counts: after so many iterations.
+        motions: that motion.
+        ms: milliseconds until then.
+    """
+
+    counts: list[int]
+    motions: list[Motion]
+    ms: list[float]
+
+
+def standing(update: Update) -> Motion:
+    """No motion."""
+    return Motion(jnp.zeros((len(update.batch.centers), 6)), jnp.zeros_like(update.batch.pose.means))
+
+
+def jitted(function: Callable, **options: Any) -> Callable:
+    """Compiled as the tracker's host loop is."""
+    return jax.jit(function, compiler_options=host_options() or None, **options)
+
+
+def timed(function: Callable, *arguments: Any, **options: Any) -> tuple[Any, float]:
+    """What the function gives, and milliseconds."""
+    begun = perf_counter()
+    result = jax.block_until_ready(function(*arguments, **options))
+    return result, 1e3 * (perf_counter() - begun)
+
+
+def median_ms(function: Callable, *arguments: Any, **options: Any) -> float:
+    """Of several calls after one that compiles."""
+    timed(function, *arguments, **options)
+    return float(np.median([timed(function, *arguments, **options)[1] for _ in range(CALLS)]))
+
+
+draw = jitted(lambda batch: render(place(batch.scene, batch.pose), batch.frame.cameras, batch.plan).colors)
+"""The reference for times: what may move and what surrounds it, drawn once in all cameras."""
+
+ADAM = optax.scale_by_adam(b1=0.8, b2=0.95)  # as in `refine`
+
+
+@partial(jitted, static_argnames="config")
+def adam_step(motion, state, batch, rates, config=REFINE):
+    """One iteration down refine's loss, with a rate for each number of a twist and one for delta."""
+    loss = partial(refine_loss, batch=batch, step=0, key=None, config=config)
+    change, state = ADAM.update(jax.grad(loss, has_aux=True)(motion)[0], state)
+    return jax.tree.map(lambda a, rate, by: a - rate * by, motion, rates, change), state
+
+
+def descend(start: Motion, batch, rates: Motion, count: int, config=REFINE) -> Motion:
+    """`count` iterations of Adam whose rates fall to a tenth over them, as in `refine`."""
+    motion, state = start, ADAM.init(start)
+    for i in range(count):
+        falling = jax.tree.map(lambda rate, i=i: rate * 0.1 ** (i / count), rates)
+        motion, state = adam_step(motion, state, batch, falling, config=config)
+    return motion
+
+
+def adam(
+    update: Update,
+    counts: list[int],
+    rotation_rate: float = ROTATION_RATE,
+    delta_rate: float = REFINE.delta_rate,
+) -> Trace:
+    """Adam on D_k and delta_i; every count is a run with a schedule of its own."""
+    start, batch = standing(update), update.batch
+    rates = Motion(jnp.repeat(jnp.array([TRANSLATION_RATE, rotation_rate]), 3), jnp.array(delta_rate))
+    each = median_ms(adam_step, start, ADAM.init(start), batch, rates)
+    motions = [descend(start, batch, rates, count) for count in counts]
+    return Trace(counts, motions, [count * each for count in counts])
+
+
+def rigid_step(block: int) -> Step:
+    return least_squares_step(
+        partial(refine_residual, config=REFINE, block=block, softness=SOFTNESS), jac="fwd"
+    )
+
+
+@partial(jitted, static_argnames="block")
+def least_squares(motions, state, batch, block):
+    """One iteration of Levenberg-Marquardt on all groups at once."""
+    return rigid_step(block).update(motions, state, batch, step=0, key=None)[:2]
+
+
+def levenberg_marquardt(update: Update, counts: list[int]) -> Trace:
+    """On rendered residuals, coarse to fine, with a dense Jacobian by columns; rigid groups."""
+    batch = update.batch._replace(plan=replace(update.batch.plan, derivative="forward"))
+    motions, found, ms = jaxlie.SE3.identity((len(batch.centers),)), [standing(update)], []
+    state, last = None, None
+    for block in BLOCKS[: max(counts)]:
+        if block != last:  # another problem from here on
+            state, last = rigid_step(block).init(motions), block
+            timed(least_squares, motions, state, batch, block)  # compiles
+        (motions, state), took = timed(least_squares, motions, state, batch, block)
+        ms.append(took)
+        twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
+        found.append(Motion(twists, found[0].delta))
+    return Trace(counts, [found[n] for n in counts], [n * float(np.median(ms)) for n in counts])
+
+
+lift = jitted(jax.vmap(unproject, in_axes=(None, 0, 0, 0)))
+
+
+def icp(update: Update, counts: list[int], reach: float = ICP_REACH) -> Trace:
+    """Iterative closest points: pixels that showed a group, against all measured points near it."""
+    frame, centers = update.batch.frame, np.asarray(update.batch.centers, np.float64)
+    grid = pixel_grid(frame.cameras.width, frame.cameras.height).reshape(-1, 2)
+    depths = frame.depths.reshape(len(frame.depths), -1)
+    views = (grid, depths, frame.cameras.viewmat, frame.cameras.K)
+    lift(*views)
+    begun = perf_counter()
+    measured = np.asarray(lift(*views), np.float64)[np.asarray(depths) > 0]
+    sources, trees = [], []
+    for means, seen in zip(np.asarray(update.points.means), np.asarray(update.points.seen), strict=True):
+        source = np.swapaxes(means, 1, 2)[seen > 0].astype(np.float64)
+        inside = np.zeros(len(measured), bool)
+        if len(source):
+            low, high = source.min(0) - ICP_MARGIN, source.max(0) + ICP_MARGIN
+            inside = ((measured > low) & (measured < high)).all(1)
+        sources.append(source)
+        trees.append(cKDTree(measured[inside]) if inside.any() else None)
+    times, poses, found = [1e3 * (perf_counter() - begun)], np.tile(np.eye(4), (len(sources), 1, 1)), []
+    for _ in range(max(counts) + 1):
+        turns = jaxlie.SO3.from_matrix(jnp.asarray(poses[:, :3, :3], jnp.float32)).log()
+        shifts = np.einsum("kij,kj->ki", poses[:, :3, :3], centers) + poses[:, :3, 3] - centers
+        twists = jnp.concatenate([jnp.asarray(shifts, jnp.float32), turns], axis=-1)
+        found.append(Motion(twists, jnp.zeros_like(update.batch.pose.means)))
+        begun = perf_counter()
+        for k, (source, tree) in enumerate(zip(sources, trees, strict=True)):
+            moved = source @ poses[k, :3, :3].T + poses[k, :3, 3]
+            distance, nearest = (np.inf, 0) if tree is None else tree.query(moved)
+            pairs = np.broadcast_to(distance < reach, len(moved))
+            if pairs.sum() >= 3:
+                target = tree.data[nearest[pairs]]
+                poses[k] = procrustes(moved[pairs], target, reflection=False, scale=False)[0] @ poses[k]
+        times.append(1e3 * (perf_counter() - begun))
+    each = float(np.median(times[1:]))
+    return Trace(counts, [found[n] for n in counts], [times[0] + n * each if n else 0.0 for n in counts])
+
+
+over_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
+
+
+@partial(jitted, static_argnames="config")
+def aligned(start, points, centers, frame, config=ALIGN):
+    """Wide scales first, then narrow ones, as in `search`."""
+    sight = sight_of(frame, config.shading)
+    wide = over_groups(start, points, centers, sight, widened(config))
+    return over_groups(wide, points, centers, sight, config)
+
+
+@partial(jitted, static_argnames="config")
+def searched(start, points, centers, frame, config=ALIGN):
+    """The same, and then every group is looked for all around."""
+    sight, count = sight_of(frame, config.shading), len(centers)
+    seen = (config, first_watch(count), jnp.ones(count, bool), jnp.int32(count))
+    return search(start[None], points, centers, sight, *seen)[0].twists
+
+
+def direct(update: Update, counts: list[int], find: Callable = aligned) -> Trace:
+    """Direct alignment of pixels, half of the iterations wide and half narrow; 0 is standing still."""
+    start, ms = standing(update), [0.0]
+    given = (start.twists, update.points, update.batch.centers, update.batch.frame)
+    motions = [start]
+    for count in counts[1:]:
+        config = replace(ALIGN, iterations=count // 2)
+        ms.append(median_ms(find, *given, config=config))
+        motions.append(Motion(find(*given, config=config), start.delta))
+    return Trace(counts, motions, ms)
