@@ -5,6 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from rich.console import Console
 
@@ -42,6 +43,7 @@ def started(
     dataset: str, frames: str, cameras: tuple[int, ...], held_out: tuple[int, ...], config: StartConfig
 ) -> Start:
     """A recording and its scene at the first frame, made once for several settings of the tracker."""
+    jax.clear_caches()  # every scene has shapes of its own, and programs fill the process's memory map
     recording = open_recording(dataset, cameras, held_out, frames)
     draw_ahead(recording, QUIET)
     mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)

@@ -1,25 +1,27 @@
 """The tracker where it may lose an object: does it, does it say so, and does it find it again?"""
 
-import os
+import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
+
+import jax
 import numpy as np
 from faults import noisy_depth, without_cameras, without_frames
-from rich.console import Console
-from stages import STAGES, gripper, stage
+from recordings import MASK_CAMERA, Start, recorded, tracked
+from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
-from gsjax.cli.loop import Tracking, begin, follow
+from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Recording, first_mask, remembered
 from gsjax.cli.scoring import lost_over_frames, score_motion
 from gsjax.data import Sequence, open_sequence
 from gsjax.data.simulated import tabletop
-from gsjax.methods.object_tracker import PRESETS, TrackedScene, start_scene
-from gsjax.scene.frame import Frame
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene
 
-DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
-MASK_CAMERA = 1
+START = TrackerConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
 FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
 MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
@@ -27,15 +29,12 @@ MOST_SILENT = 3  # frames in a row in which an object may be astray before that 
 
 def table(**how: bool) -> Sequence:
     """The scene that comes with the package."""
-    return tabletop(frames=48, **how)
+    return tabletop(frames=48, width=WIDTH, height=HEIGHT, **how)
 
 
-def recorded(step: int) -> Sequence:
+def knocked(step: int) -> Sequence:
     """Every so-manieth frame of a MuJoCo recording in which boxes are knocked over."""
-    path = DATA / "tabletop_1"
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: not there; set GSJAX_DATA to the folder that holds it")
-    return open_sequence(str(path)).select(slice(None, None, step))
+    return open_sequence(str(recorded("tabletop_1"))).select(slice(None, None, step))
 
 
 CASES = {
@@ -50,40 +49,29 @@ CASES = {
     "five frames lost at once": lambda: without_frames(table(), {*range(10, 15), *range(28, 33)}),
     "a camera drops out": lambda: without_cameras(table(), (1,), range(10, 25)),
     "two cameras drop out": lambda: without_cameras(table(), (1, 2), range(10, 25)),
-    "tabletop_1": lambda: recorded(1),
-    "tabletop_1, every other frame": lambda: recorded(2),
-    "tabletop_1, every third frame": lambda: recorded(3),
+    "tabletop_1": lambda: knocked(1),
+    "tabletop_1, every other frame": lambda: knocked(2),
+    "tabletop_1, every third frame": lambda: knocked(3),
 }
-
-
-class Start(NamedTuple):
-    """What all presets begin with."""
-
-    recording: Recording
-    frame: Frame
-    scene: TrackedScene
 
 
 @cache
 def started(case: str) -> Start:
     """The recording and its scene at the first frame."""
+    jax.clear_caches()  # every case has shapes of its own, and programs fill the process's memory map
     sequence = remembered(CASES[case]())
     recording = Recording(sequence, sequence, sequence.num_frames)
     mask, frame = first_mask(sequence, MASK_CAMERA, "files"), sequence.frame(0)
     assert mask.labels is not None
     for t in range(sequence.num_frames):
         sequence.frame(t)  # drawn ahead, which the tracker need not wait for
-    config = PRESETS["fast"]  # as every preset but `accurate` starts
-    return Start(recording, frame, start_scene(frame, mask.labels, MASK_CAMERA, config))
+    return Start(recording, mask, frame, start_scene(frame, mask.labels, MASK_CAMERA, START))
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Follow the objects of one case, and say of each what became of it."""
-    recording, frame, scene = started(options["case"])
-    quiet = Console(stderr=True, quiet=True)
-    tracking = follow(begin(scene), frame, recording.tracked, PRESETS[options["preset"]], quiet)
-    if tracking.stopped is not None:
-        raise tracking.stopped
+    start = started(options["case"])
+    recording, tracking = start.recording, tracked(start, PRESETS[options["preset"]])
     truth = recording.tracked.truth
     assert truth is not None
     names = dict(zip(truth.label_ids.tolist(), truth.names, strict=True))

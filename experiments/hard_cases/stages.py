@@ -15,7 +15,7 @@ from gsjax.data.simulated.simulation import simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 
-FRAMES, WIDTH, HEIGHT, HZ = 40, 320, 240, 30.0
+FRAMES, WIDTH, HEIGHT, HZ = 40, 240, 180, 30.0
 _UP = (0.0, 0.0, 1.0)
 _TARGET = np.array([0.0, 0.0, 0.04])
 _FIRST_LABEL = 2  # 0 is the background, 1 the robot

@@ -3,7 +3,6 @@
 The update begins with a scene fitted to frame t, and ends at frame t + gap, whose true motion is known.
 """
 
-import os
 import sys
 from functools import cache, partial
 from pathlib import Path
@@ -14,14 +13,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import methods
 import numpy as np
 from one_update import Update, scene_at, update_of
+from recordings import MASK_CAMERA, recorded
 
 from gsjax.cli.recording import open_recording
 
-DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
-MASK_CAMERA = 1
 RECORDINGS = {  # with the frames that updates begin at
     "built-in": ("simulated:tabletop", (12,)),
-    "tabletop_1": (str(DATA / "tabletop_1"), (18, 34)),
+    "tabletop_1": ("tabletop_1", (18, 34)),
 }
 COUNTS = [0, 1, 2, 4, 8, 16, 32]
 METHODS = {
@@ -45,9 +43,8 @@ def updates(recording: str, gap: int) -> list[Update]:
 
 @cache
 def opened(dataset: str):
-    if not dataset.startswith("simulated:") and not Path(dataset).exists():
-        raise FileNotFoundError(f"{dataset}: not there; set GSJAX_DATA to the folder that holds it")
-    return open_recording(dataset, (), (), ":").tracked
+    path = dataset if dataset.startswith("simulated:") else str(recorded(dataset))
+    return open_recording(path, (), (), ":").tracked
 
 
 @cache

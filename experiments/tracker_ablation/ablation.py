@@ -14,14 +14,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from recordings import recorded, scored, started, tracked
 
-from gsjax.methods.object_tracker import TrackerConfig
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig
 
 RECORDINGS = {  # with the frames that are taken
     "tabletop": (lambda: "simulated:tabletop?width=240&height=180", "0:24"),
     "tabletop_0": (lambda: str(recorded("tabletop_0")), "0:60:3"),
 }
 CAMERAS, HELD_OUT = (0, 1), (2,)
-FULL = TrackerConfig()
+FULL = PRESETS["paper"]
 
 
 def without_alignment(config: TrackerConfig) -> TrackerConfig:

@@ -67,7 +67,7 @@ class Options:
     """Replace a finished run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
-    preset: Literal["accurate", "balanced", "fast"] = "accurate"
+    preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
     """What the tracker's settings are unless given: for small errors, or for 30 Hz."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """The tracker's own settings."""

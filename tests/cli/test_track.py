@@ -17,7 +17,7 @@ from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
-QUICK = ("--tracker.start.iterations", "2", "--tracker.refine.iterations", "1")
+QUICK = ("--tracker.start.iterations", "2")
 CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 
 

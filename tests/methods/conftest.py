@@ -1,15 +1,26 @@
 """Simulated tables, small enough for two busy cores, and a quick tracker."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from gsjax.data.simulated import tabletop
-from gsjax.methods.object_tracker import MatchConfig, RefineConfig, StartConfig, TrackerConfig, start_scene
+from gsjax.methods.object_tracker import (
+    PRESETS,
+    MatchConfig,
+    RefineConfig,
+    StartConfig,
+    TrackerConfig,
+    start_scene,
+)
 
-QUICK = TrackerConfig(
-    start=StartConfig(iterations=5), match=MatchConfig(patch=32, radius=12), refine=RefineConfig(iterations=3)
+QUICK = replace(
+    PRESETS["paper"],
+    start=StartConfig(iterations=5),
+    match=MatchConfig(patch=32, radius=12),
+    refine=RefineConfig(iterations=3),
 )
 
 

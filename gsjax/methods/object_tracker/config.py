@@ -182,9 +182,9 @@ class TrackerConfig:
     start: StartConfig = field(default_factory=StartConfig)
     match: MatchConfig = field(default_factory=MatchConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
-    refine: RefineConfig = field(default_factory=RefineConfig)
+    refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=0))
     grow: GrowConfig = field(default_factory=GrowConfig)
-    matching: bool = True
+    matching: bool = False
     """Look for each object by template matching first. Without, it is found from where it was."""
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
@@ -192,7 +192,7 @@ class TrackerConfig:
     """The frame's cameras that are followed with, counted from 0; all unless given."""
     shrink: int = 1
     """Pictures are averaged over so many pixels each way before anything else."""
-    redraw: Literal["all", "moving"] = "all"
+    redraw: Literal["all", "moving"] = "moving"
     """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
     coarseness: int = 1
     """With "moving": pictures shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
@@ -215,18 +215,19 @@ class TrackerConfig:
             )
 
 
-FAST = TrackerConfig(
+PAPER = TrackerConfig(refine=RefineConfig(), matching=True, redraw="all")
+BALANCED = TrackerConfig(
     start=StartConfig(object_pixels=2.5, background_pixels=6.0),
+    align=AlignConfig(pixels=128, centers=128),
+    grow=GrowConfig(candidates=64),
+)
+FAST = replace(
+    BALANCED,
     align=AlignConfig(iterations=4, pixels=96, centers=64, everywhere=2),
-    refine=RefineConfig(iterations=0),
     grow=GrowConfig(candidates=16),
-    matching=False,
-    redraw="moving",
     coarseness=2,
 )
-BALANCED = replace(
-    FAST, align=AlignConfig(pixels=128, centers=128), grow=GrowConfig(candidates=64), coarseness=1
-)
-PRESETS = {"accurate": TrackerConfig(), "balanced": BALANCED, "fast": FAST}
-"""`accurate` looks for objects everywhere and refines them photometrically. `fast`, for 30 Hz on two cores,
-goes on from where they were: it loses what jumps. docs/results-tracking.md has what each costs."""
+PRESETS = {"accurate": TrackerConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
+"""`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on two cores,
+and looks for two objects everywhere in an update. `paper` has all of the paper's stages, template matching
+and photometric refinement too, which cost much and gain little: see docs/results-tracking.md."""
