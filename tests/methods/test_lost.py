@@ -55,6 +55,9 @@ def test_what_hides_a_group_says_nothing_of_it(carton):
     assert one.tells[0]
     share = points.seen[0, 1].sum() / points.seen.sum()
     assert one.shows[0] == pytest.approx(float(share * one.agrees[0]), rel=1e-3)
+    away = confidence(moved(points, 3.0, 0, 0, 0, 0, 0), sight, GAP)
+    assert not away.tells[0]
+    assert away.shows[0] == 0
     both = confidence(points, sight._replace(pixels=sight.pixels.at[..., 3].set(0.2)), GAP)
     assert not both.tells[0]
     assert both.shows[0] == 0

@@ -30,7 +30,7 @@ class Confidence(NamedTuple):
     """What the cameras say of where each group is believed to be."""
 
     agrees: Float[Array, "k"]  # share of what can be seen of it that looks as at first, 0 to 1
-    shows: Float[Array, "k"]  # the same, where what something nearer hides counts as missing
+    shows: Float[Array, "k"]  # the same of all of it: what is hidden or out of the picture is missing
     tells: Bool[Array, "k"]  # whether there was enough to see
 
 
@@ -57,12 +57,12 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
             alike = jnp.where(off > gap, 0.0, alike)
-        return (known & ~hidden) * alike, known & ~hidden, known
+        return (known & ~hidden) * alike, known & ~hidden, seen > 0
 
     over_groups = jax.vmap(jax.vmap(one), in_axes=(0, 0, 0, None, None, None))
     views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels)
-    alike, clear, known = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
-    return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(known, 1), clear >= _FEWEST)
+    alike, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
+    return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)
 
 
 class Missing(NamedTuple):
