@@ -1,5 +1,6 @@
 """One update of the tracker as a problem with a known answer: a scene, the next images, the true motion."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,9 +9,9 @@ from jaxtyping import Float, Int
 
 from gsjax.data import Sequence
 from gsjax.methods.object_tracker import (
+    PRESETS,
     StartConfig,
     TrackedScene,
-    TrackerConfig,
     first_pose,
     first_state,
     plan_tracker,
@@ -27,8 +28,9 @@ from gsjax.scene.render import plan_render
 
 # Lighter than the tracker's own, for what is compared is one update. A robot is one group here: each group
 # is six columns of a Jacobian.
-CONFIG = TrackerConfig(
-    start=StartConfig(object_pixels=2.0, background_pixels=6.0, max_extent=1.0, iterations=30)
+CONFIG = replace(
+    PRESETS["paper"],
+    start=StartConfig(object_pixels=2.0, background_pixels=6.0, max_extent=1.0, iterations=30),
 )
 
 

@@ -43,7 +43,11 @@ def without_cameras(sequence: Sequence, lost: tuple[int, ...], frames: range) ->
         measured = sequence.load_depth(t, c)
         return np.zeros_like(measured) if c in lost and t in frames else measured
 
-    return replace(sequence, load_image=image, load_depth=depth)
+    def mask(t: int, c: int) -> np.ndarray:  # what only a dead camera would show, nobody sees
+        labels = sequence.load_mask(t, c)
+        return np.zeros_like(labels) if c in lost and t in frames else labels
+
+    return replace(sequence, load_image=image, load_depth=depth, load_mask=mask)
 
 
 def without_frames(sequence: Sequence, lost: set[int]) -> Sequence:

@@ -85,7 +85,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     total = sum(o["sound_frames"] for o in objects.values())
     alarms = sum(o["false_alarms"] for o in objects.values())
     return {
-        **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "astray", "silent")},
+        **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "astray", "unsaid")},
         "worst": worst,
         "false_alarms": 100 * alarms / max(total, 1),
         "objects": {name: {k: v for k, v in o.items() if k != "order"} for name, o in objects.items()},
@@ -104,7 +104,7 @@ def seen_pixels(sequence: Sequence) -> dict[int, np.ndarray]:
 def said(tracking: Tracking, label: int) -> np.ndarray:
     """In which frames the tracker says that the object is lost, or that it sees none of it."""
     mine = np.asarray(tracking.scene.label_ids)[1:] == label
-    unseen = ~np.asarray(tracking.visible)[:, mine].all(axis=1)
+    unseen = ~np.asarray(tracking.visible)[:, mine].any(axis=1)
     return np.concatenate([[False], lost_over_frames(tracking, None, label) | unseen])
 
 
@@ -119,10 +119,10 @@ def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str,
     there = pixels >= FEWEST_PIXELS
     astray = (errors > ASTRAY_MM) & there
     silent = longest(astray & ~said)
-    ends = bool(astray[-1] or (astray.any() and not there[-1]))
+    ends = bool(astray[there][-1])
     if not astray.any():
         verdict = "sound"
-    elif silent > MOST_SILENT:
+    elif silent > MOST_SILENT or not (astray & said).any():
         verdict = "astray, unsaid"
     else:
         verdict = "lost, said so" if ends else "lost, found again"
@@ -134,6 +134,7 @@ def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str,
         "end_mm": float(errors[there][-1]),
         "astray": int(astray.sum()),
         "silent": silent,
+        "unsaid": int((astray & ~said).sum()),
         "sound_frames": int(sound.sum()),
         "false_alarms": int((sound & said).sum()),
         "errors_mm": errors.round(2).tolist(),

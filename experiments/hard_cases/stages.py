@@ -141,9 +141,9 @@ def returns() -> list[Thing]:
 
 
 def twins() -> list[Thing]:
-    """Two boxes that look the same go round each other, their corners a centimetre apart."""
+    """Two boxes that look the same go round each other, their faces a centimetre apart."""
     angle = np.deg2rad(9.0) * np.arange(FRAMES)
-    around = 0.062 * np.cos(angle), 0.062 * np.sin(angle)
+    around = 0.035 * np.cos(angle), 0.035 * np.sin(angle)
     small = (0.03, 0.03, 0.05)
     return [
         Thing("one twin", _box(small), _path(around[0], around[1], 0.05, angle)),

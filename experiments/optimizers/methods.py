@@ -21,6 +21,7 @@ from trimesh.registration import procrustes
 from gsjax.geometry.cameras import pixel_grid, unproject
 from gsjax.methods.object_tracker.align import align
 from gsjax.methods.object_tracker.config import AlignConfig, RefineConfig
+from gsjax.methods.object_tracker.lost import Missing
 from gsjax.methods.object_tracker.motion import Motion, place
 from gsjax.methods.object_tracker.points import sight_of
 from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
@@ -198,7 +199,8 @@ def aligned(start, points, centers, frame, config=ALIGN):
 def searched(start, points, centers, frame, config=ALIGN):
     """The same, and then every group is looked for all around."""
     sight, count = sight_of(frame, config.shading), len(centers)
-    seen = (config, first_watch(count), jnp.ones(count, bool), jnp.int32(count))
+    nobody = Missing(points, jax.tree.map(lambda a: a[0], points), jnp.int32(0))  # nothing is lost
+    seen = (config, first_watch(count), jnp.ones(count, bool), jnp.int32(count), nobody)
     return search(start[None], points, centers, sight, *seen)[0].twists
 
 

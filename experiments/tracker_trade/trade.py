@@ -10,11 +10,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from recordings import recorded, scored, started, tracked
 
-from gsjax.methods.object_tracker import PRESETS, TrackerConfig, track
+from gsjax.methods.object_tracker import PRESETS, TrackerConfig
 
 FAST = PRESETS["fast"]
 CAMERAS = (0, 1, 2)
-REFERENCE = 20  # updates of `fast` that are timed beside each cell
 WARM = 3  # updates at the start that are left out: they fault their memory in
 
 
@@ -51,14 +50,13 @@ def setting(knob: str, value: Any) -> TrackerConfig:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """Follow a recording with one setting, and a part of it with `fast` in the same minute."""
+    """Follow a recording with one setting, and with `fast` in the same minute."""
     config, dataset = setting(options["knob"], options["value"]), str(recorded(options["recording"]))
     start = started(dataset, ":", CAMERAS, (), config.start)
-    tracking = tracked(start, config)
-    milliseconds = 1e3 * np.asarray(tracking.update_s[1 + WARM :])
     usual = started(dataset, ":", CAMERAS, (), FAST.start)
-    frames = [usual.recording.tracked.frame(t) for t in range(1, REFERENCE + WARM)]
-    reference = [1e3 * update.seconds for update in track(usual.scene, usual.frame, frames, FAST)][WARM:]
+    tracking, beside = tracked(start, config), tracked(usual, FAST)
+    milliseconds = 1e3 * np.asarray(tracking.update_s[1 + WARM :])
+    reference = 1e3 * np.asarray(beside.update_s[1 + WARM :])
     return scored(start, tracking, every=6) | {
         "update_ms": float(np.median(milliseconds)),
         "update_p95_ms": float(np.percentile(milliseconds, 95)),

@@ -161,7 +161,7 @@ class Log:
         self._turned = Rotation.identity(groups)
         self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
         self._memory_at = 0.0
-        self._lost = np.zeros(groups, int)
+        self._lost = dict.fromkeys(sorted({*self._ids} - {0}), 0)
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
         """One update."""
@@ -174,7 +174,9 @@ class Log:
         self.everywhere.append(update.everywhere)
         self.chosen = update.chosen
         self.plans.add(update.plan)
-        self._lost += np.asarray(update.info["lost"])
+        lost = np.asarray(update.info["lost"])
+        for value in self._lost:
+            self._lost[value] += int(lost[np.asarray(self._ids[1:]) == value].any())
         twists, centers = jax.device_get((update.info["motion"].twists, update.info["centers"]))
         self._turned = Rotation.from_rotvec(twists[:, 3:]) * self._turned
         quats = self._turned.as_quat(scalar_first=True)
@@ -211,10 +213,7 @@ class Log:
             if self.memory_mb
             else None,
             "objects": {str(v): self._name(v) for v in sorted({*self._ids} - {0})},
-            "frames_lost": {
-                self._name(v): int(self._lost[np.asarray(self._ids[1:]) == v].max())
-                for v in sorted({*self._ids} - {0})
-            },
+            "frames_lost": {self._name(value): count for value, count in self._lost.items()},
         }
 
     def _name(self, value: int) -> str:

@@ -137,7 +137,7 @@ def metrics(
             "gaussians": _count_gaussians(tracking, values, label),
             "mask_pixels": _pixels(mask, tracking, values, label),
             "travelled_mm": _travelled_mm(tracking, values, label),
-            "frames_lost": int(lost_over_frames(tracking, values, label).sum()),
+            "frames_lost": _frames_lost(tracking, values, label),
             **_motion_metrics(motion.get(label)),
         }
         for label, name in names.items()
@@ -222,6 +222,11 @@ def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> 
         return None
     centroids = tracking.means()[:, members].mean(axis=1)
     return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
+
+
+def _frames_lost(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    lost = lost_over_frames(tracking, values, label)
+    return int(lost.sum()) if _members(tracking, values, label).any() else None
 
 
 def lost_over_frames(

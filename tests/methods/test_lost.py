@@ -74,13 +74,15 @@ def test_strangers_are_nearer_than_what_is_modelled(carton):
     sight, _ = carton
     model = jnp.full(sight.depths.shape, 0.9)
     shown = Shown(jnp.ones(model.shape, jnp.int32), model, model > 0)
-    found = with_strangers(shown, sight, 1, GAP, 1)
+    found = with_strangers(shown, sight, 1, GAP, GAP, 1)
     strange = np.asarray((sight.depths > 0) & (sight.depths < 0.9 - GAP))
     assert 0 < strange.mean() < 1
     np.testing.assert_array_equal(found.labels, np.where(strange, 2, 1))
     np.testing.assert_array_equal(found.depths, np.where(strange, sight.depths, 0.9))
+    thick = with_strangers(shown, sight, 1, GAP, 0.1, 1)  # a group explains what is a little nearer
+    np.testing.assert_array_equal(thick.labels == 2, np.asarray((sight.depths > 0) & (sight.depths < 0.8)))
     blind = sight._replace(pixels=sight.tones)
-    assert with_strangers(shown, blind, 1, GAP, 1) is shown
+    assert with_strangers(shown, blind, 1, GAP, GAP, 1) is shown
 
 
 def test_guesses_bring_points_to_strangers_or_stay_near(carton):

@@ -52,12 +52,14 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
         found = image[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
         squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / _COLOR_SCALE**2
-        alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & (seen > 0)
+        asked = seen > 0
+        alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
         if sight.depths is not None:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
+            asked &= (image[..., 3] > 0).any()  # a camera that failed is not asked
             alike = jnp.where(off > gap, 0.0, alike)
-        return (known & ~hidden) * alike, known & ~hidden, seen > 0
+        return (known & ~hidden) * alike, known & ~hidden, asked
 
     over_groups = jax.vmap(jax.vmap(one), in_axes=(0, 0, 0, None, None, None))
     views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels)
@@ -68,33 +70,38 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
 class Missing(NamedTuple):
     """What a lost group is looked for with."""
 
-    points: Points  # of each group, see `alone`
+    centers: Points  # of each group: its Gaussians of the first frame
     strangers: Points  # pixels of the last frame that no group explains
     count: Int[Array, ""]  # frames so far, from which chance is drawn: a recording gives the same run again
 
 
-def alone(centers: Points, others: Points) -> Points:
-    """Both joined, where only the centres count: the others show what a lost group was taken for.
+def alone(centers: Points, points: Points) -> Points:
+    """As many as `points`, of which only the centres count: pixels show what a lost group was taken for.
 
     The centres stand where every fourth or every other point is chosen first.
     """
+    others = jax.tree.map(lambda a: a[..., centers.seen.shape[-1] :], points)
     both = join(centers, others._replace(seen=jnp.zeros_like(others.seen)))
     count = both.seen.shape[-1]
     places = np.concatenate([np.arange(0, count, 4), np.arange(2, count, 4), np.arange(1, count, 2)])
     return jax.tree.map(lambda a: a[..., np.argsort(places)], both)
 
 
-def with_strangers(shown: Shown, sight: Sight, num_groups: int, gap: float, coarseness: int) -> Shown:
+def with_strangers(
+    shown: Shown, sight: Sight, num_groups: int, gap: float, thickness: float, coarseness: int
+) -> Shown:
     """`shown`, where pixels that no group explains have the label num_groups + 1 and their measured depth.
 
     Args:
-        gap: what is measured this much nearer than the model is not explained by it, metres.
+        gap: what is measured this much nearer than the background is not explained by it, metres ...
+        thickness: ... and this much nearer than a group, metres.
         coarseness: `shown` has every so-manieth pixel.
     """
     if sight.depths is None:
         return shown
     measured = sight.depths[:, ::coarseness, ::coarseness]
-    strange = (measured > 0) & shown.covered & (measured < shown.depths - gap)
+    nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
+    strange = (measured > 0) & shown.covered & (measured < nearest)
     labels = jnp.where(strange, num_groups + 1, shown.labels)
     return shown._replace(labels=labels, depths=jnp.where(strange, measured, shown.depths))
 
@@ -105,6 +112,7 @@ def guesses(
     points: Points,
     center: Float[Array, "3"],
     strangers: Points,
+    max_turn: float = _LARGEST_TURN,
 ) -> Float[Array, "h 6"]:
     """Where a lost group may be: turned at random, every other time near by, and else at strange pixels.
 
@@ -114,17 +122,18 @@ def guesses(
             brought to it.
         center: what the group turns about.
         strangers: pixels that no group explains, as each camera sees them.
+        max_turn: radians.
     """
     count = len(shifts)
     place, pair, axis, angle = jax.random.split(key, 4)
     to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in strangers)
     own, tones, seen = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in points)
-    chosen = jax.random.categorical(place, jnp.log(there + 1e-9), shape=(count,))
+    chosen = jax.random.categorical(place, jnp.where(there > 0, 0.0, -jnp.inf), shape=(count,))
     apart = jnp.sum((colors[:, chosen, None] - tones[:, None]) ** 2, axis=0) / _COLOR_SCALE**2
-    paired = jax.random.categorical(pair, jnp.log(seen + 1e-9) - apart)
+    paired = jax.random.categorical(pair, jnp.where(seen > 0, -apart, -jnp.inf))
     turns = jax.random.normal(axis, (count, 3))
     turns /= jnp.linalg.norm(turns, axis=1, keepdims=True)
-    turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1))
+    turns *= max_turn * jax.random.uniform(angle, (count, 1))
     offsets = own[:, paired].T - center
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
     strange = (jnp.arange(count) % 2 == 1) & (there.sum() > 0)

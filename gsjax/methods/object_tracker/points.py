@@ -171,9 +171,13 @@ def faded(keyframe: Keyframe, max_turn: float) -> Points:
     return keyframe.points._replace(seen=keyframe.points.seen * share[:, None, None])
 
 
-def renewed(keyframe: Keyframe, pixels: Points, max_turn: float) -> Keyframe:
-    """`pixels` for the groups that have turned by more than `max_turn` radians: they show other sides now."""
+def renewed(
+    keyframe: Keyframe, pixels: Points, max_turn: float, retaken: Bool[Array, "k"] | None = None
+) -> Keyframe:
+    """`pixels` for the groups that have turned by more than `max_turn` radians, which show other sides now,
+    and for those that are `retaken`: what they had while they were lost is something else's."""
     old = turn_since(keyframe) > max_turn
+    old = old if retaken is None else old | retaken
     return jax.tree.map(lambda new, kept: of_groups(old, new, kept), first_keyframe(pixels), keyframe)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.align import align, disagreement
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.lost import FOUND, LOST, Confidence, Missing, guesses
+from gsjax.methods.object_tracker.lost import FOUND, LOST, Confidence, Missing, alone, guesses
 from gsjax.methods.object_tracker.points import Points, Sight
 from gsjax.optim.step import keep_if
 
@@ -215,10 +215,14 @@ def search(
         found, again = carried
         group = order[i]
         lost, center = watch.lost[group], centers[group]
-        known, own, firsts = jax.tree.map(lambda a: a[group], (found, points, missing.points))
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), missing.count), group)
-        guessed = guesses(key, shifts, firsts, center, missing.strangers)
-        own, around = keep_if(lost, (firsts, guessed), (own, shifts))
+        known, own, firsts = jax.tree.map(lambda a: a[group], (found, points, missing.centers))
+
+        def anywhere():
+            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), missing.count), group)
+            turn = {} if config.max_turn else {"max_turn": 0.0}
+            return alone(firsts, own), guesses(key, shifts, firsts, center, missing.strangers, **turn)
+
+        own, around = jax.lax.cond(lost, anywhere, lambda: (own, shifts))
         start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
         better = look_everywhere(start, starts[:, group], own, center, sight, config, around)
         again = again.at[group].set(jnp.where(lost, better.twists, again[group]))

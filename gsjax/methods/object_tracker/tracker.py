@@ -23,7 +23,7 @@ from gsjax.methods.object_tracker.layers import (
     shown_by,
     thinned,
 )
-from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, alone, confidence, with_strangers
+from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, confidence, with_strangers
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
 from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
 from gsjax.methods.object_tracker.points import (
@@ -118,11 +118,14 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
     params: the `Pose` of the moving Gaussians. state: `TrackerState`. batch: `TrackerBatch`.
 
-    A frame goes through: see what the last scene shows of each object; match each object's template in every
-    camera and lift the match to a translation; from standing still, going on as before and the match, align
-    each object with the images and take what agrees best; refine D_k and delta_i photometrically; keep
-    the refinement of an object only where it agrees better still; and draw what the scene shows now. What no
-    camera sees stays where it is. With `config.redraw` "moving", what is drawn are the moving Gaussians.
+    A frame goes through: see what the last scene shows of each object; from standing still and going on as
+    before, align each object with the images and take what agrees best; look everywhere for those that agree
+    worst, and for what is lost; draw what the scene shows now; and tell what is lost. What no camera sees
+    stays where it is.
+
+    With `config.redraw` "moving", what is drawn are the moving Gaussians. With `config.matching`, each
+    object's template is matched first, in every camera, and lifted to one more start. With
+    `config.refine.iterations`, D_k and delta_i are refined photometrically, and kept where that is better.
 
     Args:
         config: see `TrackerConfig`.
@@ -152,7 +155,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
     def look_at(shown: Shown, sight: Sight) -> tuple[Points, Points]:
         """Pixels that show each group, and those that none explains."""
-        labelled = with_strangers(shown, sight, num_objects, config.grow.min_gap, config.coarseness)
+        gaps = (config.grow.min_gap, config.align.max_thickness)
+        labelled = with_strangers(shown, sight, num_objects, *gaps, config.coarseness)
         how = (num_objects + 1, config.align, config.coarseness)
         pixels = pixels_of_groups(sight, labelled.labels, labelled.depths, *how)
         return jax.tree.map(lambda a: a[:-1], pixels), jax.tree.map(lambda a: a[-1], pixels)
@@ -221,7 +225,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             everywhere = jnp.int32(
                 num_objects if config.align.everywhere is None else config.align.everywhere
             )
-        missing = Missing(alone(named, since), state.strangers, state.count)
+        missing = Missing(named, state.strangers, state.count)
         seen = (config.align, state.watch, visible, everywhere, missing)
         aligned, again, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
         residual = aligned.residuals
@@ -240,9 +244,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-        better = state.watch.lost & (sure_of(again).shows > jnp.maximum(FOUND, sure_of(kept.twists).shows))
-        kept = _select(better, Motion(again, jnp.zeros_like(delta)), kept, groups)
-        sure = sure_of(kept.twists)
+        sure, surely = sure_of(kept.twists), sure_of(again)
+        retaken = (
+            state.watch.lost & looked_for & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
+        )
+        kept = _select(retaken, Motion(again, jnp.zeros_like(delta)), kept, groups)
+        sure = jax.tree.map(lambda a, b: jnp.where(retaken, a, b), surely, sure)
 
         pose = move(params, kept, centers, groups)
         backdrop, drawn = state.backdrop, jnp.int32(0)
@@ -259,7 +266,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         sound = all_finite((pose, shifts)) & ~overflow
         pixels, strangers = look_at(shown, sight)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
-        keyframe = renewed(keyframe, pixels, config.align.keyframe_turn)
+        keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
         watch = state.watch.after(residual, looked_for, counts, sure)
         new_state = TrackerState(kept, pixels, keyframe, strangers, watch, state.count + 1, *told)
