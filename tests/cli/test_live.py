@@ -18,6 +18,7 @@ def standing_still(scene, first, frames, config, *, budget_ms):
     """`track` for objects that never move."""
     groups = scene.num_objects
     info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
+    info["lost"] = jnp.arange(groups) == groups - 1
     for _ in frames:
         yield Tracked(scene, first_pose(scene), None, info, 0.001, 0.0, None, 2)
 
@@ -53,6 +54,9 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
     assert "10 offered" in said
+    *followed, last = found["objects"].values()  # the last group is said to be lost in every frame
+    assert found["frames_lost"] == {**dict.fromkeys(followed, 0), last: frames["used"]}
+    assert f"{last} in {frames['used']} updates" in said
     with np.load(folder / "trajectory.npz") as stored:
         assert len(stored["times"]) == len(stored["centers"]) == frames["used"]
         np.testing.assert_allclose(stored["quats"], np.broadcast_to([1, 0, 0, 0], stored["quats"].shape))

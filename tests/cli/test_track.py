@@ -95,7 +95,7 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
 
     config = yaml.safe_load((run / "config.yml").read_text())
     assert config["cameras"] == [0, 1]
-    assert config["tracker"]["refine"]["iterations"] == 1
+    assert config["tracker"]["start"]["iterations"] == 2
     for camera in (0, 1, 2):
         assert len(read_video_frames(run / f"video_{camera}.mp4")) == 4
         assert len(list((run / "renders" / str(camera)).glob("*.png"))) == 4
