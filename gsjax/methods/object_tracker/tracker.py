@@ -244,10 +244,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-        sure, surely = sure_of(kept.twists), sure_of(again)
-        retaken = (
-            state.watch.lost & looked_for & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
-        )
+        sure, sought = sure_of(kept.twists), state.watch.lost & looked_for
+        surely = jax.lax.cond(sought.any(), sure_of, lambda _: sure, again)
+        retaken = sought & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
         kept = _select(retaken, Motion(again, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(lambda a, b: jnp.where(retaken, a, b), surely, sure)
 
