@@ -19,7 +19,7 @@ from gsjax.methods.object_tracker.points import Points, Sight, join, rotated
 
 _COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
 _FEWEST = 6.0  # points that can tell
-_LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
+LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
 
 LOST, FOUND = 0.35, 0.5
 """Below the one a group is lost, and above the other a lost one is found: see `Confidence`.
@@ -112,7 +112,7 @@ def guesses(
     points: Points,
     center: Float[Array, "3"],
     strangers: Points,
-    max_turn: float = _LARGEST_TURN,
+    max_turn: float = LARGEST_TURN,
 ) -> Float[Array, "h 6"]:
     """Where a lost group may be: turned at random, every other time near by, and else at strange pixels.
 
@@ -126,8 +126,8 @@ def guesses(
     """
     count = len(shifts)
     place, pair, axis, angle = jax.random.split(key, 4)
-    to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in strangers)
-    own, tones, seen = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in points)
+    to, colors, there = _of_all_cameras(strangers)
+    own, tones, seen = _of_all_cameras(points)
     chosen = jax.random.categorical(place, jnp.where(there > 0, 0.0, -jnp.inf), shape=(count,))
     apart = jnp.sum((colors[:, chosen, None] - tones[:, None]) ** 2, axis=0) / _COLOR_SCALE**2
     paired = jax.random.categorical(pair, jnp.where(seen > 0, -apart, -jnp.inf))
@@ -138,3 +138,8 @@ def guesses(
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
     strange = (jnp.arange(count) % 2 == 1) & (there.sum() > 0)
     return jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
+
+
+def _of_all_cameras(points: Points) -> Points:
+    """One group's points in one row: [3, c p], and `seen` [c p]."""
+    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1), points)

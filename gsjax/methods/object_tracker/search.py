@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.align import align, disagreement
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.lost import FOUND, LOST, Confidence, Missing, alone, guesses
+from gsjax.methods.object_tracker.lost import FOUND, LARGEST_TURN, LOST, Confidence, Missing, alone, guesses
 from gsjax.methods.object_tracker.points import Points, Sight
 from gsjax.optim.step import keep_if
 
@@ -219,8 +219,8 @@ def search(
 
         def anywhere():
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), missing.count), group)
-            turn = {} if config.max_turn else {"max_turn": 0.0}
-            return alone(firsts, own), guesses(key, shifts, firsts, center, missing.strangers, **turn)
+            turn = LARGEST_TURN if config.max_turn else 0.0
+            return alone(firsts, own), guesses(key, shifts, firsts, center, missing.strangers, turn)
 
         own, around = jax.lax.cond(lost, anywhere, lambda: (own, shifts))
         start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
