@@ -65,8 +65,8 @@ def scored(start: Start, tracking: Tracking, every: int = 1) -> dict[str, Any]:
     recording = start.recording
     values, truth = group_values(tracking, start.mask, recording), recording.tracked.truth
     scores = Scores(values, None if truth is None else truth.robot)
-    for t, views_of_frame in enumerate(views(tracking, recording)):
-        for view in views_of_frame if t % every == 0 else ():
+    for views_of_frame in views(tracking, recording, every):
+        for view in views_of_frame:
             scores.add(view)
     found = metrics(tracking, recording, start.mask, scores, score_motion(tracking, recording), values)
     moved = {name: s for name, s in found["objects"].items() if (s["moved_mm"] or 0) > MOVED_MM}

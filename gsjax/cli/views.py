@@ -46,8 +46,8 @@ class View(NamedTuple):
     covered: np.ndarray
 
 
-def views(tracking: Tracking, recording: Recording) -> Iterator[list[View]]:
-    """The views of all cameras, a list a frame; one frame is in memory at a time.
+def views(tracking: Tracking, recording: Recording, every: int = 1) -> Iterator[list[View]]:
+    """The views of all cameras, a list for every so-manieth frame; one frame is in memory at a time.
 
     Masks of all frames are opened here, for scoring: call it when tracking has ended.
     """
@@ -58,7 +58,8 @@ def views(tracking: Tracking, recording: Recording) -> Iterator[list[View]]:
         return sequence.frame(t), [sequence.mask(t, c) for c in cameras]
 
     plan: Plan | None = None
-    for t, (frame, masks) in enumerate(Prefetched(load, range(tracking.num_frames))):
+    chosen = range(0, tracking.num_frames, every)
+    for t, (frame, masks) in zip(chosen, Prefetched(load, chosen), strict=True):
         scene, pose = tracking.at(t)
         if plan is None:
             plan = plan_render(place(scene, pose), frame.cameras)

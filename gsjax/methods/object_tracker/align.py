@@ -112,13 +112,30 @@ def _normal_equations(
     squared, weights = _squared(residuals), points.seen[:, None]
     # What falls outside the picture, or is truncated, costs as much as a bad fit.
     cost = jnp.sum(weights * jnp.where(residuals.counts, squared / (1 + squared), 0.5))
-    x, y, z = jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0)[:, :, None]
-    by_x, by_y, by_z = jnp.moveaxis(residuals.gradients, 1, 0)
-    turns = (y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x)
-    jacobian = jnp.stack([by_x, by_y, by_z, *turns], axis=1)
-    weighted = jacobian * (weights * residuals.counts / (1 + squared) ** 2)[:, None]
-    hessian = jnp.einsum("cidp,cjdp->ij", weighted, jacobian)
-    return _Fit(twist, cost, hessian, jnp.einsum("cidp,cdp->i", weighted, residuals.values))
+    weights = weights * residuals.counts / (1 + squared) ** 2
+    arms = tuple(jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0))
+    x, y, z = jnp.moveaxis(residuals.gradients, 1, 0)
+
+    def over_channels(a, b) -> Float[Array, "c p"]:
+        return jnp.sum(weights * a * b, axis=1)
+
+    # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
+    # the sum of g g^T over its channels. No row is written down, which XLA:CPU would do for a product.
+    xx, xy, xz = (over_channels(x, other) for other in (x, y, z))
+    yy, yz, zz = over_channels(y, y), over_channels(y, z), over_channels(z, z)
+    forces = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    levers = [_cross(arms, force) for force in forces]  # of A F, a column each
+    torques = [_cross(arms, lever) for lever in zip(*levers, strict=True)]
+    upper = [(*force, *lever) for force, lever in zip(forces, levers, strict=True)]
+    lower = [(*lever, *torque) for lever, torque in zip(zip(*levers, strict=True), torques, strict=True)]
+    pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
+    hessian = jnp.stack([jnp.stack(row).sum((1, 2)) for row in upper + lower])
+    return _Fit(twist, cost, hessian, jnp.stack([*pulls, *_cross(arms, pulls)]).sum((1, 2)))
+
+
+def _cross(a, b):
+    """a x b, of three arrays each."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def align(
