@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.object_tracker import GrowConfig, RefineConfig, track
+from gsjax.geometry.cameras import camera_centers
+from gsjax.methods.object_tracker import GrowConfig, RefineConfig, first_pose, track
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.layers import Shown
 from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, guesses, with_strangers
+from gsjax.methods.object_tracker.motion import facing
 from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, sight_of
 from gsjax.methods.object_tracker.search import coarse_shifts
+from gsjax.methods.object_tracker.tracker import _Last, _named
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -61,6 +64,35 @@ def test_what_hides_a_group_says_nothing_of_it(carton):
     both = confidence(points, sight._replace(pixels=sight.pixels.at[..., 3].set(0.2)), GAP)
     assert not both.tells[0]
     assert both.shows[0] == 0
+
+
+def test_what_shows_the_background_does_not_show_the_group(carton):
+    """A can that slips into a garage's front agrees with it in depth and nearly in colour."""
+    sight, points = carton
+    usual = confidence(points, sight, GAP)
+    behind, unknown = jnp.where(sight.depths > 0, sight.depths + 0.05, 0.0), jnp.zeros_like(sight.depths)
+    for background in (behind, unknown, behind[:, ::2, ::2]):
+        assert confidence(points, sight, GAP, background).agrees[0] > 0.99 * usual.agrees[0]
+    assert confidence(points, sight, GAP, sight.depths).agrees[0] == 0
+    coarse = confidence(points, sight, GAP, sight.depths[:, ::2, ::2])
+    assert coarse.agrees[0] < FOUND  # on a slope the pixel beside is at another depth
+    assert coarse.tells[0]
+
+
+def test_a_lost_group_is_looked_for_with_all_that_faces_a_camera(table, started, quick):
+    """Where it is believed to be it may be hidden; only what cameras saw of it counts for the others."""
+    _, frames, _ = table()
+    pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
+    nothing = jnp.zeros((2, cameras.height, cameras.width))
+    last = _Last(Shown(nothing.astype(int), nothing, nothing > 0), cameras, None, None)
+    lost = jnp.zeros(count, bool).at[0].set(True)
+    mine = np.asarray(started.labels[: started.num_moving]) == 1
+    config = replace(quick, align=replace(quick.align, centers=int(mine.sum())))
+    points = _named(started, pose, last, lost, config)
+    assert not points.seen[1:].any()
+    faces = facing(started, pose, camera_centers(cameras.viewmat))[:, : started.num_moving] > 0.5
+    assert points.seen[0].sum() == faces[:, mine].sum() > 10
+    assert not _named(started, pose, last, ~lost & lost, config).seen.any()
 
 
 def test_without_depth_colour_alone_decides(carton):

@@ -34,7 +34,9 @@ class Confidence(NamedTuple):
     tells: Bool[Array, "k"]  # whether there was enough to see
 
 
-def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
+def confidence(
+    centers: Points, sight: Sight, gap: float, background: Float[Array, "c h w"] | None = None
+) -> Confidence:
     """Compare each group's Gaussians of the first frame, where they should be now, with what is seen there.
 
     Args:
@@ -42,15 +44,19 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
         sight: what the cameras see now.
         gap: measured depth may differ by so much, metres. What is further is seen past the group, which
             disagrees; what is nearer hides it, and says nothing.
+        background: its depth where it is known, metres, else 0; of every so-manieth pixel. Where a camera
+            measures just that, it does not see the group, however near: what slips into a wall would agree
+            with the wall.
     """
     height, width = sight.pixels.shape[1:3]
 
-    def one(means, tones, seen, viewmat, K, image):
+    def one(means, tones, seen, viewmat, K, image, background):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = local[2]
         column, row, _ = jnp.floor(rotated(K, local) / jnp.maximum(z, 1e-6)).astype(jnp.int32)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
-        found = image[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+        row, column = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
+        found = image[row, column]
         squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / _COLOR_SCALE**2
         asked = seen > 0
         alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
@@ -58,11 +64,17 @@ def confidence(centers: Points, sight: Sight, gap: float) -> Confidence:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
             asked &= (image[..., 3] > 0).any()  # a camera that failed is not asked
-            alike = jnp.where(off > gap, 0.0, alike)
+            other = off > gap
+            if background is not None:
+                stride = -(-width // background.shape[1])
+                known_depth = background[row // stride, column // stride]
+                other |= (known_depth > 0) & (jnp.abs(found[:, 3] - known_depth) < gap / 3)
+            alike = jnp.where(other, 0.0, alike)
         return (known & ~hidden) * alike, known & ~hidden, asked
 
-    over_groups = jax.vmap(jax.vmap(one), in_axes=(0, 0, 0, None, None, None))
-    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels)
+    over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, 0, None if background is None else 0))
+    over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None))
+    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, background)
     alike, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.layers import (
@@ -25,7 +25,7 @@ from gsjax.methods.object_tracker.layers import (
 )
 from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, confidence, with_strangers
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
-from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
+from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
 from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
@@ -88,8 +88,14 @@ class TrackerBatch(NamedTuple):
     everywhere: Int[Array, ""] | None = None  # groups to look for everywhere; None: as the config says
 
 
-def _named(scene: TrackedScene, pose: Pose, last: "_Last", config: TrackerConfig) -> Points:
-    """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's."""
+def _named(
+    scene: TrackedScene, pose: Pose, last: "_Last", lost: Bool[Array, "k"], config: TrackerConfig
+) -> Points:
+    """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's.
+
+    Cameras look for those that they saw, and of a lost group for all that face them: what hides it where it
+    is believed to be need not hide it where it is.
+    """
     groups = scene.labels[: scene.num_moving]
     rows, real = first_members(groups, scene.num_objects, min(config.align.centers, scene.num_moving))
     # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
@@ -97,6 +103,13 @@ def _named(scene: TrackedScene, pose: Pose, last: "_Last", config: TrackerConfig
     named = (with_normal | ~with_normal.any())[rows] & real
     own = (pose.means[rows.ravel()], groups[rows.ravel()])
     seen = seen_from(*own, last.shown, last.cameras, config.start.depth_gap)
+    astray = (lost & with_normal.any())[own[1] - 1]
+
+    def with_facing():
+        faces = facing(scene, pose, camera_centers(last.cameras.viewmat))[:, rows.ravel()] > 0.5
+        return jnp.where(astray, faces.astype(seen.dtype), seen)
+
+    seen = jax.lax.cond(astray.any(), with_facing, lambda: seen)
     seen = jnp.moveaxis(seen.reshape(-1, *rows.shape), 0, 1) * named[:, None]
     colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.align.shading)
     in_all = (*seen.shape[:2], 3, seen.shape[2])
@@ -195,6 +208,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         centers = group_means(params.means, groups, num_objects)
         sight = sight_of(frame, config.align.shading)
 
+        backdrop, drawn = state.backdrop, jnp.int32(0)
+        if backdrop is not None:
+            views = reduced(frame.cameras, config.coarseness)
+            backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
         last = look_back(params, state, batch)
         enough = _ENOUGH_PIXELS / config.coarseness**2
         counts = pixel_counts(last.shown.labels, num_objects)
@@ -202,13 +219,14 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
-        named, since = _named(scene, params, last, config), join(state.pixels, remembered)
+        named, since = _named(scene, params, last, state.watch.lost, config), join(state.pixels, remembered)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, since)
 
         def sure_of(twists) -> Confidence:
             moved = jax.vmap(carry)(named, twists, centers)
-            return confidence(moved, sight, config.start.depth_gap)
+            background = None if backdrop is None else jnp.where(backdrop.alphas > 0.5, backdrop.depths, 0.0)
+            return confidence(moved, sight, config.start.depth_gap, background)
 
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
@@ -251,10 +269,6 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         sure = jax.tree.map(lambda a, b: jnp.where(retaken, a, b), surely, sure)
 
         pose = move(params, kept, centers, groups)
-        backdrop, drawn = state.backdrop, jnp.int32(0)
-        if backdrop is not None:
-            views = reduced(frame.cameras, config.coarseness)
-            backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
         shown, shown_needed = show(scene, pose, frame, backdrop, plan)
         if last.rendered is not None:
             drawn = jnp.maximum(last.rendered.meta.needed.max(), shown_needed)
