@@ -208,10 +208,11 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         centers = group_means(params.means, groups, num_objects)
         sight = sight_of(frame, config.align.shading)
 
-        backdrop, drawn = state.backdrop, jnp.int32(0)
+        backdrop, background, drawn = state.backdrop, None, jnp.int32(0)
         if backdrop is not None:
             views = reduced(frame.cameras, config.coarseness)
             backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
+            background = jnp.where(backdrop.alphas > 0.5, backdrop.depths, 0.0)
         last = look_back(params, state, batch)
         enough = _ENOUGH_PIXELS / config.coarseness**2
         counts = pixel_counts(last.shown.labels, num_objects)
@@ -225,7 +226,6 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
 
         def sure_of(twists) -> Confidence:
             moved = jax.vmap(carry)(named, twists, centers)
-            background = None if backdrop is None else jnp.where(backdrop.alphas > 0.5, backdrop.depths, 0.0)
             return confidence(moved, sight, config.start.depth_gap, background)
 
         still = jnp.zeros_like(state.motion.twists)
