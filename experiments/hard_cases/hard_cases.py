@@ -16,13 +16,14 @@ from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Recording, first_mask, remembered
-from gsjax.cli.scoring import lost_over_frames, score_motion
+from gsjax.cli.scoring import lost_over_frames, score_motion, turn_unknown
 from gsjax.data import Sequence, open_sequence
 from gsjax.data.simulated import tabletop
 from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene
 
 START = TrackerConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
+TURN_MM = 40.0  # no wrong turn alone puts the centroid of a surface of these objects further off
 FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
 MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
 
@@ -77,7 +78,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     names = dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
     motion, pixels = score_motion(tracking, recording), seen_pixels(recording.tracked)
     objects = {
-        names[label]: judge(score.centroid_errors_mm, pixels[label], said(tracking, label))
+        names[label]: judge(score.centroid_errors_mm, pixels[label], *said(tracking, label))
         for label, score in motion.items()
         if score.num_scored
     }
@@ -101,29 +102,35 @@ def seen_pixels(sequence: Sequence) -> dict[int, np.ndarray]:
     return {int(label): (masks == label).sum(axis=1) for label in sequence.truth.label_ids}
 
 
-def said(tracking: Tracking, label: int) -> np.ndarray:
-    """In which frames the tracker says that the object is lost, or that it sees none of it."""
+def said(tracking: Tracking, label: int) -> tuple[np.ndarray, np.ndarray]:
+    """In which frames the tracker says that the object is lost, or that it sees none of it; and in which that
+    it does not know how the object is turned."""
     mine = np.asarray(tracking.scene.label_ids)[1:] == label
     unseen = ~np.asarray(tracking.visible)[:, mine].any(axis=1)
-    return np.concatenate([[False], lost_over_frames(tracking, None, label) | unseen])
+    lost = lost_over_frames(tracking, None, label) | unseen
+    return tuple(np.concatenate([[False], a]) for a in (lost, turn_unknown(tracking, None, label)))
 
 
-def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str, Any]:
+def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray, unsure: np.ndarray) -> dict[str, Any]:
     """What became of one object.
 
     Args:
         errors: of its centroid, millimetres, frame by frame.
         pixels: that truly show it.
         said: whether the tracker said that it is lost or unseen.
+        unsure: whether it said that it does not know how the object is turned.
     """
     there = pixels >= FEWEST_PIXELS
     astray = (errors > ASTRAY_MM) & there
-    silent = longest(astray & ~said)
+    told = said | (unsure & (errors <= TURN_MM))
+    silent = longest(astray & ~told)
     ends = bool(astray[there][-1])
     if not astray.any():
         verdict = "sound"
-    elif silent > MOST_SILENT or not (astray & said).any():
+    elif silent > MOST_SILENT or not (astray & told).any():
         verdict = "astray, unsaid"
+    elif not (astray & said).any():
+        verdict = "turn unknown, said so"
     else:
         verdict = "lost, said so" if ends else "lost, found again"
     sound = there & ~astray
@@ -134,11 +141,13 @@ def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray) -> dict[str,
         "end_mm": float(errors[there][-1]),
         "astray": int(astray.sum()),
         "silent": silent,
-        "unsaid": int((astray & ~said).sum()),
+        "unsaid": int((astray & ~told).sum()),
         "sound_frames": int(sound.sum()),
         "false_alarms": int((sound & said).sum()),
+        "unsure_frames": int((there & unsure).sum()),
         "errors_mm": errors.round(2).tolist(),
         "said": said.tolist(),
+        "unsure": unsure.tolist(),
         "there": there.tolist(),
     }
 

@@ -65,6 +65,7 @@ class Tracking:
     plans: int = 0
     visible: list[np.ndarray] = field(default_factory=list)
     lost: list[np.ndarray] = field(default_factory=list)
+    turn_known: list[np.ndarray] = field(default_factory=list)
     skipped: int = 0
     everywhere: list[int] = field(default_factory=list)
     chosen: Chosen | None = None
@@ -165,6 +166,7 @@ def follow(
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)
                 tracking.visible.append(np.asarray(update.info["visible"]))
                 tracking.lost.append(np.asarray(update.info["lost"]))
+                tracking.turn_known.append(np.asarray(update.info["turn_known"]))
                 tracking.skipped += int(update.info["skipped"])
                 plans.add(update.plan)
                 saved(tracking, update, False)

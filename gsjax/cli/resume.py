@@ -67,6 +67,7 @@ class Saver:
             "skipped": tracking.skipped,
             "visible": [seen.tolist() for seen in tracking.visible],
             "lost": [lost.tolist() for lost in tracking.lost],
+            "turn_known": [known.tolist() for known in tracking.turn_known],
             "everywhere": tracking.everywhere,
             "chosen": _chosen_metadata(update.chosen),
         }
@@ -107,6 +108,7 @@ def load(folder: Path, first: Frame, config: TrackerConfig) -> tuple[Tracking, T
         skipped=found["skipped"],
         visible=[np.asarray(seen) for seen in found["visible"]],
         lost=[np.asarray(lost) for lost in found["lost"]],
+        turn_known=[np.asarray(known) for known in found["turn_known"]],
         everywhere=found["everywhere"],
         resumed=found["frames"],
     )

@@ -138,6 +138,7 @@ def metrics(
             "mask_pixels": _pixels(mask, tracking, values, label),
             "travelled_mm": _travelled_mm(tracking, values, label),
             "frames_lost": _frames_lost(tracking, values, label),
+            "turn_unknown_from": turn_unknown_from(tracking, values, label),
             **_motion_metrics(motion.get(label)),
         }
         for label, name in names.items()
@@ -233,9 +234,29 @@ def lost_over_frames(
     tracking: Tracking, values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates"]:
     """In which updates the tracker held the object, or a part of it, for lost."""
+    return _of_object(tracking, tracking.lost, values, label).any(axis=1)
+
+
+def turn_unknown(
+    tracking: Tracking, values: np.ndarray | None, label: int
+) -> Bool[np.ndarray, "updates"]:
+    """After which updates the tracker did not know how the object, or a part of it, is turned."""
+    return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
+
+
+def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    """The frame from which on, to the end, the tracker did not know how the object is turned; None if it did."""
+    known = np.flatnonzero(~turn_unknown(tracking, values, label))
+    first = known[-1] + 2 if len(known) else 1
+    return int(first) if first < tracking.num_frames else None
+
+
+def _of_object(
+    tracking: Tracking, flags: list[np.ndarray], values: np.ndarray | None, label: int
+) -> Bool[np.ndarray, "updates parts"]:
+    """Of all flags those of one object's groups."""
     ids = np.asarray(tracking.scene.label_ids) if values is None else values
-    lost = np.asarray(tracking.lost).reshape(len(tracking.lost), len(ids) - 1)
-    return lost[:, ids[1:] == label].any(axis=1)
+    return np.asarray(flags, bool).reshape(len(flags), len(ids) - 1)[:, ids[1:] == label]
 
 
 def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:

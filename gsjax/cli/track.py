@@ -31,6 +31,7 @@ from gsjax.cli.scoring import (
     budget_metrics,
     group_values,
     lost_over_frames,
+    turn_unknown_from,
     metrics,
     object_names,
     score_motion,
@@ -338,6 +339,9 @@ def _note_what_is_missing(
             name = names.get(label, f"object {label}")
             ended = "to the end" if lost[-1] == tracking.num_frames - 1 else f"to {lost[-1]}"
             notes.add(f"{name}: lost in {len(lost)} frames, from {lost[0]} {ended}.")
+        unknown = turn_unknown_from(tracking, values, label)
+        if unknown is not None and label in names:
+            notes.add(f"{name}: how it is turned is not known from frame {unknown} on; other turns agree as well.")
     for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
         name = names.get(label, f"object {label}")
         frames = max(counts[group] for group in range(len(counts)) if ids[group + 1] == label)

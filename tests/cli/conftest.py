@@ -40,7 +40,7 @@ def standing_still(scene, first, frames, config, **how):
     """`track` for objects that never move."""
     for _ in frames:
         seen = np.ones(scene.num_objects, bool)
-        info = {"visible": seen, "lost": ~seen, "joined": 0, "skipped": False}
+        info = {"visible": seen, "lost": ~seen, "turn_known": seen, "joined": 0, "skipped": False}
         yield Tracked(scene, first_pose(scene), None, info, 0.01, 0.0, None, 0)
 
 

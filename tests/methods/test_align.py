@@ -33,7 +33,9 @@ from gsjax.methods.object_tracker.points import (
     tones,
 )
 from gsjax.methods.object_tracker.search import (
+    TELLS_TURN,
     Found,
+    Sought,
     ball,
     first_watch,
     least,
@@ -81,7 +83,7 @@ def look(points, center, sight, config=CONFIG, everywhere=1):
     points = jax.tree.map(lambda a: a[None], points)
     missing = Missing(points, jax.tree.map(lambda a: a[0], points), jnp.int32(0))
     how = (config, first_watch(1), jnp.array([True]), jnp.int32(everywhere), missing)
-    return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how)[0].twists[0]
+    return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how).found.twists[0]
 
 
 def gap(points, sight, config=CONFIG):
@@ -331,11 +333,29 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
     missing = Missing(points, given[0], jnp.int32(0))
     for watch, there, expected in watches:
         one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1), missing)
-        found, _, looked_for = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
-        np.testing.assert_array_equal(np.flatnonzero(looked_for), expected)
-        right = jnp.linalg.norm(found.twists[:, :3] - shift, axis=1) < 1e-3
+        sought = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
+        np.testing.assert_array_equal(np.flatnonzero(sought.looked_for), expected)
+        np.testing.assert_array_equal(np.flatnonzero(jnp.isfinite(sought.leads)), expected)
+        right = jnp.linalg.norm(sought.found.twists[:, :3] - shift, axis=1) < 1e-3
         np.testing.assert_array_equal(np.flatnonzero(right), expected)
-    assert isinstance(found, Found)
+
+
+@pytest.mark.parametrize("printed", [True, False])
+def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
+    """A can that stands still: its print tells how it is turned, and without it nothing does."""
+    sequence, (frame, *_), _ = table(8, 2, **SIZE)
+    can = sequence.truth.label_ids[sequence.truth.names.index("can")]
+    mine = jnp.stack([sequence.mask(0, c) == can for c in range(2)])
+    if not printed:
+        frame = frame._replace(images=jnp.where(mine[..., None], frame.images[mine].mean(0), frame.images))
+    seen = see(frame)
+    points = pixels_of_groups(seen, mine.astype(jnp.int32), frame.depths, 1, CONFIG)
+    center = middle(jax.tree.map(lambda a: a[0], points))
+    missing = Missing(points, jax.tree.map(lambda a: a[0], points), jnp.int32(0))
+    how = (CONFIG, first_watch(1), jnp.array([True]), jnp.int32(1), missing)
+    sought = search(jnp.zeros((1, 1, 6)), points, center[None], seen, *how)
+    assert (float(sought.leads[0]) > TELLS_TURN) == printed
+    assert float(jnp.linalg.norm(sought.found.twists[0, :3])) < 1e-3
 
 
 def test_a_watch_knows_what_is_usual_and_who_waits():
@@ -343,12 +363,19 @@ def test_a_watch_knows_what_is_usual_and_who_waits():
     for t in range(60):
         shown = jnp.array([t, 60.0 - t])
         sure = Confidence(jnp.array([0.9, 0.2]), jnp.array([0.8, 0.1]), jnp.array([True, t > 0]))
-        watch = watch.after(jnp.array([0.4, 0.0]), jnp.array([False, True]), shown, sure)
+        watch = watch.after(jnp.array([0.4, 0.0]), nothing_of([False, True]), shown, sure)
         np.testing.assert_array_equal(watch.lost, [False, t > 0])  # where nothing tells, all is as before
     np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
     np.testing.assert_allclose(watch.waited, [60, 0])
     np.testing.assert_allclose(watch.largest, [59, 60])
     np.testing.assert_allclose(watch.agrees, [0.9, 0.2])
+
+
+def nothing_of(looked_for, leads=jnp.inf):
+    """A search that says just which groups were looked for, and what their turns agree better by."""
+    still = jnp.zeros((len(looked_for), 6))
+    found = Found(still, still[:, 0])
+    return Sought(found, still, jnp.array(looked_for), jnp.broadcast_to(jnp.asarray(leads), len(still)))
 
 
 def test_what_is_lost_is_found_only_when_it_shows_itself():
@@ -357,5 +384,23 @@ def test_what_is_lost_is_found_only_when_it_shows_itself():
     told = [(0.2, 0.2, True), (0.9, 0.4, True), (0.9, 0.6, False), (0.4, 0.4, False), (0.3, 0.3, True)]
     for agrees, shows, lost in told:
         sure = Confidence(jnp.array([agrees]), jnp.array([shows]), one)
-        watch = watch.after(none, one, none, sure)
+        watch = watch.after(none, nothing_of([True]), none, sure)
         assert bool(watch.lost[0]) == lost, (agrees, shows)
+
+
+def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
+    watch, none, one = first_watch(1), jnp.zeros(1), jnp.array([True])
+    told = [
+        (0.8, 0.2, True),  # agrees, lead of its turn, whether its turn is known then
+        (0.8, TELLS_TURN - 0.01, False),
+        (0.9, 0.2, False),  # it may have been turned in between
+        (0.2, 0.2, False),  # lost
+        (0.6, 0.2, False),  # found, but hardly as it was
+        (0.2, 0.2, False),
+        (0.9, 0.2, True),
+        (0.9, jnp.inf, True),  # not looked for
+    ]
+    for agrees, lead, known in told:
+        sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
+        watch = watch.after(none, nothing_of([True], lead), none, sure)
+        assert bool(watch.turn_known[0]) == known, (agrees, lead)

@@ -22,6 +22,9 @@ from gsjax.optim.step import keep_if
 _LEAST_USUAL = 0.02  # a residual below this is noise
 _WHILE_LOST = 1.0  # what being lost counts beside a residual as usual
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
+_OTHER_TURN = 0.14  # radians; what is turned by more than this is turned otherwise
+TELLS_TURN = 0.045  # another turn's residual must be higher by this; docs/results-hard-cases.md has both sides
+_FOUND_TURNED = 0.65  # share that agrees of what is found again, below which it may be turned otherwise
 
 
 def widened(config: AlignConfig) -> AlignConfig:
@@ -35,6 +38,15 @@ class Found(NamedTuple):
 
     twists: Float[Array, "*k 6"]  # translation, metres, and rotation vector, radians
     residuals: Float[Array, "*k"]  # how badly that agrees with the images: 0 perfect, 1 not at all
+
+
+class Sought(NamedTuple):
+    """What a search found."""
+
+    found: Found
+    again: Float[Array, "k 6"]  # where a lost group that was looked for may be instead
+    looked_for: Bool[Array, "k"]  # everywhere
+    leads: Float[Array, "k"]  # by how much every other turn agrees worse; infinite where none was tried
 
 
 def judge(
@@ -97,19 +109,19 @@ def look_everywhere(
     sight: Sight,
     config: AlignConfig,
     elsewhere: Float[Array, "n 6"],
-) -> Found:
-    """`known` of one group, or what agrees better.
+) -> tuple[Found, Float[Array, ""]]:
+    """`known` of one group, or what agrees better; and by how much every other turn agrees worse.
 
     Every start is aligned, and so is the best of `elsewhere`, for what has no texture to match. Then turns to
     all sides are tried from the best, because a knock changes a spin from one frame to the next, and a round
     thing may roll without its shape changing. Half the points choose among these; all of them have the last
-    word.
+    word. A turn that ends up elsewhere and agrees nearly as well says that pictures do not tell the turn.
     """
     wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 
-    def judged(twists, points, config) -> Found:
+    def judged(twists, points, config) -> Float[Array, "h"]:
         over_twists = jax.vmap(disagreement, in_axes=(0, None, None, None, None))
-        return least(over_twists(twists, points, center, sight, config), twists)
+        return over_twists(twists, points, center, sight, config)
 
     def aligned(twists):
         over_twists = jax.vmap(align, in_axes=(0, None, None, None, None))
@@ -118,15 +130,20 @@ def look_everywhere(
     starts = jnp.concatenate([starts, known.twists[None]])
     if len(elsewhere):
         few = jax.tree.map(lambda a: a[..., ::4], points)
-        starts = jnp.concatenate([starts, judged(elsewhere, few, wide).twists[None]])
-    best = judged(aligned(starts), half, config).twists
+        starts = jnp.concatenate([starts, least(judged(elsewhere, few, wide), elsewhere).twists[None]])
+    tried = aligned(starts)
+    residuals = judged(tried, half, config)
     if config.max_turn and config.turns:
-        best = judged(
-            aligned(turned(best, principal_axes(points, center), config.turns)), half, config
-        ).twists
-    last = align(best, points, center, sight, config)
-    residuals = jnp.stack([known.residuals, disagreement(last, points, center, sight, config)])
-    return least(residuals, jnp.stack([known.twists, last]))
+        axes = principal_axes(points, center)
+        tried = aligned(turned(least(residuals, tried).twists, axes, config.turns))
+        residuals = judged(tried, half, config)
+    last = align(least(residuals, tried).twists, points, center, sight, config)
+    ends = jnp.stack([known.twists, last])
+    found = least(jnp.stack([known.residuals, disagreement(last, points, center, sight, config)]), ends)
+    apart = jaxlie.SO3.exp(found.twists[3:]).inverse() @ jaxlie.SO3.exp(tried[:, 3:])
+    others = jnp.linalg.norm(apart.log(), axis=-1) > _OTHER_TURN
+    rival = jnp.min(jnp.where(others, residuals, jnp.inf))
+    return found, rival - disagreement(found.twists, half, center, sight, config)
 
 
 class Watch(NamedTuple):
@@ -137,38 +154,42 @@ class Watch(NamedTuple):
     largest: Float[Array, "k"]  # pixels that showed it when it was seen best, all cameras together
     agrees: Float[Array, "k"]  # how much of what was last seen of it looked as at first, 0 to 1
     lost: Bool[Array, "k"]
+    turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
 
     def after(
         self,
         residuals: Float[Array, "k"],
-        looked_for: Bool[Array, "k"],
+        sought: Sought,
         shown: Float[Array, "k"],
         sure: Confidence,
     ) -> "Watch":
         """One frame later.
 
         Args:
-            residuals: as in `Found`.
-            looked_for: which groups were looked for everywhere.
+            residuals: as in `Found`, of what was kept.
+            sought: what the search found.
             shown: pixels that showed each group.
             sure: whether each group is where it is believed to be.
         """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
         lost = jnp.where(self.lost, sure.shows < FOUND, sure.agrees < LOST)
-        waited = jnp.where(looked_for, 0.0, self.waited + 1.0)
+        lost = jnp.where(sure.tells, lost, self.lost)
+        as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
+        told = jnp.where(self.lost, as_at_first, self.turn_known & (sought.leads > TELLS_TURN))
         return Watch(
             usual,
-            waited,
+            jnp.where(sought.looked_for, 0.0, self.waited + 1.0),
             jnp.maximum(self.largest, shown),
             jnp.where(sure.tells, sure.agrees, self.agrees),
-            jnp.where(sure.tells, lost, self.lost),
+            lost,
+            told & ~lost,
         )
 
 
 def first_watch(num_groups: int) -> Watch:
     """Before the first frame."""
     nothing, certain = jnp.zeros(num_groups), jnp.ones(num_groups)
-    return Watch(jnp.full(num_groups, 0.1), nothing, nothing, certain, jnp.zeros(num_groups, bool))
+    return Watch(jnp.full(num_groups, 0.1), nothing, nothing, certain, nothing > 0, certain > 0)
 
 
 def search(
@@ -181,9 +202,8 @@ def search(
     visible: Bool[Array, "k"],
     everywhere: Int[Array, ""],
     missing: Missing,
-) -> tuple[Found, Float[Array, "k 6"], Bool[Array, "k"]]:
-    """The twist of each group that agrees best with the images, no worse than any start; of a lost one that
-    was looked for, where it may be instead; and which groups were looked for everywhere.
+) -> Sought:
+    """The twist of each group that agrees best with the images, no worse than any start.
 
     Args:
         starts: hypotheses: translation, metres, and rotation vector, radians, of each group.
@@ -212,7 +232,7 @@ def search(
     count = jnp.minimum(everywhere, visible.sum())
 
     def look(i, carried):
-        found, again = carried
+        found, again, leads = carried
         group = order[i]
         lost, center = watch.lost[group], centers[group]
         known, own, firsts = jax.tree.map(lambda a: a[group], (found, points, missing.centers))
@@ -224,10 +244,13 @@ def search(
 
         own, around = jax.lax.cond(lost, anywhere, lambda: (own, shifts))
         start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
-        better = look_everywhere(start, starts[:, group], own, center, sight, config, around)
+        better, lead = look_everywhere(start, starts[:, group], own, center, sight, config, around)
         again = again.at[group].set(jnp.where(lost, better.twists, again[group]))
+        leads = leads.at[group].set(jnp.where(lost, leads[group], lead))
         better = keep_if(lost, known, better)
-        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better), again
+        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better), again, leads
 
-    found, again = jax.lax.fori_loop(0, count, look, (found, jnp.zeros_like(found.twists)))
-    return found, again, jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
+    nothing = (found, jnp.zeros_like(found.twists), jnp.full_like(found.residuals, jnp.inf))
+    found, again, leads = jax.lax.fori_loop(0, count, look, nothing)
+    looked_for = jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
+    return Sought(found, again, looked_for, leads)

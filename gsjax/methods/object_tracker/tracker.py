@@ -245,9 +245,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             )
         missing = Missing(named, state.strangers, state.count)
         seen = (config.align, state.watch, visible, everywhere, missing)
-        aligned, again, looked_for = search(jnp.stack(starts), points, centers, sight, *seen)
-        residual = aligned.residuals
-        kept = begun = Motion(aligned.twists, delta)
+        sought = search(jnp.stack(starts), points, centers, sight, *seen)
+        residual = sought.found.residuals
+        kept = begun = Motion(sought.found.twists, delta)
         needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
         if config.refine.iterations:
             assert last.rendered is not None
@@ -262,10 +262,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-        sure, sought = sure_of(kept.twists), state.watch.lost & looked_for
-        surely = jax.lax.cond(sought.any(), sure_of, lambda _: sure, again)
-        retaken = sought & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
-        kept = _select(retaken, Motion(again, jnp.zeros_like(delta)), kept, groups)
+        sure, lost = sure_of(kept.twists), state.watch.lost & sought.looked_for
+        surely = jax.lax.cond(lost.any(), sure_of, lambda _: sure, sought.again)
+        retaken = lost & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
+        kept = _select(retaken, Motion(sought.again, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(lambda a, b: jnp.where(retaken, a, b), surely, sure)
 
         pose = move(params, kept, centers, groups)
@@ -281,7 +281,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, looked_for, counts, sure)
+        watch = state.watch.after(residual, sought, counts, sure)
         new_state = TrackerState(kept, pixels, keyframe, strangers, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
@@ -294,7 +294,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "residual": residual,
             "agrees": watch.agrees,
             "lost": watch.lost,
-            "looked_for": looked_for,
+            "turn_known": watch.turn_known,
+            "looked_for": sought.looked_for,
             "motion": kept,
             "centers": centers + kept.twists[:, :3],
             "shown": shown,
