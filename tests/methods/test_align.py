@@ -347,7 +347,8 @@ def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
     can = sequence.truth.label_ids[sequence.truth.names.index("can")]
     mine = jnp.stack([sequence.mask(0, c) == can for c in range(2)])
     if not printed:
-        frame = frame._replace(images=jnp.where(mine[..., None], frame.images[mine].mean(0), frame.images))
+        plain = jnp.where(mine[..., None], frame.images[mine].mean(0), frame.images)
+        frame = replace(frame, images=plain)
     seen = see(frame)
     points = pixels_of_groups(seen, mine.astype(jnp.int32), frame.depths, 1, CONFIG)
     center = middle(jax.tree.map(lambda a: a[0], points))
