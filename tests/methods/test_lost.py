@@ -138,11 +138,12 @@ def test_guesses_bring_points_to_strangers_or_stay_near(carton):
     )
 
 
-def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick):
+@pytest.mark.parametrize("redraw", ["moving", "all"])
+def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick, redraw):
     """The scene has the carton 12 cm beside where it is, too far to be looked for from there."""
     _, frames, _ = table()
     config = replace(
-        quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
+        quick, redraw=redraw, matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
     )
     group = started.label_ids.index(CARTON)
     mine = np.asarray(started.labels) == group

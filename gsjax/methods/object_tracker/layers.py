@@ -39,6 +39,11 @@ class Backdrop(NamedTuple):
     depths: Float[Array, "c height width"]
     alphas: Float[Array, "c height width"]
 
+    @property
+    def covers(self) -> Bool[Array, "c height width"]:
+        """Where it is more than half opaque."""
+        return self.alphas > 0.5
+
 
 def render_labels(
     scene: TrackedScene, pose: Pose, frame: Frame, plan: Plan, *, one_sided: bool = False
@@ -126,11 +131,11 @@ def show_moving(
     )
     alphas, depths = alphas[..., 0], images[..., -1]
     labels = ((images[..., :-1] > 0.5 * alphas[..., None]) * powers).sum(-1).astype(jnp.int32)
-    behind = (backdrop.alphas > 0.5) & (backdrop.depths < depths)
+    behind = backdrop.covers & (backdrop.depths < depths)
     on_top = (alphas > 0.5) & ~behind
     labels = jnp.where(on_top & (labels <= scene.num_objects), labels, 0)
     depths = jnp.where(on_top, depths, backdrop.depths)
-    return Shown(labels, depths, on_top | (backdrop.alphas > 0.5)), meta.needed.max()
+    return Shown(labels, depths, on_top | backdrop.covers), meta.needed.max()
 
 
 def seen_from(

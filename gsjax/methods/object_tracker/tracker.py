@@ -212,7 +212,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         if backdrop is not None:
             views = reduced(frame.cameras, config.coarseness)
             backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
-            background = jnp.where(backdrop.alphas > 0.5, backdrop.depths, 0.0)
+            background = jnp.where(backdrop.covers, backdrop.depths, 0.0)
         last = look_back(params, state, batch)
         enough = _ENOUGH_PIXELS / config.coarseness**2
         counts = pixel_counts(last.shown.labels, num_objects)
