@@ -11,19 +11,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import jax
 import numpy as np
 from faults import noisy_depth, without_cameras, without_frames
-from recordings import MASK_CAMERA, Start, recorded, tracked
+from recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
+from scipy.spatial.transform import Rotation
 from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
 from gsjax.cli.loop import Tracking
-from gsjax.cli.recording import Recording, first_mask, remembered
+from gsjax.cli.recording import Recording, draw_ahead, first_mask, remembered
 from gsjax.cli.scoring import lost_over_frames, score_motion, turn_unknown
-from gsjax.data import Sequence, open_sequence
+from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
 from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene
 
 START = TrackerConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
-TURN_MM = 40.0  # no wrong turn alone puts the centroid of a surface of these objects further off
+TURNED_DEG = 8.0  # an object that is turned otherwise by more than this
 FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
 MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
 
@@ -61,11 +62,10 @@ def started(case: str) -> Start:
     """The recording and its scene at the first frame."""
     jax.clear_caches()  # every case has shapes of its own, and programs fill the process's memory map
     sequence = remembered(CASES[case]())
-    recording = Recording(sequence, sequence, sequence.num_frames)
+    recording = Recording(sequence, sequence, sequence.num_frames, True)
     mask, frame = first_mask(sequence, MASK_CAMERA, "files"), sequence.frame(0)
     assert mask.labels is not None
-    for t in range(sequence.num_frames):
-        sequence.frame(t)  # drawn ahead, which the tracker need not wait for
+    draw_ahead(recording, QUIET)
     return Start(recording, mask, frame, start_scene(frame, mask.labels, MASK_CAMERA, START))
 
 
@@ -78,17 +78,25 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     names = dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
     motion, pixels = score_motion(tracking, recording), seen_pixels(recording.tracked)
     objects = {
-        names[label]: judge(score.centroid_errors_mm, pixels[label], *said(tracking, label))
+        names[label]: judge(
+            score.centroid_errors_mm,
+            turn_errors(tracking, truth, label),
+            pixels[label],
+            *said(tracking, label),
+        )
         for label, score in motion.items()
         if score.num_scored
     }
     worst = max(objects, key=lambda name: (objects[name]["silent"], *objects[name]["order"]))
     total = sum(o["sound_frames"] for o in objects.values())
     alarms = sum(o["false_alarms"] for o in objects.values())
+    known = sum(o["turn_right_frames"] for o in objects.values())
+    doubts = sum(o["false_doubts"] for o in objects.values())
     return {
         **{key: objects[worst][key] for key in ("verdict", "median_mm", "end_mm", "astray", "unsaid")},
         "worst": worst,
         "false_alarms": 100 * alarms / max(total, 1),
+        "false_doubts": 100 * doubts / max(known, 1),
         "objects": {name: {k: v for k, v in o.items() if k != "order"} for name, o in objects.items()},
         "update_ms": 1e3 * np.median(tracking.update_s[3:]),
     }
@@ -111,18 +119,33 @@ def said(tracking: Tracking, label: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.concatenate([[False], a]) for a in (lost, turn_unknown(tracking, None, label)))
 
 
-def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray, unsure: np.ndarray) -> dict[str, Any]:
+def turn_errors(tracking: Tracking, truth: Truth, label: int) -> np.ndarray:
+    """Angle between how the tracker and the truth have turned an object since the first frame, degrees."""
+    group = tracking.scene.label_ids.index(label)
+    one = int(np.argmax(np.asarray(tracking.scene.labels) == group))  # any Gaussian turns as its object does
+    found = Rotation.from_quat(tracking.quats()[:, one], scalar_first=True)
+    poses = truth.poses[: tracking.num_frames, truth.label_ids.tolist().index(label), :3, :3]
+    true = Rotation.from_matrix(poses)
+    apart = (found * found[0].inv()).inv() * (true * true[0].inv())
+    return np.degrees(apart.magnitude())
+
+
+def judge(
+    errors: np.ndarray, turns: np.ndarray, pixels: np.ndarray, said: np.ndarray, unsure: np.ndarray
+) -> dict[str, Any]:
     """What became of one object.
 
     Args:
         errors: of its centroid, millimetres, frame by frame.
+        turns: errors of how it is turned, degrees.
         pixels: that truly show it.
         said: whether the tracker said that it is lost or unseen.
         unsure: whether it said that it does not know how the object is turned.
     """
     there = pixels >= FEWEST_PIXELS
     astray = (errors > ASTRAY_MM) & there
-    told = said | (unsure & (errors <= TURN_MM))
+    wrongly = turns > TURNED_DEG  # which moves the centroid of what is seen of an object
+    told = said | (unsure & wrongly)
     silent = longest(astray & ~told)
     ends = bool(astray[there][-1])
     if not astray.any():
@@ -144,7 +167,9 @@ def judge(errors: np.ndarray, pixels: np.ndarray, said: np.ndarray, unsure: np.n
         "unsaid": int((astray & ~told).sum()),
         "sound_frames": int(sound.sum()),
         "false_alarms": int((sound & said).sum()),
-        "unsure_frames": int((there & unsure).sum()),
+        "turn_right_frames": int((there & ~wrongly).sum()),
+        "false_doubts": int((there & ~wrongly & unsure & ~said).sum()),
+        "turns_deg": turns.round(1).tolist(),
         "errors_mm": errors.round(2).tolist(),
         "said": said.tolist(),
         "unsure": unsure.tolist(),

@@ -87,7 +87,7 @@ def run(options: Options) -> int:
 
 
 def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Console) -> Grasp:
-    """The best grasp of each frame, stacked, on the host."""
+    """The best grasp of each frame, stacked, on the host; none is feasible while the object is lost."""
     scene, means = saved.tracking.scene, saved.tracking.means()
     points = means[:, answer.rows]
     obstacles = means[:, _obstacle_rows(options, saved, answer, means)]
@@ -108,7 +108,9 @@ def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Cons
     there, others = np.ones(points.shape[1], bool), np.ones(obstacles.shape[1], bool)
     frames = track(range(len(means)), "grasping", console=console, transient=True)
     found = [jax.device_get(best(key, points[t], normals[t], there, obstacles[t], others)) for t in frames]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+    grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+    lost = [False, *(bool(flags[answer.group - 1]) for flags in saved.tracking.lost)]
+    return grasps._replace(feasible=grasps.feasible & ~np.array(lost))
 
 
 def _obstacle_rows(options: Options, saved: SavedRun, answer: Answer, means: np.ndarray) -> np.ndarray:

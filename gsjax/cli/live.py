@@ -55,8 +55,6 @@ class Options:
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
-    max_skew: float = 0.02
-    """Cameras of one frame may be so far apart, seconds; a frame beyond that is left out and counted."""
     overwrite: bool = False
     """Replace a finished run in the same folder."""
     debug: bool = False
@@ -96,6 +94,7 @@ def run(options: Options) -> int:
         found = log.metrics() | {
             "source": options.source,
             "complete": stopped is None,
+            "report": False,  # a stream has none
             "stopped": None if stopped is None else describe_error(stopped) or "Ctrl-C",
             "notes": notes.all,
             "machine": describe_machine(),
@@ -115,6 +114,13 @@ def _check(options: Options) -> None:
     for name in ("seconds", "hz", "patience"):
         if not getattr(options, name) > 0:
             raise ValueError(f"--{name}: expected more than 0, found {getattr(options, name)}")
+    if options.source.startswith(CAMERA_PREFIX):
+        for name in ("cameras", "mask_camera", "frames", "masks"):
+            if getattr(options, name) != getattr(Options, name):
+                option = name.replace("_", "-")
+                raise ValueError(
+                    f"--{option}: is of recordings, and {options.source} is a camera; leave it out"
+                )
 
 
 def _open(options: Options, console: Console) -> Source:
@@ -158,10 +164,11 @@ class Log:
         self.everywhere: list[int] = []
         self.memory_mb: list[float] = []
         self.poses: list[np.ndarray] = []
-        self._turned = Rotation.identity(groups)
+        self.lost: list[np.ndarray] = []
+        self.turn_known: list[np.ndarray] = []
+        self._turned, self._centers = Rotation.identity(groups), None
         self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
         self._memory_at = 0.0
-        self._lost = dict.fromkeys(sorted({*self._ids} - {0}), 0)
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
         """One update."""
@@ -174,16 +181,31 @@ class Log:
         self.everywhere.append(update.everywhere)
         self.chosen = update.chosen
         self.plans.add(update.plan)
-        lost = np.asarray(update.info["lost"])
-        for value in self._lost:
-            self._lost[value] += int(lost[np.asarray(self._ids[1:]) == value].any())
-        twists, centers = jax.device_get((update.info["motion"].twists, update.info["centers"]))
-        self._turned = Rotation.from_rotvec(twists[:, 3:]) * self._turned
-        quats = self._turned.as_quat(scalar_first=True)
-        self.poses.append(np.concatenate([centers, quats], axis=1).astype(np.float32))
+        self.lost.append(np.asarray(update.info["lost"]))
+        self.turn_known.append(np.asarray(update.info["turn_known"]))
+        self.poses.append(
+            self._carried(*jax.device_get((update.info["motion"].twists, update.info["centers"])))
+        )
         if now - self._memory_at > _MEMORY_EVERY_S:
             self._memory_at = now
             self.memory_mb.append(resident_mb())
+
+    def _carried(self, twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        """Where the groups' first middles are now, and how they are turned.
+
+        The tracker's own middles shift with what joins a group; these go where its motion carries them.
+        """
+        before, turns = centers - twists[:, :3], Rotation.from_rotvec(twists[:, 3:])
+        old = before if self._centers is None else self._centers
+        self._centers = turns.apply(old - before) + centers
+        self._turned = turns * self._turned
+        quats = self._turned.as_quat(scalar_first=True)
+        return np.concatenate([self._centers, quats], axis=1).astype(np.float32)
+
+    def _updates_with(self, flags: list[np.ndarray]) -> dict[str, int]:
+        """In how many updates the flag of an object, or of a part of it, was set."""
+        ids, rows = np.asarray(self._ids[1:]), np.asarray(flags, bool).reshape(len(flags), len(self._ids) - 1)
+        return {self._name(v): int(rows[:, ids == v].any(axis=1).sum()) for v in sorted({*self._ids} - {0})}
 
     def trajectory(self) -> dict[str, np.ndarray]:
         """The place and turn of every group over time."""
@@ -192,6 +214,8 @@ class Log:
             "times": np.asarray(self.stamps),
             "centers": poses[..., :3],
             "quats": poses[..., 3:],
+            "lost": np.stack(self.lost),
+            "turn_known": np.stack(self.turn_known),
             "label_ids": np.asarray(self._ids[1:]),
             "latency_s": np.asarray(self.latencies),
             "update_s": np.asarray(self.seconds),
@@ -213,7 +237,8 @@ class Log:
             if self.memory_mb
             else None,
             "objects": {str(v): self._name(v) for v in sorted({*self._ids} - {0})},
-            "frames_lost": {self._name(value): count for value, count in self._lost.items()},
+            "frames_lost": self._updates_with(self.lost),
+            "frames_turn_unknown": self._updates_with([~known for known in self.turn_known]),
         }
 
     def _name(self, value: int) -> str:
@@ -235,7 +260,7 @@ def _spread(seconds: list[float]) -> dict[str, float] | None:
 def follow(options: Options, source: Source, log: Log, console: Console) -> BaseException | None:
     """Track until the stream ends; returns what ended it early, or None."""
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
-    newest = Newest(source.snapshots, max_skew=options.max_skew, patience=options.patience)
+    newest = Newest(source.snapshots, patience=options.patience)
     arrived: list[Arrival] = []
 
     def frames() -> Iterator[Frame]:
@@ -283,11 +308,14 @@ def _print(found: dict[str, Any], folder: RunFolder) -> None:
         spread = ", ".join(f"{name} {value:.0f} ms" for name, value in latency.items())
         table.add_row("[bold]latency[/]", f"from arrival to the new state: {spread}")
         table.add_row("[bold]late[/]", f"{found['late']} updates were over the budget")
-    lost = {name: count for name, count in found["frames_lost"].items() if count}
-    if lost:
-        table.add_row("[bold]lost[/]", ", ".join(f"{n} in {count} updates" for n, count in lost.items()))
+    for title, key in (("lost", "frames_lost"), ("turn unknown", "frames_turn_unknown")):
+        counts = {name: count for name, count in found[key].items() if count}
+        if counts:
+            words = ", ".join(f"{name} in {count} updates" for name, count in counts.items())
+            table.add_row(f"[bold]{title}[/]", words)
     if found["budget"]:
-        table.add_row("[bold]settings[/]", found["budget"]["chosen"])
+        beyond = "" if found["budget"]["fits"] else ", the cheapest, which takes longer than the budget"
+        table.add_row("[bold]settings[/]", found["budget"]["chosen"] + beyond)
     if memory:
         table.add_row(
             "[bold]memory[/]", f"{memory['first']:.0f} MB at first, {memory['last']:.0f} MB at last"

@@ -39,7 +39,7 @@ class Tracking:
         joined: how many Gaussians had joined by each frame.
         poses: of the moving Gaussians in each frame, and after the first of those that join; on the host.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
-        compile_s: seconds spent compiling, all together.
+        compile_s: seconds spent compiling, since it began or was resumed.
         planning_s: seconds before the first update that went into its plan, and into compiling what plans.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
@@ -47,7 +47,7 @@ class Tracking:
         visible: [K] of each update, which objects some camera saw.
         lost: [K] of each update, which objects were not where they were believed to be.
         skipped: updates that changed nothing, because a number in them was not finite.
-        everywhere: of each update, how many groups it was allowed to look for everywhere.
+        everywhere: of each update, how many groups it looked for everywhere.
         chosen: the settings chosen for a budget, or None.
         resumed: how many frames an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
@@ -171,6 +171,8 @@ def follow(
                 plans.add(update.plan)
                 saved(tracking, update, False)
                 progress.update(task, advance=1, rate=_rate(tracking))
+            if update is not None and update.info:
+                saved(tracking, update, True)
         except (KeyboardInterrupt, Exception) as stopped:
             tracking.stopped = stopped
             progress.update(task, rate="stopped")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Bool
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import FirstMask, Recording
@@ -35,10 +36,20 @@ def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> 
         normals=np.asarray(tracking.scene.normals, np.float32),
         labels=labels,
         label_ids=label_ids.astype(np.int32),
+        lost=_of_objects(tracking.lost, label_of),
+        turn_known=~_of_objects([~known for known in tracking.turn_known], label_of),
         times=times[: tracking.num_frames],
         update_s=np.asarray(tracking.update_s),
     )
     write_ply(folder.scene, tracking.scene.gaussians, labels=labels)
+
+
+def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:
+    """Whether an update set the flag of any part of each object; none is set in the first frame."""
+    rows = np.zeros((1 + len(flags), label_of.max()), bool)
+    for t, row in enumerate(flags, 1):
+        np.logical_or.at(rows[t], label_of[1:] - 1, row)
+    return rows
 
 
 def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -> Path | None:

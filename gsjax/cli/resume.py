@@ -63,7 +63,6 @@ class Saver:
             "final": _shapes(update.scene),
             "joined": tracking.joined,
             "update_s": tracking.update_s,
-            "compile_s": tracking.compile_s,
             "skipped": tracking.skipped,
             "visible": [seen.tolist() for seen in tracking.visible],
             "lost": [lost.tolist() for lost in tracking.lost],
@@ -104,12 +103,12 @@ def load(folder: Path, first: Frame, config: TrackerConfig) -> tuple[Tracking, T
         final=final,
         joined=found["joined"],
         update_s=found["update_s"],
-        compile_s=found["compile_s"],
         skipped=found["skipped"],
         visible=[np.asarray(seen) for seen in found["visible"]],
         lost=[np.asarray(lost) for lost in found["lost"]],
         turn_known=[np.asarray(known) for known in found["turn_known"]],
         everywhere=found["everywhere"],
+        chosen=chosen,
         resumed=found["frames"],
     )
     return tracking, Tracked(final, pose, state, {}, 0.0, 0.0, None, 0, chosen)

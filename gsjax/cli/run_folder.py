@@ -89,11 +89,12 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether a run that was not stopped has written its report here."""
+        """Whether a run that was not stopped has written all that it writes here: its report comes last."""
         metrics = self.path / "metrics.json"
-        if not (self.report.is_file() and metrics.is_file()):
+        if not metrics.is_file():
             return False
-        return bool(json.loads(metrics.read_text(encoding="utf-8")).get("complete", True))
+        found = json.loads(metrics.read_text(encoding="utf-8"))
+        return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
 
     @property
     def config(self) -> Path:

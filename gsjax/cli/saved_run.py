@@ -92,7 +92,8 @@ def _read_tracking(path: Path) -> Tracking:
         raise ValueError(
             f"{file}: expected plain arrays, found a file that cannot be read; {_AGAIN}"
         ) from error
-    missing = [name for name in ("means", "quats", "normals", "labels", "label_ids") if name not in arrays]
+    wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
+    missing = [name for name in wanted if name not in arrays]
     if missing:
         raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
@@ -111,7 +112,7 @@ def _read_tracking(path: Path) -> Tracking:
     poses = jax.device_get(
         [Pose(jnp.asarray(m[:moving]), jnp.asarray(q)) for m, q in zip(means, quats, strict=True)]
     )
-    return Tracking(scene, poses)
+    return Tracking(scene, poses, lost=[*arrays["lost"][1:]], turn_known=[*arrays["turn_known"][1:]])
 
 
 def _reopen(config: Path) -> Recording:

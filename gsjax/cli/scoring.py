@@ -237,15 +237,14 @@ def lost_over_frames(
     return _of_object(tracking, tracking.lost, values, label).any(axis=1)
 
 
-def turn_unknown(
-    tracking: Tracking, values: np.ndarray | None, label: int
-) -> Bool[np.ndarray, "updates"]:
+def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
     """After which updates the tracker did not know how the object, or a part of it, is turned."""
     return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
-    """The frame from which on, to the end, the tracker did not know how the object is turned; None if it did."""
+    """The frame from which on, to the end, the tracker did not know how the object is turned, lost or not;
+    None if it knew at the end."""
     known = np.flatnonzero(~turn_unknown(tracking, values, label))
     first = known[-1] + 2 if len(known) else 1
     return int(first) if first < tracking.num_frames else None

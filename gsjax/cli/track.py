@@ -31,10 +31,10 @@ from gsjax.cli.scoring import (
     budget_metrics,
     group_values,
     lost_over_frames,
-    turn_unknown_from,
     metrics,
     object_names,
     score_motion,
+    turn_unknown_from,
 )
 from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
@@ -277,7 +277,7 @@ def _seconds(tracking: Tracking) -> dict[str, float]:
     parts = {
         "planning": tracking.planning_s,
         "compile": tracking.compile_s,
-        "updates": sum(tracking.update_s),
+        "updates": sum(tracking.update_s[max(tracking.resumed, 1) :]),
         "loading": tracking.loading_s,
     }
     return parts | {"loop_rest": tracking.loop_s - sum(parts.values()), "loop_wall": tracking.loop_s}
@@ -327,6 +327,11 @@ def _note_what_is_missing(
                 else "no Gaussian is surely its"
             )
             notes.add(f"{name}: motion not scored, {why}.")
+    if tracking.chosen is not None and not tracking.chosen.fits:
+        base = f"{1e3 * tracking.chosen.costs.base:.0f} ms"
+        notes.warn(
+            f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
+        )
     if tracking.skipped:
         notes.add(f"{tracking.skipped} updates gave numbers that are not finite and were left out.")
     unseen = [np.flatnonzero(~seen) for seen in tracking.visible]
@@ -334,14 +339,16 @@ def _note_what_is_missing(
     names = object_names(tracking, recording, mask, values)
     ids = tracking.scene.label_ids if values is None else values.tolist()
     for label in sorted({*ids} - {0}):
+        name = names.get(label, f"object {label}")
         lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
+        to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
         if len(lost):
-            name = names.get(label, f"object {label}")
-            ended = "to the end" if lost[-1] == tracking.num_frames - 1 else f"to {lost[-1]}"
+            ended = "to the end" if to_the_end else f"to {lost[-1]}"
             notes.add(f"{name}: lost in {len(lost)} frames, from {lost[0]} {ended}.")
         unknown = turn_unknown_from(tracking, values, label)
-        if unknown is not None and label in names:
-            notes.add(f"{name}: how it is turned is not known from frame {unknown} on; other turns agree as well.")
+        if unknown is not None and not to_the_end:
+            why = "it was lost, or other turns agree as well"
+            notes.add(f"{name}: from frame {unknown} on it is not known how it is turned: {why}.")
     for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
         name = names.get(label, f"object {label}")
         frames = max(counts[group] for group in range(len(counts)) if ids[group + 1] == label)

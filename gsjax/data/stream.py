@@ -97,8 +97,11 @@ class Newest:
         if self._error is not None:
             raise self._error
         if not there:
+            counts = self.counts
+            left_out = {"out of order": counts.out_of_order, "with cameras out of sync": counts.out_of_sync}
+            words = "".join(f", {count} of them {why}" for why, count in left_out.items() if count)
             raise StreamStalled(
-                f"the stream stalled: nothing for {self._patience:g} s after {self.counts.offered} frames"
+                f"the stream stalled: nothing for {self._patience:g} s after {counts.offered} frames{words}"
             )
         return None
 

@@ -19,6 +19,7 @@ def standing_still(scene, first, frames, config, *, budget_ms):
     groups = scene.num_objects
     info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
     info["lost"] = jnp.arange(groups) == groups - 1
+    info["turn_known"] = jnp.arange(groups) > 0
     for _ in frames:
         yield Tracked(scene, first_pose(scene), None, info, 0.001, 0.0, None, 2)
 

@@ -156,3 +156,22 @@ def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, qui
     assert not others.any()
     found = np.asarray(updates[-1].pose.means)[mine[: started.num_moving]].mean(0)
     assert np.linalg.norm(found - np.asarray(started.gaussians.means)[mine].mean(0)) < 0.01
+
+
+def test_without_depth_what_is_elsewhere_is_said_to_be_lost_and_stays(table, started, quick):
+    """Colour alone says so; nothing says where else to look."""
+    _, frames, _ = table()
+    config = replace(
+        quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
+    )
+    config = replace(config, align=replace(config.align, iterations=1, everywhere=0))
+    group = started.label_ids.index(CARTON)
+    mine = np.asarray(started.labels) == group
+    away = np.where(mine[:, None], [0.0, 0.12, 0.0], 0.0)
+    wrong = eqx.tree_at(lambda s: s.gaussians.means, started, started.gaussians.means + away)
+    blind = replace(frames[0], depths=None)
+    last = list(track(wrong, blind, [blind] * 3, config))[-1]
+    assert last.info["lost"][group - 1]
+    found = np.asarray(last.pose.means)[mine[: started.num_moving]].mean(0)
+    assert np.isfinite(found).all()
+    assert np.linalg.norm(found - np.asarray(wrong.gaussians.means)[mine].mean(0)) < 0.05

@@ -42,9 +42,14 @@ class Chosen(NamedTuple):
 
 
 def ladder(config: TrackerConfig, num_cameras: int) -> dict[str, TrackerConfig]:
-    """Settings from the richest to the cheapest; how a scene starts and grows is always as in `config`."""
-    shared = {"start": config.start, "headroom": config.headroom}
-    rungs = {name: replace(PRESETS[name], **shared) for name in ("accurate", "balanced", "fast")}
+    """Settings from the richest to the cheapest; how a scene starts, and how much may join it, is as in
+    `config` always."""
+
+    def rung(preset: TrackerConfig) -> TrackerConfig:
+        grow = replace(preset.grow, slots=config.grow.slots)
+        return replace(preset, start=config.start, headroom=config.headroom, grow=grow)
+
+    rungs = {name: rung(PRESETS[name]) for name in ("accurate", "balanced", "fast")}
     small = replace(rungs["fast"], shrink=2)
     rungs["fast, half the resolution"] = small
     for count in range(num_cameras - 1, 0, -1):
@@ -98,10 +103,9 @@ class Governor:
         left = _USED * self._budget - self._debt - self._costs.base
         return int(min(max(left / max(self._costs.search, 1e-6), 0), self._most))
 
-    def spent(self, seconds: float, searched: int) -> bool:
-        """Tell what an update took; returns whether it was late."""
+    def spent(self, seconds: float, searched: int) -> None:
+        """Tell what an update took, and how many groups it looked for."""
         owed = self._debt + seconds - self._budget
         self._debt = min(max(owed, 0.0), _MOST_OWED * self._budget)
         error = seconds - searched * self._costs.search - self._costs.base
         self._costs = self._costs._replace(base=self._costs.base + _LEARNING * error)
-        return seconds > self._budget

@@ -59,6 +59,7 @@ def grow(
     step: Int[Array, ""],
     config: GrowConfig,
     coarseness: int = 1,
+    lost: Bool[Array, "k"] | None = None,
 ) -> tuple[TrackedScene, Pose]:
     """Fill empty slots with pixels that continue an object.
 
@@ -68,6 +69,7 @@ def grow(
         frame: what the cameras saw at this pose, with depth.
         step: any number that differs from frame to frame: it picks which pixels are looked at.
         coarseness: what is shown is of every so-manieth pixel.
+        lost: objects that nothing joins, for they are not where they are believed to be.
     """
     assert frame.depths is not None
     # Only pixels near an object can continue it; other places wait until one comes by.
@@ -89,6 +91,8 @@ def grow(
     points = jax.vmap(unproject)(pixels, depth, *views)
     label, distance = _nearest(points, color, scene, pose, config)
     wanted = (priority > 0) & (label > 0) & (distance < 1.0)
+    if lost is not None:
+        wanted &= ~lost[label - 1]
 
     # The n-th wanted pixel takes the n-th empty slot.
     slots = jnp.nonzero(empty_slots(scene), size=config.candidates, fill_value=scene.num_moving)[0]

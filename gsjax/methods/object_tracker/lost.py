@@ -46,7 +46,7 @@ def confidence(
             disagrees; what is nearer hides it, and says nothing.
         background: its depth where it is known, metres, else 0; of every so-manieth pixel. Where a camera
             measures just that, it does not see the group, however near: what slips into a wall would agree
-            with the wall.
+            with the wall. Of what lies flat on it, and is measured like it, that says nothing.
     """
     height, width = sight.pixels.shape[1:3]
 
@@ -68,7 +68,8 @@ def confidence(
             if background is not None:
                 stride = -(-width // background.shape[1])
                 known_depth = background[row // stride, column // stride]
-                other |= (known_depth > 0) & (jnp.abs(found[:, 3] - known_depth) < gap / 3)
+                raised = jnp.abs(z - known_depth) > gap / 3
+                other |= (known_depth > 0) & raised & (jnp.abs(found[:, 3] - known_depth) < gap / 3)
             alike = jnp.where(other, 0.0, alike)
         return (known & ~hidden) * alike, known & ~hidden, asked
 

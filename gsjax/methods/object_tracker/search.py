@@ -23,8 +23,9 @@ _LEAST_USUAL = 0.02  # a residual below this is noise
 _WHILE_LOST = 1.0  # what being lost counts beside a residual as usual
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 _OTHER_TURN = 0.14  # radians; what is turned by more than this is turned otherwise
-TELLS_TURN = 0.045  # another turn's residual must be higher by this; docs/results-hard-cases.md has both sides
-_FOUND_TURNED = 0.65  # share that agrees of what is found again, below which it may be turned otherwise
+_AGREES_AT_ALL = 0.5  # residual above which a group is hidden or elsewhere, and says nothing of its turn
+TELLS_TURN = 0.045  # lead that says how a group is turned; docs/results-hard-cases.md has both sides of it
+_FOUND_TURNED = 0.65  # share that must agree of what is found again for it to be turned as it was at first
 
 
 def widened(config: AlignConfig) -> AlignConfig:
@@ -46,7 +47,7 @@ class Sought(NamedTuple):
     found: Found
     again: Float[Array, "k 6"]  # where a lost group that was looked for may be instead
     looked_for: Bool[Array, "k"]  # everywhere
-    leads: Float[Array, "k"]  # by how much every other turn agrees worse; infinite where none was tried
+    leads: Float[Array, "k"]  # see `look_everywhere`; infinite where that is not known
 
 
 def judge(
@@ -110,12 +111,14 @@ def look_everywhere(
     config: AlignConfig,
     elsewhere: Float[Array, "n 6"],
 ) -> tuple[Found, Float[Array, ""]]:
-    """`known` of one group, or what agrees better; and by how much every other turn agrees worse.
+    """`known` of one group, or what agrees better; and its lead: how much worse every other turn agrees.
 
     Every start is aligned, and so is the best of `elsewhere`, for what has no texture to match. Then turns to
     all sides are tried from the best, because a knock changes a spin from one frame to the next, and a round
     thing may roll without its shape changing. Half the points choose among these; all of them have the last
-    word. A turn that ends up elsewhere and agrees nearly as well says that pictures do not tell the turn.
+    word. A turn that ends up elsewhere and agrees nearly as well says that pictures do not tell the turn. The
+    lead is a share of what agrees, for what is hidden agrees with no turn. Where little agrees, or no turn
+    was tried, it is infinite.
     """
     wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 
@@ -143,7 +146,8 @@ def look_everywhere(
     apart = jaxlie.SO3.exp(found.twists[3:]).inverse() @ jaxlie.SO3.exp(tried[:, 3:])
     others = jnp.linalg.norm(apart.log(), axis=-1) > _OTHER_TURN
     rival = jnp.min(jnp.where(others, residuals, jnp.inf))
-    return found, rival - disagreement(found.twists, half, center, sight, config)
+    own = disagreement(found.twists, half, center, sight, config)
+    return found, jnp.where(own < _AGREES_AT_ALL, (rival - own) / (1 - own), jnp.inf)
 
 
 class Watch(NamedTuple):
@@ -166,7 +170,7 @@ class Watch(NamedTuple):
         """One frame later.
 
         Args:
-            residuals: as in `Found`, of what was kept.
+            residuals: as in `Found`, where each group was aligned.
             sought: what the search found.
             shown: pixels that showed each group.
             sure: whether each group is where it is believed to be.
@@ -175,7 +179,7 @@ class Watch(NamedTuple):
         lost = jnp.where(self.lost, sure.shows < FOUND, sure.agrees < LOST)
         lost = jnp.where(sure.tells, lost, self.lost)
         as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
-        told = jnp.where(self.lost, as_at_first, self.turn_known & (sought.leads > TELLS_TURN))
+        told = jnp.where(self.lost, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
         return Watch(
             usual,
             jnp.where(sought.looked_for, 0.0, self.waited + 1.0),
@@ -246,7 +250,7 @@ def search(
         start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
         better, lead = look_everywhere(start, starts[:, group], own, center, sight, config, around)
         again = again.at[group].set(jnp.where(lost, better.twists, again[group]))
-        leads = leads.at[group].set(jnp.where(lost, leads[group], lead))
+        leads = leads.at[group].set(lead)
         better = keep_if(lost, known, better)
         return jax.tree.map(lambda all, one: all.at[group].set(one), found, better), again, leads
 

@@ -97,10 +97,11 @@ def _named(
     is believed to be need not hide it where it is.
     """
     groups = scene.labels[: scene.num_moving]
-    rows, real = first_members(groups, scene.num_objects, min(config.align.centers, scene.num_moving))
     # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
-    named = (with_normal | ~with_normal.any())[rows] & real
+    firsts = jnp.where(with_normal | ~with_normal.any(), groups, 0)
+    count = min(config.align.centers, scene.num_moving)
+    rows, named = first_members(firsts, scene.num_objects, count)
     own = (pose.means[rows.ravel()], groups[rows.ravel()])
     seen = seen_from(*own, last.shown, last.cameras, config.start.depth_gap)
     astray = (lost & with_normal.any())[own[1] - 1]

@@ -42,7 +42,7 @@ class Tracked(NamedTuple):
         seconds: from images in memory to the new state, re-planning included; compilation apart.
         compile_seconds: what compiling took before that; 0 but for the first frame and after re-plans.
         plan: the plan it ran under.
-        everywhere: how many groups it was allowed to look for everywhere.
+        everywhere: how many groups it looked for everywhere.
         chosen: the settings that were chosen for a budget; None without one.
     """
 
@@ -108,7 +108,8 @@ def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, r
         scene = keep_if(~info["skipped"], shift_background(scene, background), scene)
     info |= {"broken_pixels": broken, "joined": jnp.int32(0)}
     if config.grow.slots and frame.depths is not None:
-        grown = grow(scene, pose, shown, frame, state.count, config.grow, config.coarseness)
+        how = (config.grow, config.coarseness, info["lost"])
+        grown = grow(scene, pose, shown, frame, state.count, *how)
         scene, pose = keep_if(~info["skipped"], grown, (scene, pose))
         info["joined"] = config.grow.slots - empty_slots(scene).sum()
     return scene, pose, state, info
@@ -178,9 +179,10 @@ def track(
         (scene, pose, state, info), seconds, compile_seconds = run(
             scene, pose, state, frame, index, everywhere
         )
+        looked_for = int(info["looked_for"].sum())
         if governor is not None:
-            governor.spent(seconds, everywhere)
-        yield Tracked(scene, pose, state, info, seconds, compile_seconds, run.plan, everywhere, chosen)
+            governor.spent(seconds, looked_for)
+        yield Tracked(scene, pose, state, info, seconds, compile_seconds, run.plan, looked_for, chosen)
 
 
 class _Runner:
@@ -218,12 +220,14 @@ def _measured(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConf
     run, count = _Runner(scene, pose, first, config), scene.num_objects
     state = first_state(scene, pose, first, config, run.plan)
 
-    def median(everywhere: int) -> float:
-        return float(np.median([run(scene, pose, state, first, 0, everywhere)[1] for _ in range(_TRIALS)]))
+    def median(everywhere: int) -> tuple[float, int]:
+        """Seconds, and how many groups there were to look for."""
+        trials = [run(scene, pose, state, first, 0, everywhere) for _ in range(_TRIALS)]
+        return float(np.median([trial[1] for trial in trials])), int(trials[0][0][3]["looked_for"].sum())
 
     median(0)  # the first calls fault their memory in
-    base = median(0)
-    return Costs(base, max(median(count) - base, 0.0) / count)
+    base, (all_of_them, looked_for) = median(0)[0], median(count)
+    return Costs(base, max(all_of_them - base, 0.0) / max(looked_for, 1))
 
 
 def _check_alike(frame: Frame, first: Frame, index: int) -> None:
