@@ -24,7 +24,8 @@ from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene
 
 START = TrackerConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
-TURNED_DEG = 8.0  # an object that is turned otherwise by more than this
+TURNED_DEG = 8.0  # an object that is turned otherwise by more than this ...
+TURN_MM = 40.0  # ... may have its seen surface's centroid so far off, though its place is right
 FEWEST_PIXELS = 30  # of all cameras together, that show what can be followed
 MOST_SILENT = 3  # frames in a row in which an object may be astray before that is said
 
@@ -144,8 +145,8 @@ def judge(
     """
     there = pixels >= FEWEST_PIXELS
     astray = (errors > ASTRAY_MM) & there
-    wrongly = turns > TURNED_DEG  # which moves the centroid of what is seen of an object
-    told = said | (unsure & wrongly)
+    wrongly = turns > TURNED_DEG
+    told = said | (unsure & wrongly & (errors <= TURN_MM))
     silent = longest(astray & ~told)
     ends = bool(astray[there][-1])
     if not astray.any():

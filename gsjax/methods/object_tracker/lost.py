@@ -19,6 +19,7 @@ from gsjax.methods.object_tracker.points import Points, Sight, join, rotated
 
 _COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
 _FEWEST = 6.0  # points that can tell
+_FLAT = 0.9  # share of a group's points that lie in the background's surface where it is a card upon it
 LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
 
 LOST, FOUND = 0.35, 0.5
@@ -46,7 +47,7 @@ def confidence(
             disagrees; what is nearer hides it, and says nothing.
         background: its depth where it is known, metres, else 0; of every so-manieth pixel. Where a camera
             measures just that, it does not see the group, however near: what slips into a wall would agree
-            with the wall. Of what lies flat on it, and is measured like it, that says nothing.
+            with the wall. Of a card that lies flat on it with all it has, that says nothing.
     """
     height, width = sight.pixels.shape[1:3]
 
@@ -60,23 +61,28 @@ def confidence(
         squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / _COLOR_SCALE**2
         asked = seen > 0
         alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
+        of_a_card, flat = alike, jnp.zeros_like(inside)
         if sight.depths is not None:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
             asked &= (image[..., 3] > 0).any()  # a camera that failed is not asked
-            other = off > gap
+            of_a_card = alike = jnp.where(off > gap, 0.0, alike)
             if background is not None:
                 stride = -(-width // background.shape[1])
-                known_depth = background[row // stride, column // stride]
-                raised = jnp.abs(z - known_depth) > gap / 3
-                other |= (known_depth > 0) & raised & (jnp.abs(found[:, 3] - known_depth) < gap / 3)
-            alike = jnp.where(other, 0.0, alike)
-        return (known & ~hidden) * alike, known & ~hidden, asked
+                behind = background[row // stride, column // stride]
+                shows_it = (behind > 0) & (jnp.abs(found[:, 3] - behind) < gap / 3)
+                alike = jnp.where(shows_it, 0.0, alike)
+                flat = (behind > 0) & (jnp.abs(z - behind) < gap / 3)
+        clear = known & ~hidden
+        return clear * alike, clear * of_a_card, clear & flat, clear, asked
 
     over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, 0, None if background is None else 0))
     over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None))
     views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, background)
-    alike, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
+    alike, of_a_card, flat, clear, asked = (
+        a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views)
+    )
+    alike = jnp.where(flat > _FLAT * clear, of_a_card, alike)
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)
 
 
