@@ -89,7 +89,7 @@ def run(options: Options) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite)
         folder.write_config(options)
         source = _open(options, console)
-        log = Log(source)
+        log = Log(source.scene.label_ids, source.names)
         stopped = follow(options, source, log, console)
         found = log.metrics() | {
             "source": options.source,
@@ -154,9 +154,13 @@ def _open(options: Options, console: Console) -> Source:
 class Log:
     """What is kept of a stream: a few numbers an update, so that memory stays flat."""
 
-    def __init__(self, source: Source):
-        groups = source.scene.num_objects
-        self._names, self._ids = source.names, source.scene.label_ids
+    def __init__(self, label_ids: tuple[int, ...], names: dict[int, str]):
+        """
+        Args:
+            label_ids: the mask value of each group, the background's first.
+            names: of mask values.
+        """
+        self._ids, self._names = label_ids, names
         self.times: list[float] = []
         self.stamps: list[float] = []
         self.latencies: list[float] = []
@@ -166,7 +170,7 @@ class Log:
         self.poses: list[np.ndarray] = []
         self.lost: list[np.ndarray] = []
         self.turn_known: list[np.ndarray] = []
-        self._turned, self._centers = Rotation.identity(groups), None
+        self._turned, self._centers = Rotation.identity(len(label_ids) - 1), None
         self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
         self._memory_at = 0.0
 

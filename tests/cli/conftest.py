@@ -46,9 +46,10 @@ def standing_still(scene, first, frames, config, **how):
 
 @pytest.fixture
 def still(monkeypatch):
-    """Tracking is replaced by standing still, which compiles nothing."""
+    """Tracking is replaced by standing still, which compiles nothing; that is given."""
     monkeypatch.setattr(gsjax.cli.track, "start_scene", unfitted)
     monkeypatch.setattr(gsjax.cli.loop, "track", standing_still)
+    return standing_still
 
 
 @pytest.fixture

@@ -61,6 +61,31 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     with np.load(folder / "trajectory.npz") as stored:
         assert len(stored["times"]) == len(stored["centers"]) == frames["used"]
         np.testing.assert_allclose(stored["quats"], np.broadcast_to([1, 0, 0, 0], stored["quats"].shape))
+        assert stored["lost"][:, -1].all()
+        assert not stored["lost"][:, :-1].any()
+        assert not stored["turn_known"][:, 0].any()
+        assert stored["turn_known"][:, 1:].all()
+    code, said, _ = live(pristine, "--seconds", "0.5", "--cameras", "0", "1")
+    assert code == 2
+    assert "holds a finished run" in said
+
+
+def test_a_group_goes_where_it_is_carried_whatever_joins_it():
+    """Its own middle shifts with what joins: by 2 cm here, while it turns by 90 degrees and moves by 1 m."""
+    log = gsjax.cli.live.Log((0, 5), {})
+    still, turn = np.zeros((1, 6)), np.array([[1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]])
+    start, joined, moved = (np.array([[x, 0.0, 0.0]]) for x in (0.1, 0.12, 1.12))
+    places = [
+        log._carried(still, start),
+        log._carried(still, joined),
+        log._carried(turn, moved),
+    ]
+    np.testing.assert_allclose(places[0][0, :3], [0.1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(places[1], places[0], atol=1e-6)
+    np.testing.assert_allclose(
+        places[2][0, :3], [1.12, -0.02, 0], atol=1e-6
+    )  # 2 cm behind its middle, turned
+    np.testing.assert_allclose(places[2][0, 3:], np.sqrt([0.5, 0, 0, 0.5]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -68,6 +93,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     [
         ("camera:x", (), "expected camera:NUMBER"),
         ("camera:97", (), "replay a folder"),
+        ("camera:0", ("--cameras", "1"), "--cameras: is of recordings"),
         (None, ("--hz", "0"), "--hz: expected more than 0"),
         (None, ("--cameras", "9"), "has no camera 9"),
     ],

@@ -17,6 +17,7 @@ from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
+CAN, BALL = 3, 4
 QUICK = ("--tracker.start.iterations", "2")
 CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 
@@ -181,6 +182,39 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert set(found["iou"]) >= {"robot", "carton"}
     assert found["objects"]["carton"]["point_error_mm"] is not None
+
+
+def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
+    pristine, tmp_path, gsjax_track, still, monkeypatch
+):
+    """The can is lost in update 1 alone, and from update 2 on it is not known how the ball is turned."""
+    ids: list[int] = []
+
+    def flagged(scene, first, frames, config, **how):
+        ids[:] = scene.label_ids[1:]
+        for t, update in enumerate(still(scene, first, frames, config), 1):
+            lost, known = np.zeros(len(ids), bool), np.ones(len(ids), bool)
+            lost[ids.index(CAN)] = t == 1
+            known[ids.index(BALL)] = t < 2
+            yield update._replace(info=update.info | {"lost": lost, "turn_known": known})
+
+    monkeypatch.setattr(gsjax.cli.loop, "track", flagged)
+    assert gsjax_track(pristine, "--cameras", "1")[0] == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    notes = [note for note in found["notes"] if "lost" in note]
+    assert [note.split(":")[0] for note in notes] == ["can", "ball"]
+    assert "lost in 1 frames, from 1 to 1" in notes[0]
+    assert "from frame 2 on it is not known how it is turned" in notes[1]
+    objects = found["objects"]
+    assert {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]} == {"can": 1}
+    unknown = {name: o["turn_unknown_from"] for name, o in objects.items() if o["turn_unknown_from"]}
+    assert unknown == {"ball": 2}
+    with np.load(tmp_path / "run" / "trajectory.npz") as stored:
+        objects = stored["label_ids"][1:].tolist()
+        frames, of = np.nonzero(stored["lost"])
+        assert (frames.tolist(), [objects[k] for k in of]) == ([1], [CAN])
+        frames, of = np.nonzero(~stored["turn_known"])
+        assert (frames.tolist(), [objects[k] for k in of]) == ([2, 3], [BALL, BALL])
 
 
 def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):

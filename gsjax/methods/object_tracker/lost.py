@@ -79,9 +79,7 @@ def confidence(
     over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, 0, None if background is None else 0))
     over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None))
     views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, background)
-    alike, of_a_card, flat, clear, asked = (
-        a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views)
-    )
+    alike, of_a_card, flat, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
     alike = jnp.where(flat > _FLAT * clear, of_a_card, alike)
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)
 
