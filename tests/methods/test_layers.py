@@ -79,13 +79,13 @@ def test_what_stands_in_front_hides_what_moves(both, started, plans):
 def test_the_backdrop_is_drawn_again_only_when_a_camera_moves(both, started, plans, table):
     _, _, backdrop = both
     cameras = table()[1][0].cameras
-    marked = backdrop._replace(colors=backdrop.colors + 7.0)  # tells a kept one from one drawn anew
+    marked = backdrop._replace(depths=backdrop.depths + 7.0)  # tells a kept one from one drawn anew
     kept, needed = keep_backdrop(marked, started, cameras, plans[1])
-    np.testing.assert_array_equal(kept.colors, marked.colors)
+    np.testing.assert_array_equal(kept.depths, marked.depths)
     assert needed == 0
     moved: Camera = eqx.tree_at(lambda c: c.viewmat, cameras, cameras.viewmat.at[0, 0, 3].add(0.01))
     drawn, needed = keep_backdrop(marked, started, moved, plans[1])
     expected: Backdrop = draw_backdrop(started, moved, plans[1])[0]
-    np.testing.assert_allclose(drawn.colors, expected.colors, atol=1e-6)
+    np.testing.assert_allclose(drawn.depths, expected.depths, atol=1e-6)
     np.testing.assert_array_equal(drawn.cameras.viewmat, moved.viewmat)
     assert needed > 0

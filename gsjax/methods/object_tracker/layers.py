@@ -35,7 +35,6 @@ class Backdrop(NamedTuple):
     """The background alone, and the cameras that it was drawn for."""
 
     cameras: Camera
-    colors: Float[Array, "c height width 3"]
     depths: Float[Array, "c height width"]
     alphas: Float[Array, "c height width"]
 
@@ -92,7 +91,7 @@ def reduced(cameras: Camera, coarseness: int) -> Camera:
 def draw_backdrop(scene: TrackedScene, cameras: Camera, plan: Plan) -> tuple[Backdrop, Int[Array, ""]]:
     """The background in these cameras, and what capacity that needed."""
     drawn = render(background_of(scene), cameras, plan)
-    return Backdrop(cameras, drawn.colors, drawn.depths, drawn.alphas), drawn.meta.needed.max()
+    return Backdrop(cameras, drawn.depths, drawn.alphas), drawn.meta.needed.max()
 
 
 def keep_backdrop(
