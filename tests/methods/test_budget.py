@@ -101,6 +101,23 @@ def test_a_budget_of_nothing_is_refused(table, started):
         next(track(started, frames[0], frames[1:], budget_ms=-1))
 
 
+def test_what_updates_cost_is_measured_with_the_second_frame(table, started, monkeypatch):
+    """Where cameras move, updates to the first one again would draw no background."""
+    _, frames, _ = table()
+
+    class Measured(Exception):
+        pass
+
+    def measured(scene, pose, first, second, config):
+        raise Measured(second)
+
+    monkeypatch.setattr("gsjax.methods.object_tracker.tracking._measured", measured)
+    for following, expected in ((frames[1:], frames[1]), ([], frames[0])):
+        with pytest.raises(Measured) as seen:
+            next(track(started, frames[0], following, budget_ms=33.0))
+        assert seen.value.args[0] is expected
+
+
 @pytest.mark.slow
 def test_objects_are_followed_within_a_generous_budget(table, started, quick, centroid_errors):
     sequence, frames, _ = table()

@@ -1,5 +1,6 @@
 """The host's side of tracking: compile once, feed frames, re-plan when a plan has become too small."""
 
+import itertools
 import time
 import warnings
 from collections.abc import Iterable, Iterator
@@ -166,7 +167,12 @@ def track(
     count, governor = scene.num_objects, None
     if budget_ms is not None:
         if chosen is None:
-            measure = partial(_measured, scene, pose, first)
+            frames = iter(frames)
+            ahead = list(itertools.islice(frames, 1))
+            frames = itertools.chain(ahead, frames)
+            second = [*ahead, first][0]
+            _check_alike(second, first, 1)
+            measure = partial(_measured, scene, pose, first, second)
             chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
         config, governor = chosen.config, Governor(budget_ms / 1e3, chosen.costs, count)
     run = _Runner(scene, pose, first, config)
@@ -215,14 +221,16 @@ class _Runner:
             self.plan = self.plan.grown(info["needed"], self._config.headroom)
 
 
-def _measured(scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig) -> Costs:
-    """What updates cost: on the first frame again, which changes nothing."""
+def _measured(
+    scene: TrackedScene, pose: Pose, first: Frame, second: Frame, config: TrackerConfig
+) -> Costs:
+    """What updates cost: those to the second frame, which shows the background anew where cameras move."""
     run, count = _Runner(scene, pose, first, config), scene.num_objects
     state = first_state(scene, pose, first, config, run.plan)
 
     def median(everywhere: int) -> tuple[float, int]:
         """Seconds, and how many groups there were to look for."""
-        trials = [run(scene, pose, state, first, 0, everywhere) for _ in range(_TRIALS)]
+        trials = [run(scene, pose, state, second, 0, everywhere) for _ in range(_TRIALS)]
         return float(np.median([trial[1] for trial in trials])), int(trials[0][0][3]["looked_for"].sum())
 
     median(0)  # the first calls fault their memory in
