@@ -19,13 +19,12 @@ from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
 from gsjax.geometry.cameras import pixel_grid, unproject
-from gsjax.methods.object_tracker.align import align
+from gsjax.methods.object_tracker.align import align, widened
 from gsjax.methods.object_tracker.config import AlignConfig, RefineConfig
-from gsjax.methods.object_tracker.lost import Missing
 from gsjax.methods.object_tracker.motion import Motion, place
 from gsjax.methods.object_tracker.points import sight_of
 from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
-from gsjax.methods.object_tracker.search import first_watch, search, widened
+from gsjax.methods.object_tracker.search import first_watch, search
 from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.optim.step import Step
@@ -199,9 +198,8 @@ def aligned(start, points, centers, frame, config=ALIGN):
 def searched(start, points, centers, frame, config=ALIGN):
     """The same, and then every group is looked for all around."""
     sight, count = sight_of(frame, config.shading), len(centers)
-    nobody = Missing(points, jax.tree.map(lambda a: a[0], points), jnp.int32(0))  # nothing is lost
-    seen = (config, first_watch(count), jnp.ones(count, bool), jnp.int32(count), nobody)
-    return search(start[None], points, centers, sight, *seen)[0].twists
+    seen = (config, first_watch(jnp.ones(count)), jnp.ones(count, bool), jnp.int32(count))
+    return search(start[None], points, centers, sight, *seen).found.twists
 
 
 def direct(update: Update, counts: list[int], find: Callable = aligned) -> Trace:

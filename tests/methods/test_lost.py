@@ -5,18 +5,30 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsjax.geometry.cameras import camera_centers
 from gsjax.methods.object_tracker import GrowConfig, RefineConfig, first_pose, track
 from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.firsts import all_facing, as_facing, as_last_seen, firsts_of
 from gsjax.methods.object_tracker.layers import Shown
-from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, guesses, with_strangers
+from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, is_found
 from gsjax.methods.object_tracker.motion import facing
 from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, sight_of
+from gsjax.methods.object_tracker.recover import (
+    Around,
+    Elsewhere,
+    explained_by,
+    guesses,
+    recover,
+    since,
+    with_strangers,
+)
 from gsjax.methods.object_tracker.search import coarse_shifts
-from gsjax.methods.object_tracker.tracker import _Last, _named
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -92,20 +104,24 @@ def test_a_card_on_a_table_is_not_lost(carton):
     assert confidence(points, other, GAP, under).agrees[0] < LOST
 
 
-def test_a_lost_group_is_looked_for_with_all_that_faces_a_camera(table, started, quick):
-    """Where it is believed to be it may be hidden; only what cameras saw of it counts for the others."""
+def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera(table, started, quick):
+    """Where it is believed to be it may be hidden; of others, what cameras saw last counts."""
     _, frames, _ = table()
     pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
+    group = np.asarray(started.labels[: started.num_moving])
+    config = replace(quick.align, centers=int(np.bincount(group).max()))
+    firsts = firsts_of(started, pose, config)
     nothing = jnp.zeros((2, cameras.height, cameras.width))
-    last = _Last(Shown(nothing.astype(int), nothing, nothing > 0), cameras, None, None)
-    lost = jnp.zeros(count, bool).at[0].set(True)
-    mine = np.asarray(started.labels[: started.num_moving]) == 1
-    config = replace(quick, align=replace(quick.align, centers=int(mine.sum())))
-    points = _named(started, pose, last, lost, config)
-    assert not points.seen[1:].any()
+    unseen = Shown(nothing.astype(int), nothing, nothing > 0)
+    assert not as_last_seen(firsts, unseen, cameras, GAP).seen.any()
+    sight = sight_of(frames[0], config.shading)
+    asked = all_facing(firsts, jnp.zeros((count, 6)), jnp.zeros((count, 3)), sight)
     faces = facing(started, pose, camera_centers(cameras.viewmat))[:, : started.num_moving] > 0.5
-    assert points.seen[0].sum() == faces[:, mine].sum() > 10
-    assert not _named(started, pose, last, ~lost & lost, config).seen.any()
+    for k in range(count):
+        np.testing.assert_array_equal(asked.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
+    about = jnp.array([0.0, 0.0, 0.1])
+    around = as_facing(jax.tree.map(lambda a: a[0], firsts), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight)
+    assert float((around.seen != asked.seen[0]).sum()) > 0  # what turns away faces them no more
 
 
 def test_without_depth_colour_alone_decides(carton):
@@ -130,25 +146,102 @@ def test_strangers_are_nearer_than_what_is_modelled(carton):
     assert with_strangers(shown, blind, 1, GAP, GAP, 1) is shown
 
 
-def test_guesses_bring_points_to_strangers_or_stay_near(carton):
-    _, points = carton
-    one = jax.tree.map(lambda a: a[0], points)
-    center = jnp.array([0.1, 0.0, 0.1])
-    strangers = one._replace(means=one.means + jnp.array([0.5, 0.3, 0.0])[:, None])
-    shifts = coarse_shifts(AlignConfig())
-    drawn = [guesses(jax.random.key(seed), shifts, one, center, strangers) for seed in (0, 0, 1)]
+@pytest.fixture(scope="module")
+def one(table, started, quick):
+    """(the carton's first Gaussians, their centre, what is seen then, which pixels show the carton)."""
+    sequence, (frame, *_), _ = table()
+    firsts = firsts_of(started, first_pose(started), quick.align)
+    mine = jax.tree.map(lambda a: a[started.label_ids.index(CARTON) - 1], firsts)
+    center = (mine.means * mine.real).sum(-1) / mine.real.sum()
+    shown = jnp.stack([sequence.mask(0, c) == CARTON for c in range(2)])
+    return mine, center, sight_of(frame, quick.align.shading), shown
+
+
+def strangers_of(sight, strange) -> Points:
+    found = pixels_of_groups(sight, strange.astype(jnp.int32), sight.depths, 1, AlignConfig())
+    return jax.tree.map(lambda a: a[0], found)
+
+
+def test_guesses_bring_points_to_strangers_or_stay_near(one):
+    firsts, center, sight, shown = one
+    config, hunch = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
+    strangers, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
+
+    def draw(seed, strangers=strangers, config=config):
+        return guesses(jax.random.key(seed), shifts, firsts, center, strangers, hunch, config)
+
+    drawn = [draw(0), draw(0), draw(1)]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert np.abs(drawn[0] - drawn[2]).max() > 0.1
-    np.testing.assert_array_equal(drawn[0][::2, :3], shifts[::2, :3])
+    np.testing.assert_allclose(drawn[0][::4, :3], hunch[:3] + shifts[::4, :3] / 2, atol=1e-6)
+    np.testing.assert_array_equal(drawn[0][2::4, :3], shifts[2::4, :3])
     places = np.asarray(strangers.means).transpose(0, 2, 1)[np.asarray(strangers.seen) > 0]
     for twist in drawn[0][1:20:2]:
-        reached = np.asarray(carry(one, twist, center).means).transpose(0, 2, 1)[np.asarray(one.seen) > 0]
-        apart = np.linalg.norm(reached[:, None] - places, axis=-1)
-        assert apart.min() < 1e-5
+        reached = np.asarray(as_facing(firsts, twist, center, sight).means)[0].T[np.asarray(firsts.real)]
+        assert np.linalg.norm(reached[:, None] - places, axis=-1).min() < 1e-5
     nowhere = strangers._replace(seen=jnp.zeros_like(strangers.seen))
-    np.testing.assert_array_equal(
-        guesses(jax.random.key(0), shifts, one, center, nowhere)[:, :3], shifts[:, :3]
+    np.testing.assert_array_equal(draw(0, nowhere)[1::2, :3], shifts[1::2, :3])
+    unturned = draw(0, config=replace(config, max_turn=0.0))
+    np.testing.assert_array_equal(unturned[1:4, 3:], 0)
+    np.testing.assert_allclose(
+        unturned[::4, 3:], jnp.broadcast_to(hunch[3:], unturned[::4, 3:].shape), atol=1e-6
     )
+
+
+def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one):
+    """From 15 cm and 57 degrees off; each frame goes on from the last one's hunch."""
+    firsts, center, sight, shown = one
+    off = jnp.array([0.1, -0.1, 0.05, 0.0, 0.0, 1.0])
+    lost = firsts._replace(
+        means=carry(Points(firsts.means, firsts.tones, firsts.real), off, center).means,
+        normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), firsts.normals),
+    )
+    others, config = jnp.where(shown, 0.0, sight.depths), AlignConfig()
+    strangers, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
+    look = jax.jit(
+        lambda seed, hunch, around: recover(
+            jax.random.key(seed), lost, center + off[:3], hunch, around, config, GAP
+        )
+    )
+
+    def after(frames, explained):
+        found = Elsewhere(jnp.zeros(6), None)
+        for seed in range(frames):
+            found = look(seed, found.twists, Around(sight, explained, strangers, shifts))
+        return found
+
+    found = after(8, others)
+    back = as_facing(lost, found.twists, center + off[:3], sight).means[0]
+    assert float(jnp.linalg.norm(back - firsts.means, axis=0)[firsts.real].max()) < 0.01
+    showed = confidence(
+        jax.tree.map(lambda a: a[None], as_facing(firsts, 0 * off, center, sight)), sight, GAP
+    ).shows
+    assert is_found(jax.tree.map(lambda a: a[None], found.sure), showed)[0]
+    nobody = after(3, sight.depths)  # all that is measured is something else
+    assert not is_found(jax.tree.map(lambda a: a[None], nobody.sure), showed)[0]
+
+
+@given(st.integers(0, 2**31))
+def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
+    twists = 0.8 * jax.random.normal(jax.random.key(seed), (2, 6))
+    points = Points(
+        jax.random.normal(jax.random.key(seed + 1), (1, 3, 5)), jnp.zeros((1, 3, 5)), jnp.ones((1, 5))
+    )
+    center = jnp.array([0.3, -0.2, 0.5])
+    there = carry(points, twists[0], center).means
+    moved = carry(points, twists[1], center)
+    again = carry(moved, since(twists[0], twists[1]), center + twists[1, :3]).means
+    np.testing.assert_allclose(again, there, atol=1e-4)
+
+
+def test_what_is_known_to_be_there_is_the_sound_groups_before_the_background(carton):
+    sight, _ = carton
+    labels = jnp.zeros(sight.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
+    shown = Shown(labels, jnp.full(labels.shape, 0.7), labels > 0)
+    behind = jnp.full(labels.shape, 0.9)
+    found = explained_by(shown, jnp.array([False, True]), behind)
+    np.testing.assert_allclose(found[0, 0, :3], [0.9, 0.7, 0.9])
+    np.testing.assert_allclose(explained_by(shown, jnp.array([False, True]), None)[0, 0, :3], [0.0, 0.7, 0.0])
 
 
 @pytest.mark.parametrize("redraw", ["moving", "all"])

@@ -11,6 +11,7 @@ one, and depth pulls from further away than colour does, so groups arrive, large
 rendering can finish. Everything here is of one group and one start; `jax.vmap` makes it many.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,12 @@ from jaxtyping import Array, Bool, Float
 
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.points import Points, Sight, carry, rotated
+
+
+def widened(config: AlignConfig) -> AlignConfig:
+    """Wider scales of the residuals, which listen to more of what disagrees: for starts that are far off."""
+    factor = config.widen
+    return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
 
 
 class Read(NamedTuple):
@@ -171,6 +178,16 @@ def align(
     start = (jax.tree.map(jnp.asarray, nothing), twist, jnp.asarray(1e-2, twist.dtype))
     (best, *_), _ = jax.lax.scan(iterate, start, None, length=config.iterations + 1)
     return best.twist
+
+
+def turned(
+    twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
+) -> Float[Array, "h 6"]:
+    """The twist itself, and after a turn to either side by each angle about each of the axes."""
+    steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)])
+    steps = jnp.concatenate([jnp.zeros_like(steps[:1]), steps])
+    rotations = (jaxlie.SO3.exp(twist[3:]) @ jaxlie.SO3.exp(steps)).log()
+    return jnp.concatenate([jnp.broadcast_to(twist[:3], rotations.shape), rotations], axis=-1)
 
 
 def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:

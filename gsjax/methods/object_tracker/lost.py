@@ -1,30 +1,26 @@
-"""What is lost: telling that it is, and where to look for it.
+"""What is lost: telling that it is.
 
 Residuals of the alignment say when a group gets lost, but not that it is: pixels of the last frame are taken
 from where the group was believed to be, and agree again with whatever stands there. The Gaussians of the
 first frame do not: where the group is not, cameras see past them, or other colours. So they decide whether it
-is lost, and whether it is found again; it is looked for near by, and at pixels that no group explains.
+is lost, and whether it is found again (see `recover`).
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float
 
-from gsjax.methods.object_tracker.layers import Shown
-from gsjax.methods.object_tracker.points import Points, Sight, join, rotated
+from gsjax.methods.object_tracker.points import Points, Sight, rotated
 
-_COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
+COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
 _FEWEST = 6.0  # points that can tell
 _FLAT = 0.9  # share of a group's points that lie in the background's surface where it is a card upon it
-LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
 
-LOST, FOUND = 0.35, 0.5
-"""Below the one a group is lost, and above the other a lost one is found: see `Confidence`.
-docs/results-hard-cases.md has where sound and lost ones lie."""
+LOST, DOUBTFUL, FOUND = 0.35, 0.6, 0.6
+"""Shares of what can be seen of a group that look as at first: below the first it is lost, below the second
+it may be elsewhere, above the third it is found there. docs/results-hard-cases.md has where they lie."""
 
 
 class Confidence(NamedTuple):
@@ -58,7 +54,7 @@ def confidence(
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
         row, column = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
         found = image[row, column]
-        squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / _COLOR_SCALE**2
+        squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / COLOR_SCALE**2
         asked = seen > 0
         alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
         of_a_card, flat = alike, jnp.zeros_like(inside)
@@ -84,79 +80,6 @@ def confidence(
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)
 
 
-class Missing(NamedTuple):
-    """What a lost group is looked for with."""
-
-    centers: Points  # of each group: its Gaussians of the first frame
-    strangers: Points  # pixels of the last frame that no group explains
-    count: Int[Array, ""]  # frames so far, from which chance is drawn: a recording gives the same run again
-
-
-def alone(centers: Points, points: Points) -> Points:
-    """As many as `points`, of which only the centres count: pixels show what a lost group was taken for.
-
-    The centres stand where every fourth or every other point is chosen first.
-    """
-    others = jax.tree.map(lambda a: a[..., centers.seen.shape[-1] :], points)
-    both = join(centers, others._replace(seen=jnp.zeros_like(others.seen)))
-    count = both.seen.shape[-1]
-    places = np.concatenate([np.arange(0, count, 4), np.arange(2, count, 4), np.arange(1, count, 2)])
-    return jax.tree.map(lambda a: a[..., np.argsort(places)], both)
-
-
-def with_strangers(
-    shown: Shown, sight: Sight, num_groups: int, gap: float, thickness: float, coarseness: int
-) -> Shown:
-    """`shown`, where pixels that no group explains have the label num_groups + 1 and their measured depth.
-
-    Args:
-        gap: what is measured this much nearer than the background is not explained by it, metres ...
-        thickness: ... and this much nearer than a group, metres.
-        coarseness: `shown` has every so-manieth pixel.
-    """
-    if sight.depths is None:
-        return shown
-    measured = sight.depths[:, ::coarseness, ::coarseness]
-    nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
-    strange = (measured > 0) & shown.covered & (measured < nearest)
-    labels = jnp.where(strange, num_groups + 1, shown.labels)
-    return shown._replace(labels=labels, depths=jnp.where(strange, measured, shown.depths))
-
-
-def guesses(
-    key: Key[Array, ""],
-    shifts: Float[Array, "h 6"],
-    points: Points,
-    center: Float[Array, "3"],
-    strangers: Points,
-    max_turn: float = LARGEST_TURN,
-) -> Float[Array, "h 6"]:
-    """Where a lost group may be: turned at random, every other time near by, and else at strange pixels.
-
-    Args:
-        shifts: what is tried near by.
-        points: of the group; those that count nothing are left out. Those of about a pixel's colour are
-            brought to it.
-        center: what the group turns about.
-        strangers: pixels that no group explains, as each camera sees them.
-        max_turn: radians.
-    """
-    count = len(shifts)
-    place, pair, axis, angle = jax.random.split(key, 4)
-    to, colors, there = _of_all_cameras(strangers)
-    own, tones, seen = _of_all_cameras(points)
-    chosen = jax.random.categorical(place, jnp.where(there > 0, 0.0, -jnp.inf), shape=(count,))
-    apart = jnp.sum((colors[:, chosen, None] - tones[:, None]) ** 2, axis=0) / _COLOR_SCALE**2
-    paired = jax.random.categorical(pair, jnp.where(seen > 0, -apart, -jnp.inf))
-    turns = jax.random.normal(axis, (count, 3))
-    turns /= jnp.linalg.norm(turns, axis=1, keepdims=True)
-    turns *= max_turn * jax.random.uniform(angle, (count, 1))
-    offsets = own[:, paired].T - center
-    away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
-    strange = (jnp.arange(count) % 2 == 1) & (there.sum() > 0)
-    return jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
-
-
-def _of_all_cameras(points: Points) -> Points:
-    """One group's points in one row: [3, c p], and `seen` [c p]."""
-    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1), points)
+def is_found(sure: Confidence, showed: Float[Array, "k"]) -> Bool[Array, "k"]:
+    """Whether a lost group is where `sure` is of; `showed` is its `shows` of the first frame."""
+    return sure.tells & (sure.agrees > FOUND) & (sure.shows > FOUND * showed)

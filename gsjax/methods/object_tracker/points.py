@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from gsjax.geometry.cameras import Camera, pixel_grid, unproject
 from gsjax.methods.object_tracker.config import AlignConfig
@@ -67,7 +67,7 @@ def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
     return logs - (1 - shading) * mean
 
 
-def of_groups(chosen: Bool[Array, "k"], a: Float[Array, "k *d"], b: Float[Array, "k *d"]):
+def of_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[Array, "k *d"]):
     """The rows of `a` for the chosen groups, and of `b` for the others."""
     return jnp.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 

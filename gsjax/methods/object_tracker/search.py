@@ -4,7 +4,7 @@ Every group goes on from the better of its starts. That loses what jumps or chan
 agrees badly; so the groups that agree worst, as many as there is time for, are looked for everywhere around.
 """
 
-from dataclasses import replace
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,25 +13,19 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.methods.object_tracker.align import align, disagreement
+from gsjax.methods.object_tracker.align import align, disagreement, turned, widened
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.lost import FOUND, LARGEST_TURN, LOST, Confidence, Missing, alone, guesses
+from gsjax.methods.object_tracker.lost import DOUBTFUL, LOST, Confidence, is_found
 from gsjax.methods.object_tracker.points import Points, Sight
-from gsjax.optim.step import keep_if
+from gsjax.methods.object_tracker.recover import Elsewhere
 
 _LEAST_USUAL = 0.02  # a residual below this is noise
-_WHILE_LOST = 1.0  # what being lost counts beside a residual as usual
+_IN_DOUBT = 0.5  # what being lost, or hardly looking as at first, counts beside a residual as usual
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 _OTHER_TURN = 0.14  # radians; what is turned by more than this is turned otherwise
 _AGREES_AT_ALL = 0.5  # residual above which a group is hidden or elsewhere, and says nothing of its turn
 TELLS_TURN = 0.045  # lead that says how a group is turned; docs/results-hard-cases.md has both sides of it
 _FOUND_TURNED = 0.65  # share that must agree of what is found again for it to be turned as it was at first
-
-
-def widened(config: AlignConfig) -> AlignConfig:
-    """Wider scales of the residuals, which listen to more of what disagrees: for starts that are far off."""
-    factor = config.widen
-    return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
 
 
 class Found(NamedTuple):
@@ -45,7 +39,7 @@ class Sought(NamedTuple):
     """What a search found."""
 
     found: Found
-    again: Float[Array, "k 6"]  # where a lost group that was looked for may be instead
+    again: Elsewhere  # where each group that is astray and was looked for may be instead
     looked_for: Bool[Array, "k"]  # everywhere
     leads: Float[Array, "k"]  # see `look_everywhere`; infinite where that is not known
 
@@ -70,16 +64,6 @@ def least(residuals: Float[Array, "h *k"], twists: Float[Array, "h *k 6"]) -> Fo
     return Found(take(twists, best[..., None], axis=0)[0], take(residuals, best, axis=0)[0])
 
 
-def turned(
-    twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
-) -> Float[Array, "h 6"]:
-    """The twist itself, and after a turn to either side by each angle about each of the axes."""
-    steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)])
-    steps = jnp.concatenate([jnp.zeros_like(steps[:1]), steps])
-    rotations = (jaxlie.SO3.exp(twist[3:]) @ jaxlie.SO3.exp(steps)).log()
-    return jnp.concatenate([jnp.broadcast_to(twist[:3], rotations.shape), rotations], axis=-1)
-
-
 def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Axes of a group, one a row: a bottle rolls about its own, whichever way it lies."""
     away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
@@ -94,9 +78,9 @@ def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
     return grid[np.linalg.norm(grid, axis=1) <= radius]
 
 
-def coarse_shifts(config: AlignConfig) -> Float[Array, "n 6"]:
+def coarse_shifts(config: AlignConfig, sight: Sight) -> Float[Array, "n 6"]:
     """Twists that shift to all sides, for depth to choose from: by colour a plain thing slides about."""
-    if not config.reach:
+    if not config.reach or sight.depths is None:
         return jnp.zeros((0, 6))
     shifts = jnp.asarray(ball(config.reach, config.spacing), float)
     return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
@@ -109,16 +93,16 @@ def look_everywhere(
     center: Float[Array, "3"],
     sight: Sight,
     config: AlignConfig,
-    elsewhere: Float[Array, "n 6"],
+    shifts: Float[Array, "n 6"],
 ) -> tuple[Found, Float[Array, ""]]:
     """`known` of one group, or what agrees better; and its lead: how much worse every other turn agrees.
 
-    Every start is aligned, and so is the best of `elsewhere`, for what has no texture to match. Then turns to
-    all sides are tried from the best, because a knock changes a spin from one frame to the next, and a round
-    thing may roll without its shape changing. Half the points choose among these; all of them have the last
-    word. A turn that ends up elsewhere and agrees nearly as well says that pictures do not tell the turn. The
-    lead is a share of what agrees, for what is hidden agrees with no turn. Where little agrees, or no turn
-    was tried, it is infinite.
+    Every start is aligned, and so is the best shift of each, for what has no texture to match, or is pushed;
+    one shift is tried from one start, the next from another. Then turns to all sides are tried from the best,
+    because a knock changes a spin from one frame to the next, and a round thing may roll without its shape
+    changing. Half the points choose among these; all of them have the last word. A turn that ends elsewhere
+    and agrees nearly as well says that pictures do not tell the turn. The lead is a share of what agrees, for
+    what is hidden agrees with no turn. Where little agrees, or no turn was tried, it is infinite.
     """
     wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 
@@ -130,11 +114,13 @@ def look_everywhere(
         over_twists = jax.vmap(align, in_axes=(0, None, None, None, None))
         return over_twists(twists, half, center, sight, wide)
 
-    starts = jnp.concatenate([starts, known.twists[None]])
-    if len(elsewhere):
-        few = jax.tree.map(lambda a: a[..., ::4], points)
-        starts = jnp.concatenate([starts, least(judged(elsewhere, few, wide), elsewhere).twists[None]])
-    tried = aligned(starts)
+    tried = jnp.concatenate([starts, known.twists[None]])
+    if len(shifts):
+        few, count = jax.tree.map(lambda a: a[..., ::4], points), len(starts)
+        shifted = [starts[i] + shifts[i::count] for i in range(count)]
+        parts = jnp.split(judged(jnp.concatenate(shifted), few, wide), np.cumsum([*map(len, shifted)])[:-1])
+        tried = jnp.stack([*tried, *(least(*part).twists for part in zip(parts, shifted, strict=True))])
+    tried = aligned(tried)
     residuals = judged(tried, half, config)
     if config.max_turn and config.turns:
         axes = principal_axes(points, center)
@@ -158,7 +144,13 @@ class Watch(NamedTuple):
     largest: Float[Array, "k"]  # pixels that showed it when it was seen best, all cameras together
     agrees: Float[Array, "k"]  # how much of what was last seen of it looked as at first, 0 to 1
     lost: Bool[Array, "k"]
+    showed: Float[Array, "k"]  # share of it that was seen in the first frame, of what faced the cameras
     turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
+
+    @property
+    def doubtful(self) -> Bool[Array, "k"]:
+        """Whether it may be elsewhere."""
+        return self.lost | (self.agrees < DOUBTFUL)
 
     def after(
         self,
@@ -176,7 +168,7 @@ class Watch(NamedTuple):
             sure: whether each group is where it is believed to be.
         """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
-        lost = jnp.where(self.lost, sure.shows < FOUND, sure.agrees < LOST)
+        lost = jnp.where(self.lost, ~is_found(sure, self.showed), sure.agrees < LOST)
         lost = jnp.where(sure.tells, lost, self.lost)
         as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
         told = jnp.where(self.lost, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
@@ -186,14 +178,15 @@ class Watch(NamedTuple):
             jnp.maximum(self.largest, shown),
             jnp.where(sure.tells, sure.agrees, self.agrees),
             lost,
+            self.showed,
             told & ~lost,
         )
 
 
-def first_watch(num_groups: int) -> Watch:
-    """Before the first frame."""
-    nothing, certain = jnp.zeros(num_groups), jnp.ones(num_groups)
-    return Watch(jnp.full(num_groups, 0.1), nothing, nothing, certain, nothing > 0, certain > 0)
+def first_watch(showed: Float[Array, "k"]) -> Watch:
+    """Before the first frame, of which `showed` says how much of each group was seen."""
+    nothing, certain = jnp.zeros_like(showed), jnp.ones_like(showed)
+    return Watch(jnp.full_like(showed, 0.1), nothing, nothing, certain, nothing > 0, showed, certain > 0)
 
 
 def search(
@@ -205,7 +198,8 @@ def search(
     watch: Watch,
     visible: Bool[Array, "k"],
     everywhere: Int[Array, ""],
-    missing: Missing,
+    astray: Bool[Array, "k"] | None = None,
+    recover: Callable[[Int[Array, ""]], Elsewhere] | None = None,
 ) -> Sought:
     """The twist of each group that agrees best with the images, no worse than any start.
 
@@ -215,10 +209,11 @@ def search(
         centers: what groups turn about.
         sight: what the cameras see now.
         watch: how groups have been followed so far.
-        visible: groups that a camera sees; no other is looked for.
+        visible: groups that a camera sees; of others only what is lost is looked for.
         everywhere: how many groups are looked for everywhere, those first that agree worst beside what is
             usual for them, or that have waited longest.
-        missing: what lost ones are looked for with.
+        astray: groups that are lost, or may be: they are recovered where others are followed; None: nobody.
+        recover: says where the astray group of this index may be instead.
     """
     judged = jax.vmap(judge, in_axes=(0, None, None, None, None))
     best = least(judged(starts, points, centers, sight, config), starts)
@@ -228,33 +223,36 @@ def search(
     residuals = jnp.stack([best.residuals, judge(aligned, points, centers, sight, config)])
     found = least(residuals, jnp.stack([best.twists, aligned]))
 
-    shifts = coarse_shifts(config) if sight.depths is not None else jnp.zeros((0, 6))
+    shifts = coarse_shifts(config, sight)
 
-    urgency = found.residuals / watch.usual + _PATIENCE * watch.waited + _WHILE_LOST * watch.lost
-    urgency = jnp.where(visible, urgency, -jnp.inf)
-    order = jnp.argsort(-urgency)
-    count = jnp.minimum(everywhere, visible.sum())
+    urgency = found.residuals / watch.usual + _PATIENCE * watch.waited + _IN_DOUBT * watch.doubtful
+    there = visible | watch.lost
+    order = jnp.argsort(-jnp.where(there, urgency, -jnp.inf))
+    count = jnp.minimum(everywhere, there.sum())
 
     def look(i, carried):
         found, again, leads = carried
         group = order[i]
-        lost, center = watch.lost[group], centers[group]
-        known, own, firsts = jax.tree.map(lambda a: a[group], (found, points, missing.centers))
 
-        def anywhere():
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), missing.count), group)
-            turn = LARGEST_TURN if config.max_turn else 0.0
-            return alone(firsts, own), guesses(key, shifts, firsts, center, missing.strangers, turn)
+        def follow():
+            known, own = jax.tree.map(lambda a: a[group], (found, points))
+            start = (starts[:, group], own, centers[group], sight, config, shifts)
+            better, lead = look_everywhere(known, *start)
+            return _with(found, group, better), again, leads.at[group].set(lead)
 
-        own, around = jax.lax.cond(lost, anywhere, lambda: (own, shifts))
-        start = known._replace(residuals=jnp.where(lost, jnp.inf, known.residuals))
-        better, lead = look_everywhere(start, starts[:, group], own, center, sight, config, around)
-        again = again.at[group].set(jnp.where(lost, better.twists, again[group]))
-        leads = leads.at[group].set(lead)
-        better = keep_if(lost, known, better)
-        return jax.tree.map(lambda all, one: all.at[group].set(one), found, better), again, leads
+        if astray is None or recover is None:
+            return follow()
+        return jax.lax.cond(
+            astray[group], lambda: (found, _with(again, group, recover(group)), leads), follow
+        )
 
-    nothing = (found, jnp.zeros_like(found.twists), jnp.full_like(found.residuals, jnp.inf))
-    found, again, leads = jax.lax.fori_loop(0, count, look, nothing)
+    unknown, nothing = jnp.full_like(found.residuals, jnp.inf), jnp.zeros_like(found.residuals)
+    nowhere = Elsewhere(jnp.zeros_like(found.twists), Confidence(nothing, nothing, nothing > 0))
+    found, again, leads = jax.lax.fori_loop(0, count, look, (found, nowhere, unknown))
     looked_for = jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
     return Sought(found, again, looked_for, leads)
+
+
+def _with(all_of_them, index, one):
+    """`all_of_them`, of which that of an index is `one`."""
+    return jax.tree.map(lambda a, b: a.at[index].set(b), all_of_them, one)

@@ -1,14 +1,15 @@
 """The tracker's step: from S_{t-1} and the new images to S_t (sections II-B and II-C of the paper)."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.cameras import Camera, camera_centers
-from gsjax.geometry.spherical_harmonics import SH_C0
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker.config import TrackerConfig
+from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of
 from gsjax.methods.object_tracker.layers import (
     Backdrop,
     Shown,
@@ -18,14 +19,13 @@ from gsjax.methods.object_tracker.layers import (
     moving_of,
     reduced,
     render_labels,
-    seen_from,
     show_moving,
     shown_by,
     thinned,
 )
-from gsjax.methods.object_tracker.lost import FOUND, Confidence, Missing, confidence, with_strangers
+from gsjax.methods.object_tracker.lost import Confidence, confidence, is_found
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
-from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
+from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
 from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
@@ -34,13 +34,21 @@ from gsjax.methods.object_tracker.points import (
     carry_keyframe,
     faded,
     first_keyframe,
-    first_members,
     join,
+    of_groups,
     pixel_counts,
     pixels_of_groups,
     renewed,
     sight_of,
-    tones,
+)
+from gsjax.methods.object_tracker.recover import (
+    Around,
+    Elsewhere,
+    evidence,
+    explained_by,
+    recover,
+    since,
+    with_strangers,
 )
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
 from gsjax.methods.object_tracker.region import (
@@ -54,7 +62,7 @@ from gsjax.methods.object_tracker.region import (
     touched_tiles,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.methods.object_tracker.search import Watch, first_watch, judge, search
+from gsjax.methods.object_tracker.search import Watch, coarse_shifts, first_watch, judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
@@ -63,6 +71,7 @@ from gsjax.scene.render import Rendered, plan_render, render
 # Pixels that must show a group for it to be moved: fewer cannot decide six numbers. So many are enough, and
 # this share of what there once were, for what is small.
 _ENOUGH_PIXELS, _MIN_SHARE = 200, 0.2
+_BETTER = 1.3  # factor in evidence by which a group has to be seen better elsewhere to be moved there
 
 
 class TrackerState(NamedTuple):
@@ -72,6 +81,7 @@ class TrackerState(NamedTuple):
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
     strangers: Points  # pixels of the last frame that no group explains
+    hunches: Float[Array, "k 6"]  # where what is lost may be instead, from where it is believed to be
     watch: Watch
     count: Int[Array, ""]  # frames so far
     shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
@@ -86,36 +96,6 @@ class TrackerBatch(NamedTuple):
     frame: Frame
     plan: TrackerPlan
     everywhere: Int[Array, ""] | None = None  # groups to look for everywhere; None: as the config says
-
-
-def _named(
-    scene: TrackedScene, pose: Pose, last: "_Last", lost: Bool[Array, "k"], config: TrackerConfig
-) -> Points:
-    """Centres of Gaussians that the first mask named: what joined an object later may be a neighbour's.
-
-    Cameras look for those that they saw, and of a lost group for all that face them: what hides it where it
-    is believed to be need not hide it where it is.
-    """
-    groups = scene.labels[: scene.num_moving]
-    # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
-    with_normal = jnp.any(scene.normals != 0, axis=-1)
-    firsts = jnp.where(with_normal | ~with_normal.any(), groups, 0)
-    count = min(config.align.centers, scene.num_moving)
-    rows, named = first_members(firsts, scene.num_objects, count)
-    own = (pose.means[rows.ravel()], groups[rows.ravel()])
-    seen = seen_from(*own, last.shown, last.cameras, config.start.depth_gap)
-    astray = (lost & with_normal.any())[own[1] - 1]
-
-    def with_facing():
-        faces = facing(scene, pose, camera_centers(last.cameras.viewmat))[:, rows.ravel()] > 0.5
-        return jnp.where(astray, faces.astype(seen.dtype), seen)
-
-    seen = jax.lax.cond(astray.any(), with_facing, lambda: seen)
-    seen = jnp.moveaxis(seen.reshape(-1, *rows.shape), 0, 1) * named[:, None]
-    colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.align.shading)
-    in_all = (*seen.shape[:2], 3, seen.shape[2])
-    of_each = (jnp.swapaxes(a, 1, 2)[:, None] for a in (pose.means[rows], colors))
-    return Points(*(jnp.broadcast_to(a, in_all) for a in of_each), seen)
 
 
 class _Last(NamedTuple):
@@ -157,12 +137,18 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         shown, _ = show(scene, params, frame, backdrop, plan)
         sight = sight_of(frame, config.align.shading)
         pixels, strangers = look_at(shown, sight)
+        firsts = firsts_of(scene, params, config.align)
+        centers = group_means(params.means, scene.labels[: scene.num_moving], num_objects)
+        showed = confidence(
+            all_facing(firsts, nowhere.twists, centers, sight), sight, config.start.depth_gap
+        ).shows
         return TrackerState(
             nowhere,
             pixels,
             first_keyframe(pixels),
             strangers,
-            first_watch(num_objects),
+            nowhere.twists,
+            first_watch(showed),
             jnp.int32(0),
             *memory(shown, backdrop, frame),
         )
@@ -221,13 +207,21 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         jump, found, score = _match(last.template, frame, num_objects, config, reduction)
 
         remembered = faded(state.keyframe, config.align.keyframe_turn)
-        named, since = _named(scene, params, last, state.watch.lost, config), join(state.pixels, remembered)
+        firsts, gap = firsts_of(scene, params, config.align), config.start.depth_gap
+        named = as_last_seen(firsts, last.shown, last.cameras, gap)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
-        points = join(weighted, since)
+        points = join(weighted, state.pixels, remembered)
+        astray = state.watch.lost | (state.watch.doubtful & (state.count % 2 == 0))
+        explained = explained_by(last.shown, astray, background)
+        around = Around(sight, explained, state.strangers, coarse_shifts(config.align, sight))
 
-        def sure_of(twists) -> Confidence:
-            moved = jax.vmap(carry)(named, twists, centers)
-            return confidence(moved, sight, config.start.depth_gap, background)
+        def recovered(group) -> Elsewhere:
+            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), state.count), group)
+            own = jax.tree.map(lambda a: a[group], (firsts, centers, state.hunches))
+            return recover(key, *own, around, config.align, gap)
+
+        def sure_of(points) -> Confidence:
+            return confidence(points, sight, gap, background)
 
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
@@ -244,17 +238,16 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             everywhere = jnp.int32(
                 num_objects if config.align.everywhere is None else config.align.everywhere
             )
-        missing = Missing(named, state.strangers, state.count)
-        seen = (config.align, state.watch, visible, everywhere, missing)
-        sought = search(jnp.stack(starts), points, centers, sight, *seen)
+        how = (config.align, state.watch, visible, everywhere, astray, recovered)
+        sought = search(jnp.stack(starts), points, centers, sight, *how)
         residual = sought.found.residuals
         kept = begun = Motion(sought.found.twists, delta)
-        needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
+        needed, info, shifted = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
         if config.refine.iterations:
             assert last.rendered is not None
-            refined, shifts, needed, info = _refine(begun, params, centers, last.rendered, batch, config)
-            if shifts is not None:
-                scene = shift_background(scene, shifts)
+            refined, shifted, needed, info = _refine(begun, params, centers, last.rendered, batch, config)
+            if shifted is not None:
+                scene = shift_background(scene, shifted)
             # Points know nothing of outlines, which rendered images do, so these are overruled only where
             # they went clearly astray; without depth the points hardly know better at all.
             lead = 0.1 if frame.depths is None else 0.01
@@ -263,11 +256,17 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-        sure, lost = sure_of(kept.twists), state.watch.lost & sought.looked_for
-        surely = jax.lax.cond(lost.any(), sure_of, lambda _: sure, sought.again)
-        retaken = lost & surely.tells & (surely.shows > jnp.maximum(FOUND, sure.shows))
-        kept = _select(retaken, Motion(sought.again, jnp.zeros_like(delta)), kept, groups)
-        sure = jax.tree.map(lambda a, b: jnp.where(retaken, a, b), surely, sure)
+        sure, again = sure_of(jax.vmap(carry)(named, kept.twists, centers)), sought.again
+        faced = jax.lax.cond(
+            astray.any(), lambda: sure_of(all_facing(firsts, kept.twists, centers, sight)), lambda: sure
+        )
+        sure = jax.tree.map(partial(of_groups, state.watch.lost), faced, sure)
+        missing = astray & sought.looked_for
+        better = evidence(again.sure) > _BETTER * evidence(faced)
+        retaken = missing & better & is_found(again.sure, state.watch.showed)
+        hunches = of_groups(missing, again.twists, state.hunches)
+        kept = _select(retaken, Motion(again.twists, jnp.zeros_like(delta)), kept, groups)
+        sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
 
         pose = move(params, kept, centers, groups)
         shown, shown_needed = show(scene, pose, frame, backdrop, plan)
@@ -277,13 +276,14 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         else:
             needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, shown_needed))
         overflow = needed.exceeds(plan)
-        sound = all_finite((pose, shifts)) & ~overflow
+        sound = all_finite((pose, shifted)) & ~overflow
         pixels, strangers = look_at(shown, sight)
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
         watch = state.watch.after(residual, sought, counts, sure)
-        new_state = TrackerState(kept, pixels, keyframe, strangers, watch, state.count + 1, *told)
+        hunches = jnp.where(watch.lost[:, None], since(hunches, kept.twists), 0.0)
+        new_state = TrackerState(kept, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
             "overflow": overflow,
@@ -300,7 +300,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             "motion": kept,
             "centers": centers + kept.twists[:, :3],
             "shown": shown,
-            "background": shifts,
+            "background": shifted,
         }
         return pose, new_state, info
 

@@ -221,9 +221,7 @@ class _Runner:
             self.plan = self.plan.grown(info["needed"], self._config.headroom)
 
 
-def _measured(
-    scene: TrackedScene, pose: Pose, first: Frame, second: Frame, config: TrackerConfig
-) -> Costs:
+def _measured(scene: TrackedScene, pose: Pose, first: Frame, second: Frame, config: TrackerConfig) -> Costs:
     """What updates cost: those to the second frame, which shows the background anew where cameras move."""
     run, count = _Runner(scene, pose, first, config), scene.num_objects
     state = first_state(scene, pose, first, config, run.plan)

@@ -1,0 +1,167 @@
+"""Where a lost group may be: of many guesses, what the cameras show most of, aligned.
+
+Residuals cannot choose, for they take what hides a group, or lies outside the pictures, for a disagreement.
+So `confidence` does, with the Gaussians of the first frame that would face each camera. What it comes up with
+is a hunch, from which the next frame goes on, until so much of the group shows there that it is found.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Key
+
+from gsjax.methods.object_tracker.align import align, compose, turned, widened
+from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.firsts import Firsts, as_facing
+from gsjax.methods.object_tracker.layers import Shown
+from gsjax.methods.object_tracker.lost import COLOR_SCALE, Confidence, confidence
+from gsjax.methods.object_tracker.points import Points, Sight
+
+_LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
+_NEAR_HUNCH = 0.3  # radians; how a guess that goes on from a hunch is turned
+_STARTS = 8  # guesses that are aligned
+_ROUNDS = 2  # in which turns of the best are tried
+
+
+def since(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
+    """The same places as after `twists`, from where groups are after `moved`, both about the same centres."""
+    turns = jaxlie.SO3.exp(twists[..., 3:]) @ jaxlie.SO3.exp(moved[..., 3:]).inverse()
+    return jnp.concatenate([twists[..., :3] - moved[..., :3], turns.log()], axis=-1)
+
+
+class Elsewhere(NamedTuple):
+    """Where a lost group may be instead."""
+
+    twists: Float[Array, "*k 6"]  # from where it is believed to be
+    sure: Confidence
+
+
+class Around(NamedTuple):
+    """What a lost group is looked for in."""
+
+    sight: Sight
+    explained: Float[Array, "c h w"]  # depth of what is known to be there, see `explained_by`
+    strangers: Points  # pixels of the last frame that no group explains
+    shifts: Float[Array, "h 6"]  # what is tried near by
+
+
+def recover(
+    key: Key[Array, ""],
+    firsts: Firsts,
+    center: Float[Array, "3"],
+    hunch: Float[Array, "6"],
+    around: Around,
+    config: AlignConfig,
+    gap: float,
+) -> Elsewhere:
+    """Where one lost group shows most.
+
+    Args:
+        firsts: of the group.
+        center: what it turns about.
+        hunch: what this said in the last frame, from where the group is believed to be now.
+        around: what it is looked for in.
+        gap: see `confidence`.
+    """
+    sight = around.sight
+
+    def shown(twists, firsts) -> Confidence:
+        points = jax.vmap(as_facing, in_axes=(None, 0, None, None))(firsts, twists, center, sight)
+        return confidence(points, sight, gap, around.explained)
+
+    def aligned(twist):
+        faces = as_facing(firsts, twist, center, sight).seen
+        points = as_facing(firsts, jnp.zeros_like(twist), center, sight)._replace(seen=faces)
+        for scales in (widened(config), config):
+            twist = align(twist, points, center, sight, scales)
+        return twist
+
+    def best(twists) -> tuple[Float[Array, "6"], Confidence]:
+        twists = jnp.concatenate([twists, jax.vmap(aligned)(twists)])
+        sure = shown(twists, firsts)
+        return jax.tree.map(lambda a: a[jnp.argmax(evidence(sure))], (twists, sure))
+
+    tried = hunch[None]
+    if len(around.shifts):
+        few = jax.tree.map(lambda a: a[..., ::4], firsts)
+        drawn = guesses(key, around.shifts, firsts, center, around.strangers, hunch, config)
+        most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
+        tried = jnp.concatenate([tried, drawn[most]])
+    twist, sure = best(tried)
+    if config.max_turn and config.turns:
+        for _ in range(_ROUNDS):
+            twist, sure = best(turned(twist, jnp.eye(3), config.turns))
+    return Elsewhere(twist, sure)
+
+
+def evidence(sure: Confidence) -> Float[Array, "*k"]:
+    """What speaks for a group's being somewhere: much of it shows, and what shows of it agrees."""
+    return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
+
+
+def explained_by(
+    shown: Shown, astray: Bool[Array, "k"], background: Float[Array, "c h w"] | None
+) -> Float[Array, "c h w"]:
+    """Depth of the groups that are not astray, where they were last seen, and of the background behind them;
+    0 where neither is known. What shows these shows no other group."""
+    sound = (shown.labels > 0) & ~astray[shown.labels - 1]
+    return jnp.where(sound, shown.depths, 0.0 if background is None else background)
+
+
+def with_strangers(
+    shown: Shown, sight: Sight, num_groups: int, gap: float, thickness: float, coarseness: int
+) -> Shown:
+    """`shown`, where pixels that no group explains have the label num_groups + 1 and their measured depth.
+
+    Args:
+        gap: what is measured this much nearer than the background is not explained by it, metres ...
+        thickness: ... and this much nearer than a group, metres.
+        coarseness: `shown` has every so-manieth pixel.
+    """
+    if sight.depths is None:
+        return shown
+    measured = sight.depths[:, ::coarseness, ::coarseness]
+    nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
+    strange = (measured > 0) & shown.covered & (measured < nearest)
+    labels = jnp.where(strange, num_groups + 1, shown.labels)
+    return shown._replace(labels=labels, depths=jnp.where(strange, measured, shown.depths))
+
+
+def guesses(
+    key: Key[Array, ""],
+    shifts: Float[Array, "h 6"],
+    firsts: Firsts,
+    center: Float[Array, "3"],
+    strangers: Points,
+    hunch: Float[Array, "6"],
+    config: AlignConfig,
+) -> Float[Array, "h 6"]:
+    """Where a lost group may be: half of them at strange pixels and a quarter near by, turned at random, and
+    a quarter near the hunch.
+
+    Args:
+        shifts: what is tried near by.
+        firsts: of the group. Those of about a strange pixel's colour are brought to it.
+        center: what the group turns about.
+        strangers: pixels that no group explains, as each camera sees them.
+        hunch: see `recover`.
+        config: without `max_turn` nothing is turned.
+    """
+    count = len(shifts)
+    place, pair, axis, angle, small = jax.random.split(key, 5)
+    to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in strangers)
+    chosen = jax.random.categorical(place, jnp.where(there > 0, 0.0, -jnp.inf), shape=(count,))
+    apart = jnp.sum((colors[:, chosen, None] - firsts.tones[:, None]) ** 2, axis=0) / COLOR_SCALE**2
+    paired = jax.random.categorical(pair, jnp.where(firsts.real, -apart, -jnp.inf))
+    turns = jax.random.normal(axis, (count, 3))
+    turns /= jnp.linalg.norm(turns, axis=1, keepdims=True)
+    turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1)) * (config.max_turn > 0)
+    offsets = firsts.means[:, paired].T - center
+    away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
+    strange = (jnp.arange(count) % 2 == 1) & (there.sum() > 0)
+    far = jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
+    nearly = _NEAR_HUNCH * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
+    near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(hunch, far.shape))
+    return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)
