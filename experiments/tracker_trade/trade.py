@@ -7,6 +7,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
 
+import jax
 import numpy as np
 from recordings import recorded, scored, started, tracked
 
@@ -51,6 +52,7 @@ def setting(knob: str, value: Any) -> TrackerConfig:
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Follow a recording with one setting, and with `fast` in the same minute."""
+    jax.clear_caches()  # every setting compiles programs of its own, which fill the process's memory map
     config, dataset = setting(options["knob"], options["value"]), str(recorded(options["recording"]))
     start = started(dataset, ":", CAMERAS, (), config.start)
     usual = started(dataset, ":", CAMERAS, (), FAST.start)

@@ -5,6 +5,7 @@ agrees badly; so the groups that agree worst, as many as there is time for, are 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -242,9 +243,8 @@ def search(
 
         if astray is None or recover is None:
             return follow()
-        return jax.lax.cond(
-            astray[group], lambda: (found, _with(again, group, recover(group)), leads), follow
-        )
+        seek = partial(recover, group)
+        return jax.lax.cond(astray[group], lambda: (found, _with(again, group, seek()), leads), follow)
 
     unknown, nothing = jnp.full_like(found.residuals, jnp.inf), jnp.zeros_like(found.residuals)
     nowhere = Elsewhere(jnp.zeros_like(found.twists), Confidence(nothing, nothing, nothing > 0))
