@@ -399,7 +399,8 @@ def nothing_of(looked_for, leads=jnp.inf):
     """A search that says just which groups were looked for, and what their turns agree better by."""
     still = jnp.zeros((len(looked_for), 6))
     found, none = Found(still, still[:, 0]), still[:, 0]
-    nowhere = Elsewhere(still, Confidence(none, none, none > 0))
+    sure = Confidence(none, none, none > 0)
+    nowhere = Elsewhere(still, sure, sure)
     return Sought(found, nowhere, jnp.array(looked_for), jnp.broadcast_to(jnp.asarray(leads), len(still)))
 
 

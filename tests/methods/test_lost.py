@@ -205,7 +205,7 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
     )
 
     def after(frames, explained):
-        found = Elsewhere(jnp.zeros(6), None)
+        found = Elsewhere(jnp.zeros(6), None, None)
         for seed in range(frames):
             found = look(seed, found.twists, Around(sight, explained, strangers, shifts))
         return found
@@ -217,6 +217,9 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
         jax.tree.map(lambda a: a[None], as_facing(firsts, 0 * off, center, sight)), sight, GAP
     ).shows
     assert is_found(jax.tree.map(lambda a: a[None], found.sure), showed)[0]
+    assert is_found(jax.tree.map(lambda a: a[None], found.before), showed)[0]
+    first = after(1, others)  # nothing was said before: it is believed where it is not
+    assert not is_found(jax.tree.map(lambda a: a[None], first.before), showed)[0]
     nobody = after(3, sight.depths)  # all that is measured is something else
     assert not is_found(jax.tree.map(lambda a: a[None], nobody.sure), showed)[0]
 

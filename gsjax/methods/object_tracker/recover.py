@@ -2,7 +2,8 @@
 
 Residuals cannot choose, for they take what hides a group, or lies outside the pictures, for a disagreement.
 So `confidence` does, with the Gaussians of the first frame that would face each camera. What it comes up with
-is a hunch, from which the next frame goes on, until so much of the group shows there that it is found.
+is a hunch, from which the next frame goes on, until so much of the group shows there that it is found: in two
+frames, for of many guesses one may agree by chance.
 """
 
 from typing import NamedTuple
@@ -36,6 +37,9 @@ class Elsewhere(NamedTuple):
 
     twists: Float[Array, "*k 6"]  # from where it is believed to be
     sure: Confidence
+    before: (
+        Confidence  # of where it was said to be in the last frame, aligned: found by chance, it is not there
+    )
 
 
 class Around(NamedTuple):
@@ -83,7 +87,7 @@ def recover(
         sure = shown(twists, firsts)
         return jax.tree.map(lambda a: a[jnp.argmax(evidence(sure))], (twists, sure))
 
-    tried = hunch[None]
+    tried, (_, before) = hunch[None], best(hunch[None])
     if len(around.shifts):
         few = jax.tree.map(lambda a: a[..., ::4], firsts)
         drawn = guesses(key, around.shifts, firsts, center, around.strangers, hunch, config)
@@ -93,7 +97,7 @@ def recover(
     if config.max_turn and config.turns:
         for _ in range(_ROUNDS):
             twist, sure = best(turned(twist, jnp.eye(3), config.turns))
-    return Elsewhere(twist, sure)
+    return Elsewhere(twist, sure, before)
 
 
 def evidence(sure: Confidence) -> Float[Array, "*k"]:

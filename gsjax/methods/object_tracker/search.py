@@ -247,7 +247,8 @@ def search(
         return jax.lax.cond(astray[group], lambda: (found, _with(again, group, seek()), leads), follow)
 
     unknown, nothing = jnp.full_like(found.residuals, jnp.inf), jnp.zeros_like(found.residuals)
-    nowhere = Elsewhere(jnp.zeros_like(found.twists), Confidence(nothing, nothing, nothing > 0))
+    none = Confidence(nothing, nothing, nothing > 0)
+    nowhere = Elsewhere(jnp.zeros_like(found.twists), none, none)
     found, again, leads = jax.lax.fori_loop(0, count, look, (found, nowhere, unknown))
     looked_for = jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
     return Sought(found, again, looked_for, leads)

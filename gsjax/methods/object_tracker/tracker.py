@@ -81,7 +81,7 @@ class TrackerState(NamedTuple):
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
     strangers: Points  # pixels of the last frame that no group explains
-    hunches: Float[Array, "k 6"]  # where what is lost may be instead, from where it is believed to be
+    hunches: Float[Array, "k 6"]  # where what may be elsewhere is then, from where it is believed to be
     watch: Watch
     count: Int[Array, ""]  # frames so far
     shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
@@ -263,7 +263,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         sure = jax.tree.map(partial(of_groups, state.watch.lost), faced, sure)
         missing = astray & sought.looked_for
         better = evidence(again.sure) > _BETTER * evidence(faced)
-        retaken = missing & better & is_found(again.sure, state.watch.showed)
+        twice = is_found(again.sure, state.watch.showed) & is_found(again.before, state.watch.showed)
+        retaken = missing & better & twice
         hunches = of_groups(missing, again.twists, state.hunches)
         kept = _select(retaken, Motion(again.twists, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
@@ -282,7 +283,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
         watch = state.watch.after(residual, sought, counts, sure)
-        hunches = jnp.where(watch.lost[:, None], since(hunches, kept.twists), 0.0)
+        hunches = of_groups(watch.doubtful & ~retaken, since(hunches, kept.twists), still)
         new_state = TrackerState(kept, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         info |= {
