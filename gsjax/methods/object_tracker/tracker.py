@@ -211,7 +211,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         named = as_last_seen(firsts, last.shown, last.cameras, gap)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, state.pixels, remembered)
-        astray = state.watch.lost | (state.watch.doubtful & (state.count % 2 == 0))
+        astray = state.watch.lost | (state.watch.doubtful & (state.count % 4 < 2))
         explained = explained_by(last.shown, astray, background)
         around = Around(sight, explained, state.strangers, coarse_shifts(config.align, sight))
 
