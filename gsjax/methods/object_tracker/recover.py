@@ -82,21 +82,26 @@ def recover(
             twist = align(twist, points, center, sight, scales)
         return twist
 
-    def best(twists) -> tuple[Float[Array, "6"], Confidence]:
+    def places(twists) -> tuple[Float[Array, "n 6"], Confidence]:
+        """As they are, and then aligned."""
         twists = jnp.concatenate([twists, jax.vmap(aligned)(twists)])
-        sure = shown(twists, firsts)
-        return jax.tree.map(lambda a: a[jnp.argmax(evidence(sure))], (twists, sure))
+        return twists, shown(twists, firsts)
 
-    tried, (_, before) = hunch[None], best(hunch[None])
+    def best(places) -> tuple[Float[Array, "6"], Confidence]:
+        return jax.tree.map(lambda a: a[jnp.argmax(evidence(places[1]))], places)
+
+    tried = hunch[None]
     if len(around.shifts):
         few = jax.tree.map(lambda a: a[..., ::4], firsts)
         drawn = guesses(key, around.shifts, firsts, center, around.strangers, hunch, config)
         most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
         tried = jnp.concatenate([tried, drawn[most]])
-    twist, sure = best(tried)
+    found = places(tried)
+    _, before = best(jax.tree.map(lambda a: a[:: len(tried)], found))  # the hunch, and the hunch aligned
+    twist, sure = best(found)
     if config.max_turn and config.turns:
         for _ in range(_ROUNDS):
-            twist, sure = best(turned(twist, jnp.eye(3), config.turns))
+            twist, sure = best(places(turned(twist, jnp.eye(3), config.turns)))
     return Elsewhere(twist, sure, before)
 
 
