@@ -15,6 +15,7 @@ from gsjax.methods.object_tracker.align import (
     _normal_equations,
     _residuals,
     align,
+    ball,
     bilinear,
     disagreement,
     turned,
@@ -39,7 +40,6 @@ from gsjax.methods.object_tracker.search import (
     TELLS_TURN,
     Found,
     Sought,
-    ball,
     first_watch,
     least,
     principal_axes,
@@ -345,6 +345,27 @@ def test_search_finds_what_is_pushed_while_it_turns(moved):
     np.testing.assert_allclose(searched(1)[3:], true[3:], atol=0.02)
 
 
+def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
+    """It may be where it was believed to be. What is lost is not, and what agrees as ever has not jumped."""
+    *given, shift = jumped
+    points, centers = jax.tree.map(lambda a: a[None], given[:2])
+    sure, yes = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True)), jnp.array([True])
+
+    def searched(**changes) -> Sought:
+        watch = first_watch(jnp.ones(1))._replace(**changes)
+        how = (replace(CONFIG, iterations=3), watch, yes, jnp.int32(1), yes)
+        nowhere = Elsewhere(jnp.ones(6), sure, sure)
+        return search(jnp.zeros((1, 1, 6)), points, centers, given[2], *how, lambda _: nowhere)
+
+    followed = searched(usual=jnp.array([0.05]))
+    np.testing.assert_allclose(followed.found.twists[0, :3], shift, atol=1e-3)
+    assert not followed.recovered[0]
+    for changes in ({"usual": jnp.array([0.9])}, {"usual": jnp.array([0.05]), "lost": yes}):
+        elsewhere = searched(**changes)
+        np.testing.assert_allclose(elsewhere.again.twists[0], 1.0)
+        assert elsewhere.recovered[0]
+
+
 def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jumped):
     """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
     *given, shift = jumped
@@ -400,8 +421,8 @@ def nothing_of(looked_for, leads=jnp.inf):
     still = jnp.zeros((len(looked_for), 6))
     found, none = Found(still, still[:, 0]), still[:, 0]
     sure = Confidence(none, none, none > 0)
-    nowhere = Elsewhere(still, sure, sure)
-    return Sought(found, nowhere, jnp.array(looked_for), jnp.broadcast_to(jnp.asarray(leads), len(still)))
+    leads = jnp.broadcast_to(jnp.asarray(leads), len(still))
+    return Sought(found, jnp.array(looked_for), Elsewhere(still, sure, sure), none > 0, leads)
 
 
 def test_what_is_lost_is_found_only_when_it_shows_itself():

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from gsjax.geometry.cameras import camera_centers
 from gsjax.methods.object_tracker import GrowConfig, RefineConfig, first_pose, track
+from gsjax.methods.object_tracker.align import coarse_shifts
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.firsts import all_facing, as_facing, as_last_seen, firsts_of
 from gsjax.methods.object_tracker.layers import Shown
@@ -28,7 +29,6 @@ from gsjax.methods.object_tracker.recover import (
     since,
     with_strangers,
 )
-from gsjax.methods.object_tracker.search import coarse_shifts
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -197,7 +197,7 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
         normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), firsts.normals),
     )
     others, config = jnp.where(shown, 0.0, sight.depths), AlignConfig()
-    strangers, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
+    strangers = strangers_of(sight, shown)
     look = jax.jit(
         lambda seed, hunch, around: recover(
             jax.random.key(seed), lost, center + off[:3], hunch, around, config, GAP
@@ -207,7 +207,7 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
     def after(frames, explained):
         found = Elsewhere(jnp.zeros(6), None, None)
         for seed in range(frames):
-            found = look(seed, found.twists, Around(sight, explained, strangers, shifts))
+            found = look(seed, found.twists, Around(sight, explained, strangers))
         return found
 
     found = after(8, others)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gsjax.methods.object_tracker.config import AlignConfig
@@ -178,6 +179,21 @@ def align(
     start = (jax.tree.map(jnp.asarray, nothing), twist, jnp.asarray(1e-2, twist.dtype))
     (best, *_), _ = jax.lax.scan(iterate, start, None, length=config.iterations + 1)
     return best.twist
+
+
+def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
+    """The points of a cubic grid within `radius` of the origin."""
+    steps = spacing * np.arange(-(radius // spacing), radius // spacing + 1)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    return grid[np.linalg.norm(grid, axis=1) <= radius]
+
+
+def coarse_shifts(config: AlignConfig, sight: Sight) -> Float[Array, "n 6"]:
+    """Twists that shift to all sides, for depth to choose from: by colour a plain thing slides about."""
+    if not config.reach or sight.depths is None:
+        return jnp.zeros((0, 6))
+    shifts = jnp.asarray(ball(config.reach, config.spacing), float)
+    return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
 
 
 def turned(

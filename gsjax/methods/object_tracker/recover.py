@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Key
 
-from gsjax.methods.object_tracker.align import align, compose, turned, widened
+from gsjax.methods.object_tracker.align import align, coarse_shifts, compose, turned, widened
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.firsts import Firsts, as_facing
 from gsjax.methods.object_tracker.layers import Shown
@@ -48,7 +48,6 @@ class Around(NamedTuple):
     sight: Sight
     explained: Float[Array, "c h w"]  # depth of what is known to be there, see `explained_by`
     strangers: Points  # pixels of the last frame that no group explains
-    shifts: Float[Array, "h 6"]  # what is tried near by
 
 
 def recover(
@@ -90,10 +89,10 @@ def recover(
     def best(places) -> tuple[Float[Array, "6"], Confidence]:
         return jax.tree.map(lambda a: a[jnp.argmax(evidence(places[1]))], places)
 
-    tried = hunch[None]
-    if len(around.shifts):
+    tried, shifts = hunch[None], coarse_shifts(config, sight)
+    if len(shifts):
         few = jax.tree.map(lambda a: a[..., ::4], firsts)
-        drawn = guesses(key, around.shifts, firsts, center, around.strangers, hunch, config)
+        drawn = guesses(key, shifts, firsts, center, around.strangers, hunch, config)
         most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
         tried = jnp.concatenate([tried, drawn[most]])
     found = places(tried)

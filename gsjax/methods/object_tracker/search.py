@@ -14,7 +14,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.methods.object_tracker.align import align, disagreement, turned, widened
+from gsjax.methods.object_tracker.align import align, coarse_shifts, disagreement, turned, widened
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.lost import DOUBTFUL, LOST, Confidence, is_found
 from gsjax.methods.object_tracker.points import Points, Sight
@@ -24,6 +24,7 @@ _LEAST_USUAL = 0.02  # a residual below this is noise
 _IN_DOUBT = 0.5  # what being lost, or hardly looking as at first, counts beside a residual as usual
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 _OTHER_TURN = 0.14  # radians; what is turned by more than this is turned otherwise
+_CALM = 2.0  # a residual above that beside the usual one: a group has just moved, and is followed first
 _AGREES_AT_ALL = 0.5  # residual above which a group is hidden or elsewhere, and says nothing of its turn
 TELLS_TURN = 0.045  # lead that says how a group is turned; docs/results-hard-cases.md has both sides of it
 _FOUND_TURNED = 0.65  # share that must agree of what is found again for it to be turned as it was at first
@@ -40,8 +41,9 @@ class Sought(NamedTuple):
     """What a search found."""
 
     found: Found
-    again: Elsewhere  # where each group that is astray and was looked for may be instead
     looked_for: Bool[Array, "k"]  # everywhere
+    again: Elsewhere  # where each group may be instead ...
+    recovered: Bool[Array, "k"]  # ... that was looked for where it was not believed to be
     leads: Float[Array, "k"]  # see `look_everywhere`; infinite where that is not known
 
 
@@ -70,21 +72,6 @@ def principal_axes(points: Points, center: Float[Array, "3"]) -> Float[Array, "3
     away = (points.means - center[:, None]) * (points.seen > 0)[:, None]
     _, vectors = jnp.linalg.eigh(jnp.einsum("cip,cjp->ij", away, away))
     return vectors.T
-
-
-def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
-    """The points of a cubic grid within `radius` of the origin."""
-    steps = spacing * np.arange(-(radius // spacing), radius // spacing + 1)
-    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    return grid[np.linalg.norm(grid, axis=1) <= radius]
-
-
-def coarse_shifts(config: AlignConfig, sight: Sight) -> Float[Array, "n 6"]:
-    """Twists that shift to all sides, for depth to choose from: by colour a plain thing slides about."""
-    if not config.reach or sight.depths is None:
-        return jnp.zeros((0, 6))
-    shifts = jnp.asarray(ball(config.reach, config.spacing), float)
-    return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
 
 
 def look_everywhere(
@@ -213,7 +200,8 @@ def search(
         visible: groups that a camera sees; of others only what is lost is looked for.
         everywhere: how many groups are looked for everywhere, those first that agree worst beside what is
             usual for them, or that have waited longest.
-        astray: groups that are lost, or may be: they are recovered where others are followed; None: nobody.
+        astray: groups that are lost, or may be: they are recovered where others are followed, unless they are
+            not lost and have just moved; None: nobody.
         recover: says where the astray group of this index may be instead.
     """
     judged = jax.vmap(judge, in_axes=(0, None, None, None, None))
@@ -223,6 +211,8 @@ def search(
     aligned = over_groups(aligned, points, centers, sight, config)
     residuals = jnp.stack([best.residuals, judge(aligned, points, centers, sight, config)])
     found = least(residuals, jnp.stack([best.twists, aligned]))
+    calm = found.residuals < _CALM * watch.usual
+    astray = jnp.zeros_like(watch.lost) if astray is None else astray & (watch.lost | calm)
 
     shifts = coarse_shifts(config, sight)
 
@@ -241,7 +231,7 @@ def search(
             better, lead = look_everywhere(known, *start)
             return _with(found, group, better), again, leads.at[group].set(lead)
 
-        if astray is None or recover is None:
+        if recover is None:
             return follow()
         seek = partial(recover, group)
         return jax.lax.cond(astray[group], lambda: (found, _with(again, group, seek()), leads), follow)
@@ -251,7 +241,7 @@ def search(
     nowhere = Elsewhere(jnp.zeros_like(found.twists), none, none)
     found, again, leads = jax.lax.fori_loop(0, count, look, (found, nowhere, unknown))
     looked_for = jnp.zeros(len(centers), bool).at[order].set(jnp.arange(len(centers)) < count)
-    return Sought(found, again, looked_for, leads)
+    return Sought(found, looked_for, again, looked_for & astray, leads)
 
 
 def _with(all_of_them, index, one):

@@ -62,7 +62,7 @@ from gsjax.methods.object_tracker.region import (
     touched_tiles,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.methods.object_tracker.search import Watch, coarse_shifts, first_watch, judge, search
+from gsjax.methods.object_tracker.search import Watch, first_watch, judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
@@ -213,7 +213,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         points = join(weighted, state.pixels, remembered)
         astray = state.watch.lost | (state.watch.doubtful & (state.count % 4 < 2))
         explained = explained_by(last.shown, astray, background)
-        around = Around(sight, explained, state.strangers, coarse_shifts(config.align, sight))
+        around = Around(sight, explained, state.strangers)
 
         def recovered(group) -> Elsewhere:
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), state.count), group)
@@ -261,11 +261,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             astray.any(), lambda: sure_of(all_facing(firsts, kept.twists, centers, sight)), lambda: sure
         )
         sure = jax.tree.map(partial(of_groups, state.watch.lost), faced, sure)
-        missing = astray & sought.looked_for
         better = evidence(again.sure) > _BETTER * evidence(faced)
         twice = is_found(again.sure, state.watch.showed) & is_found(again.before, state.watch.showed)
-        retaken = missing & better & twice
-        hunches = of_groups(missing, again.twists, state.hunches)
+        retaken = sought.recovered & better & twice
+        hunches = of_groups(sought.recovered, again.twists, state.hunches)
         kept = _select(retaken, Motion(again.twists, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
 
