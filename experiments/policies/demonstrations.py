@@ -46,7 +46,8 @@ def record(count: int) -> None:
     while good < count:
         path = HOME / f"demo_{tried:03d}.npz"
         if not path.exists() and demonstrate(world, FIRST + tried, look=False) is not None:
-            np.savez_compressed(path, **demonstrate(world, FIRST + tried) or {})
+            if recorded := demonstrate(world, FIRST + tried):
+                np.savez_compressed(path, **recorded)
         good, tried = good + path.exists(), tried + 1
         write_json(HOME / "demonstrations.json", {"tried": tried, "kept": good})
     print(f"{good} of {tried} demonstrations succeeded")

@@ -12,8 +12,7 @@ from gsjax.methods.object_tracker import PRESETS
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]
-# `fast` goes on from where things were and loses what a gripper lifts: it is looked for up to 3 cm around.
-CONFIG = replace(FAST, align=replace(FAST.align, reach=0.03), grow=replace(FAST.grow, slots=0))
+CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))  # a pose is of Gaussians that stay the same
 OWN, BACKGROUND = 256, 4096  # Gaussians of the can and of everything else
 SMALL = (80, 60)  # width and height of what the image policy sees
 

@@ -23,7 +23,7 @@ from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups,
 from gsjax.methods.object_tracker.recover import (
     Around,
     Elsewhere,
-    explained_by,
+    depths_of_others,
     guesses,
     recover,
     since,
@@ -102,6 +102,9 @@ def test_a_card_on_a_table_is_not_lost(carton):
     assert confidence(points, sight, GAP, under).agrees[0] == pytest.approx(float(usual.agrees[0]))
     other = sight._replace(pixels=sight.pixels.at[..., :3].add(0.5))
     assert confidence(points, other, GAP, under).agrees[0] < LOST
+    assert confidence(points, sight, GAP, None, under).agrees[0] < LOST  # on another group nothing lies so
+    nothing = jnp.zeros_like(under)
+    assert confidence(points, sight, GAP, None, nothing).agrees[0] == pytest.approx(float(usual.agrees[0]))
 
 
 def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera(table, started, quick):
@@ -204,10 +207,10 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
         )
     )
 
-    def after(frames, explained):
-        found = Elsewhere(jnp.zeros(6), None, None)
+    def after(frames, others, start=0 * off):
+        found = Elsewhere(start, None, None)
         for seed in range(frames):
-            found = look(seed, found.twists, Around(sight, explained, strangers))
+            found = look(seed, found.twists, Around(sight, None, others, strangers))
         return found
 
     found = after(8, others)
@@ -220,8 +223,11 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
     assert is_found(jax.tree.map(lambda a: a[None], found.before), showed)[0]
     first = after(1, others)  # nothing was said before: it is believed where it is not
     assert not is_found(jax.tree.map(lambda a: a[None], first.before), showed)[0]
-    nobody = after(3, sight.depths)  # all that is measured is something else
-    assert not is_found(jax.tree.map(lambda a: a[None], nobody.sure), showed)[0]
+    for explained, there in ((jnp.zeros_like(sight.depths), True), (sight.depths, False)):
+        from_there = after(
+            1, explained, found.twists
+        )  # where all that is measured is something else, it is not
+        assert is_found(jax.tree.map(lambda a: a[None], from_there.sure), showed)[0] == there
 
 
 @given(st.integers(0, 2**31))
@@ -237,14 +243,12 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
     np.testing.assert_allclose(again, there, atol=1e-4)
 
 
-def test_what_is_known_to_be_there_is_the_sound_groups_before_the_background(carton):
+def test_depths_of_others_are_those_of_what_is_not_astray(carton):
     sight, _ = carton
     labels = jnp.zeros(sight.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
     shown = Shown(labels, jnp.full(labels.shape, 0.7), labels > 0)
-    behind = jnp.full(labels.shape, 0.9)
-    found = explained_by(shown, jnp.array([False, True]), behind)
-    np.testing.assert_allclose(found[0, 0, :3], [0.9, 0.7, 0.9])
-    np.testing.assert_allclose(explained_by(shown, jnp.array([False, True]), None)[0, 0, :3], [0.0, 0.7, 0.0])
+    found = depths_of_others(shown, jnp.array([False, True]))
+    np.testing.assert_allclose(found[0, 0, :3], [0.0, 0.7, 0.0])
 
 
 @pytest.mark.parametrize("redraw", ["moving", "all"])

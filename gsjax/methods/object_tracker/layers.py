@@ -98,9 +98,13 @@ def keep_backdrop(
     backdrop: Backdrop, scene: TrackedScene, cameras: Camera, plan: Plan
 ) -> tuple[Backdrop, Int[Array, ""]]:
     """The backdrop for these cameras: the one there is, unless a camera has moved."""
-    same = jnp.array_equal(backdrop.cameras.viewmat, cameras.viewmat)
-    same &= jnp.array_equal(backdrop.cameras.K, cameras.K)
+    same = are_same(backdrop.cameras, cameras)
     return jax.lax.cond(same, lambda: (backdrop, jnp.int32(0)), lambda: draw_backdrop(scene, cameras, plan))
+
+
+def are_same(a: Camera, b: Camera) -> Bool[Array, ""]:
+    """Whether these cameras of one size are in the same places, and see the same of it."""
+    return jnp.array_equal(a.viewmat, b.viewmat) & jnp.array_equal(a.K, b.K)
 
 
 def show_moving(

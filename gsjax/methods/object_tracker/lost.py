@@ -32,7 +32,11 @@ class Confidence(NamedTuple):
 
 
 def confidence(
-    centers: Points, sight: Sight, gap: float, background: Float[Array, "c h w"] | None = None
+    centers: Points,
+    sight: Sight,
+    gap: float,
+    background: Float[Array, "c h w"] | None = None,
+    others: Float[Array, "c h w"] | None = None,
 ) -> Confidence:
     """Compare each group's Gaussians of the first frame, where they should be now, with what is seen there.
 
@@ -44,10 +48,11 @@ def confidence(
         background: its depth where it is known, metres, else 0; of every so-manieth pixel. Where a camera
             measures just that, it does not see the group, however near: what slips into a wall would agree
             with the wall. Of a card that lies flat on it with all it has, that says nothing.
+        others: the same of other groups, on which nothing lies like a card.
     """
     height, width = sight.pixels.shape[1:3]
 
-    def one(means, tones, seen, viewmat, K, image, background):
+    def one(means, tones, seen, viewmat, K, image, background, others):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = local[2]
         column, row, _ = jnp.floor(rotated(K, local) / jnp.maximum(z, 1e-6)).astype(jnp.int32)
@@ -58,23 +63,30 @@ def confidence(
         asked = seen > 0
         alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
         of_a_card, flat = alike, jnp.zeros_like(inside)
+
+        def lies_in(depth, surface):
+            stride = -(-width // surface.shape[1])
+            there = surface[row // stride, column // stride]
+            return (there > 0) & (jnp.abs(depth - there) < gap / 3)
+
         if sight.depths is not None:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
             asked &= (image[..., 3] > 0).any()  # a camera that failed is not asked
-            of_a_card = alike = jnp.where(off > gap, 0.0, alike)
+            alike = jnp.where(off > gap, 0.0, alike)
+            if others is not None:
+                alike = jnp.where(lies_in(found[:, 3], others), 0.0, alike)
+            of_a_card = alike
             if background is not None:
-                stride = -(-width // background.shape[1])
-                behind = background[row // stride, column // stride]
-                shows_it = (behind > 0) & (jnp.abs(found[:, 3] - behind) < gap / 3)
-                alike = jnp.where(shows_it, 0.0, alike)
-                flat = (behind > 0) & (jnp.abs(z - behind) < gap / 3)
+                alike = jnp.where(lies_in(found[:, 3], background), 0.0, alike)
+                flat = lies_in(z, background)
         clear = known & ~hidden
         return clear * alike, clear * of_a_card, clear & flat, clear, asked
 
-    over_cameras = jax.vmap(one, in_axes=(0, 0, 0, 0, 0, 0, None if background is None else 0))
-    over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None))
-    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, background)
+    surfaces = (background, others)
+    over_cameras = jax.vmap(one, in_axes=(0,) * 6 + tuple(None if s is None else 0 for s in surfaces))
+    over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None, None))
+    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, *surfaces)
     alike, of_a_card, flat, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
     alike = jnp.where(flat > _FLAT * clear, of_a_card, alike)
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)

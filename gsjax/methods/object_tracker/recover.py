@@ -46,7 +46,8 @@ class Around(NamedTuple):
     """What a lost group is looked for in."""
 
     sight: Sight
-    explained: Float[Array, "c h w"]  # depth of what is known to be there, see `explained_by`
+    background: Float[Array, "c h w"] | None  # its depth, metres, where it is known; else 0
+    others: Float[Array, "c h w"]  # depth of groups that are where they should be, see `depths_of_others`
     strangers: Points  # pixels of the last frame that no group explains
 
 
@@ -72,7 +73,7 @@ def recover(
 
     def shown(twists, firsts) -> Confidence:
         points = jax.vmap(as_facing, in_axes=(None, 0, None, None))(firsts, twists, center, sight)
-        return confidence(points, sight, gap, around.explained)
+        return confidence(points, sight, gap, around.background, around.others)
 
     def aligned(twist):
         faces = as_facing(firsts, twist, center, sight).seen
@@ -109,13 +110,11 @@ def evidence(sure: Confidence) -> Float[Array, "*k"]:
     return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
 
 
-def explained_by(
-    shown: Shown, astray: Bool[Array, "k"], background: Float[Array, "c h w"] | None
-) -> Float[Array, "c h w"]:
-    """Depth of the groups that are not astray, where they were last seen, and of the background behind them;
-    0 where neither is known. What shows these shows no other group."""
+def depths_of_others(shown: Shown, astray: Bool[Array, "k"]) -> Float[Array, "c h w"]:
+    """Depth of the groups that are not astray, where they were last seen; else 0. What shows these shows no
+    group that is astray."""
     sound = (shown.labels > 0) & ~astray[shown.labels - 1]
-    return jnp.where(sound, shown.depths, 0.0 if background is None else background)
+    return jnp.where(sound, shown.depths, 0.0)
 
 
 def with_strangers(

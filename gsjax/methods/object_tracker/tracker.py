@@ -13,6 +13,7 @@ from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts
 from gsjax.methods.object_tracker.layers import (
     Backdrop,
     Shown,
+    are_same,
     background_of,
     draw_backdrop,
     keep_backdrop,
@@ -44,8 +45,8 @@ from gsjax.methods.object_tracker.points import (
 from gsjax.methods.object_tracker.recover import (
     Around,
     Elsewhere,
+    depths_of_others,
     evidence,
-    explained_by,
     recover,
     since,
     with_strangers,
@@ -172,6 +173,15 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             return shown_by(rendered), rendered.meta.needed.max()
         return show_moving(scene, pose, backdrop, plan.near, config.coarseness)
 
+    def look_again(params: Pose, last: _Last, backdrop: Backdrop | None, batch: TrackerBatch):
+        """What the last scene shows to the cameras of now, and what capacity that took."""
+        before = last.shown, jnp.int32(0)
+        if backdrop is None:
+            return before
+        scene, frame, plan, _ = batch
+        same = are_same(last.cameras, backdrop.cameras)
+        return jax.lax.cond(same, lambda: before, lambda: show(scene, params, frame, backdrop, plan))
+
     def look_back(params: Pose, state: TrackerState, batch: TrackerBatch) -> _Last:
         """What the last scene shows."""
         scene, frame, plan, _ = batch
@@ -211,35 +221,41 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         named = as_last_seen(firsts, last.shown, last.cameras, gap)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, state.pixels, remembered)
+        # What is doubtful is looked for elsewhere in two frames, which finding takes, and followed in two.
         astray = state.watch.lost | (state.watch.doubtful & (state.count % 4 < 2))
-        explained = explained_by(last.shown, astray, background)
-        around = Around(sight, explained, state.strangers)
+        before_now, near_needed = look_again(params, last, backdrop, batch)
+        others = depths_of_others(before_now, astray)
+        around = Around(sight, background, others, state.strangers)
 
         def recovered(group) -> Elsewhere:
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), state.count), group)
             own = jax.tree.map(lambda a: a[group], (firsts, centers, state.hunches))
             return recover(key, *own, around, config.align, gap)
 
-        def sure_of(points) -> Confidence:
-            return confidence(points, sight, gap, background)
+        def where_it_is() -> Confidence:
+            """By all that faces the cameras: what is lost is not where it was seen last."""
+            points = all_facing(firsts, kept.twists, centers, sight)
+            return confidence(points, sight, gap, background, others)
 
         still = jnp.zeros_like(state.motion.twists)
         jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
-        going = state.motion.twists
+        before = state.motion.twists
         starts, delta = [still], jnp.zeros_like(state.motion.delta)
         if config.matching:
             starts += [jumped]
         if config.warm_start:
-            starts += [going]
+            starts += [before]
             delta = state.motion.delta
         if config.matching and config.warm_start:
-            starts += [going.at[:, :3].set(jumped[:, :3])]
+            starts += [before.at[:, :3].set(jumped[:, :3])]
         if everywhere is None:
             everywhere = jnp.int32(
                 num_objects if config.align.everywhere is None else config.align.everywhere
             )
-        how = (config.align, state.watch, visible, everywhere, astray, recovered)
-        sought = search(jnp.stack(starts), points, centers, sight, *how)
+        how = (config.align, state.watch, visible, everywhere)
+        # Without depth, what hides a group cannot be told from what is not it.
+        elsewhere = () if sight.depths is None else (astray, recovered)
+        sought = search(jnp.stack(starts), points, centers, sight, *how, *elsewhere)
         residual = sought.found.residuals
         kept = begun = Motion(sought.found.twists, delta)
         needed, info, shifted = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
@@ -256,10 +272,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-        sure, again = sure_of(jax.vmap(carry)(named, kept.twists, centers)), sought.again
-        faced = jax.lax.cond(
-            astray.any(), lambda: sure_of(all_facing(firsts, kept.twists, centers, sight)), lambda: sure
-        )
+        again, carried = sought.again, jax.vmap(carry)(named, kept.twists, centers)
+        sure = confidence(carried, sight, gap, background)
+        faced = jax.lax.cond(astray.any(), where_it_is, lambda: sure)
         sure = jax.tree.map(partial(of_groups, state.watch.lost), faced, sure)
         better = evidence(again.sure) > _BETTER * evidence(faced)
         twice = is_found(again.sure, state.watch.showed) & is_found(again.before, state.watch.showed)
@@ -274,7 +289,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             drawn = jnp.maximum(last.rendered.meta.needed.max(), shown_needed)
             needed = needed._replace(full=drawn)
         else:
-            needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, shown_needed))
+            near_needed = jnp.maximum(near_needed, shown_needed)
+            needed = needed._replace(full=drawn, near=jnp.maximum(needed.near, near_needed))
         overflow = needed.exceeds(plan)
         sound = all_finite((pose, shifted)) & ~overflow
         pixels, strangers = look_at(shown, sight)
@@ -283,8 +299,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         told = memory(shown, backdrop, frame)
         watch = state.watch.after(residual, sought, counts, sure)
         hunches = of_groups(watch.doubtful & ~retaken, since(hunches, kept.twists), still)
-        new_state = TrackerState(kept, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
+        going = _select(retaken, jax.tree.map(jnp.zeros_like, kept), kept, groups)  # a find is no velocity
+        new_state = TrackerState(going, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
+        kept, watch = jax.tree.map(lambda a: jnp.where(sound, a, jnp.zeros_like(a)), kept), new_state.watch
         info |= {
             "overflow": overflow,
             "needed": needed,
