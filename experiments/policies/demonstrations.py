@@ -45,9 +45,13 @@ def record(count: int) -> None:
     world, good, tried = Bins(), 0, 0
     while good < count:
         path = HOME / f"demo_{tried:03d}.npz"
-        if not path.exists() and demonstrate(world, FIRST + tried, look=False) is not None:
-            if recorded := demonstrate(world, FIRST + tried):
-                np.savez_compressed(path, **recorded)
+        seed, missing = FIRST + tried, not path.exists()
+        if (
+            missing
+            and demonstrate(world, seed, look=False) is not None
+            and (seen := demonstrate(world, seed))
+        ):
+            np.savez_compressed(path, **seen)
         good, tried = good + path.exists(), tried + 1
         write_json(HOME / "demonstrations.json", {"tried": tried, "kept": good})
     print(f"{good} of {tried} demonstrations succeeded")
