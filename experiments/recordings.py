@@ -12,13 +12,13 @@ from rich.console import Console
 from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
 from gsjax.cli.scoring import Scores, group_values, metrics, score_motion
+from gsjax.cli.summary import MOVED_MM
 from gsjax.cli.views import views
 from gsjax.methods.object_tracker import StartConfig, TrackedScene, TrackerConfig, start_scene
 from gsjax.scene.frame import Frame
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 MASK_CAMERA = 1
-MOVED_MM = 30.0  # an object that moves less says little about a tracker
 QUIET = Console(stderr=True, quiet=True)
 
 

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter
@@ -120,6 +121,13 @@ class Experiment:
         texts = [self.text, *(path.read_text(encoding="utf-8") for path in beside)]
         return hashlib.sha256("\n".join([str(self.config.version), *texts]).encode()).hexdigest()[:16]
 
+    @property
+    def made_with(self) -> str:
+        """Version of gsjax, and a hash of its sources and of what experiments share at the root: rows
+        of one table may have been made with several, which is said below it."""
+        root = self.folder.parents[len(Path(self.name).parts) - 1]
+        return f"{import_module('gsjax').__version__}+{_hash_of(root.resolve())}"
+
     def path(self, cell: Cell) -> Path:
         """The file of a cell that ran on this machine."""
         return self.cells_folder / f"{cell.id}.json"
@@ -176,6 +184,14 @@ class Experiment:
         return run, figure
 
 
+@cache
+def _hash_of(root: Path) -> str:
+    """Of gsjax's files and those at the root of the experiments, as they are when first asked for."""
+    package = Path(import_module("gsjax").__file__).parent
+    paths = sorted(package.rglob("*.py")) + sorted(root.glob("*.py"))
+    return hashlib.sha256(b"\n".join(path.read_bytes() for path in paths)).hexdigest()[:8]
+
+
 def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bool = False) -> dict[str, Any]:
     """Run one cell and keep its record, also if it fails; only Ctrl-C leaves none. Returns the record.
 
@@ -186,6 +202,7 @@ def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bo
     folder, path = experiment.cells_folder / cell.id, experiment.path(cell)
     shutil.rmtree(folder, ignore_errors=True)  # a run that was stopped may have left half of something
     folder.mkdir(parents=True, exist_ok=True)
+    made_with = experiment.made_with
     result, error, trace, begun = None, None, [], perf_counter()
     try:
         result = script_run(copy.deepcopy(cell.options), cell.seed, folder)
@@ -206,7 +223,7 @@ def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bo
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "script": experiment.fingerprint,
         "machine": machine.describe(),  # asked after the script ran, which may configure JAX first
-        "gsjax": import_module("gsjax").__version__,
+        "gsjax": made_with,
     }
     write_json(path, record)
     with contextlib.suppress(OSError):  # files of the script's are in it

@@ -1,5 +1,6 @@
 """`gsjax grasp`: the best antipodal grasp of the object that a text means, in every frame of a run."""
 
+import math
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated
@@ -14,8 +15,8 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.outputs import write_png
-from gsjax.cli.query import Answer, Asked, ask, frame_rate, fresh_folder, progress, show
+from gsjax.cli.outputs import frame_rate, write_png
+from gsjax.cli.query import Answer, Asked, ask, fresh_folder, progress, show
 from gsjax.cli.saved_run import SavedRun
 from gsjax.cli.views import views
 from gsjax.geometry.cameras import project
@@ -36,7 +37,7 @@ class Options(Asked):
     """What `gsjax grasp` is told."""
 
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ("robot",)
-    """Objects that are no obstacles, as far as the run has them: the arm that is to grasp."""
+    """Objects that are no obstacles, as far as the run has them: the arm that is to grasp. No name: none."""
     approach: tuple[float, float, float] | None = None
     """Direction in which the gripper comes, in the world: 0 0 -1 is from above where z is up. Else any."""
     max_angle: float = 0.5
@@ -47,6 +48,11 @@ class Options(Asked):
     """Which grasps are tried. They ride with the object, so those of one frame are those of the next."""
     gripper: Gripper = field(default_factory=Gripper)
     """The gripper, in metres; a Franka Panda's hand unless told."""
+
+    def __post_init__(self):
+        if self.approach is not None and not 0 < math.hypot(*self.approach) < math.inf:
+            words = " ".join(f"{x:g}" for x in self.approach)
+            raise ValueError(f"--approach: expected a direction, such as 0 0 -1, found {words}")
 
 
 def run(options: Options) -> int:
@@ -87,12 +93,21 @@ def run(options: Options) -> int:
 
 
 def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Console) -> Grasp:
-    """The best grasp of each frame, stacked, on the host; none is feasible while the object is lost."""
+    """The best grasp of each frame, stacked, on the host; none is feasible while the object is lost.
+
+    Raises:
+        ValueError: nothing says which side of the object's surface is outside.
+    """
     scene, means = saved.tracking.scene, saved.tracking.means()
     points = means[:, answer.rows]
     obstacles = means[:, _obstacle_rows(options, saved, answer, means)]
     turns = quats_to_matrices(jnp.asarray(saved.tracking.quats()[:, answer.rows]))
     normals = np.asarray(jnp.einsum("tnij,nj->tni", turns, scene.normals[answer.rows]))
+    if not normals.any():
+        raise ValueError(
+            f"{saved.path}: expected normals of {answer.name}, found none: a run from known shapes has none, "
+            "and fingers need two sides to hold. Track it from depth images"
+        )
     approach = None if options.approach is None else jnp.asarray(options.approach, float)
     best = jax.jit(
         partial(

@@ -171,7 +171,7 @@ class Log:
         self.lost: list[np.ndarray] = []
         self.turn_known: list[np.ndarray] = []
         self._turned, self._centers = Rotation.identity(len(label_ids) - 1), None
-        self.late, self.counts, self.chosen, self.plans = 0, {}, None, set()
+        self.late, self.skipped, self.counts, self.chosen, self.plans = 0, 0, {}, None, set()
         self._memory_at = 0.0
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
@@ -182,6 +182,7 @@ class Log:
         self.latencies.append(now - arrival.time)
         self.seconds.append(update.seconds)
         self.late += update.seconds > budget
+        self.skipped += bool(update.info["skipped"])
         self.everywhere.append(update.everywhere)
         self.chosen = update.chosen
         self.plans.add(update.plan)
@@ -234,6 +235,7 @@ class Log:
             "latency_ms": _spread(self.latencies),
             "update_ms": _spread(self.seconds),
             "late": self.late,
+            "skipped": self.skipped,
             "looked_for": float(np.mean(self.everywhere)) if self.everywhere else None,
             "budget": None if self.chosen is None else budget_metrics(self.chosen),
             "plans": len(self.plans),
@@ -312,6 +314,9 @@ def _print(found: dict[str, Any], folder: RunFolder) -> None:
         spread = ", ".join(f"{name} {value:.0f} ms" for name, value in latency.items())
         table.add_row("[bold]latency[/]", f"from arrival to the new state: {spread}")
         table.add_row("[bold]late[/]", f"{found['late']} updates were over the budget")
+    if found["skipped"]:
+        words = f"{found['skipped']} updates came to nothing finite and were left out"
+        table.add_row("[bold]skipped[/]", words)
     for title, key in (("lost", "frames_lost"), ("turn unknown", "frames_turn_unknown")):
         counts = {name: count for name, count in found[key].items() if count}
         if counts:

@@ -61,11 +61,11 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
 
 
 def _expect_values(options: Any, arguments: list[str]) -> None:
-    """Raises a ValueError for a list that was begun and left empty: it would mean all there is."""
+    """Raises a ValueError for a list that was begun and left empty, where that would mean all there is."""
     given = {argument.replace("_", "-") for argument in arguments}
     for field in fields(options):
         flag = "--" + field.name.replace("_", "-")
-        if getattr(options, field.name) == () and flag in given:
+        if getattr(options, field.name) == field.default == () and flag in given:
             raise ValueError(f"{flag}: expected one value or more, found none")
 
 

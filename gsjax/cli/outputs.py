@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import FirstMask, Recording
@@ -62,6 +62,12 @@ def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -
     return path
 
 
+def frame_rate(times: Float[np.ndarray, "t"]) -> float:
+    """Frames a second of a video, near the recording's own."""
+    steps = np.diff(times)
+    return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
+
+
 class Film:
     """Writes each camera's video and a few of its renders as views go by: `with Film(...) as film`."""
 
@@ -73,9 +79,7 @@ class Film:
         """
         self._folder, self._frame_ids, self._colors = folder, recording.judged.frame_ids, colors
         self._kept = set(np.linspace(0, num_frames - 1, RENDERS).round().astype(int).tolist())
-        steps = np.diff(recording.judged.times)
-        rate = 1 / float(np.median(steps)) if len(steps) else MIN_VIDEO_HZ
-        self._fps = min(max(rate, MIN_VIDEO_HZ), MAX_VIDEO_HZ)
+        self._fps = frame_rate(recording.judged.times)
         self._stack = contextlib.ExitStack()
         self._videos: dict[int, VideoWriter] = {}
 

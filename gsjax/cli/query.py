@@ -10,13 +10,13 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.outputs import MAX_VIDEO_HZ, MIN_VIDEO_HZ, write_png
+from gsjax.cli.outputs import frame_rate, write_png
 from gsjax.cli.saved_run import SavedRun, open_run
 from gsjax.cli.views import View, views
 from gsjax.io.atomic import write_json, write_npz
@@ -169,12 +169,6 @@ def fresh_folder(path: Path) -> Path:
         shutil.rmtree(path)
     path.mkdir()
     return path
-
-
-def frame_rate(times: Float[np.ndarray, "t"]) -> float:
-    """Frames a second of a video, near the recording's own."""
-    steps = np.diff(times)
-    return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
 
 
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:

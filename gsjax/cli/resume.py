@@ -53,6 +53,9 @@ class Saver:
         self._at = perf_counter()
 
     def _write(self, tracking: Tracking, update: Tracked) -> None:
+        for path in _parts(self._folder):
+            if _frames_of(path) > self._saved:  # a state that failed to follow, or one of another life
+                path.unlink()
         news = tracking.poses[max(self._saved, 1) :]  # the first one is the scene's own
         if news:
             poses = jax.tree.map(lambda *rows: np.stack(rows), *news)
@@ -119,11 +122,20 @@ def _part(folder: Path, frames: int) -> Path:
     return folder / f"poses_{frames:06d}.npz"
 
 
+def _parts(folder: Path) -> list[Path]:
+    """All of them, in order."""
+    return sorted(folder.glob("poses_*.npz"))
+
+
+def _frames_of(part: Path) -> int:
+    return int(part.stem.removeprefix("poses_"))
+
+
 def _saved_poses(folder: Path, frames: int, structure: Any) -> list[Pose]:
     """The poses after the first one. Parts that were written after the state are of another life."""
     poses = []
-    for path in sorted(folder.glob("poses_*.npz")):
-        if int(path.stem.removeprefix("poses_")) <= frames:
+    for path in _parts(folder):
+        if _frames_of(path) <= frames:
             with np.load(path, allow_pickle=False) as part:
                 rows = zip(part["means"], part["quats"], strict=True)  # on the host, as `follow` keeps them
                 poses.extend(jax.tree.unflatten(structure, row) for row in rows)

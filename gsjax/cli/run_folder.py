@@ -31,7 +31,7 @@ class RunFolder:
           config.yml              the settings, written first; its first line marks the folder as a run's
           metrics.json            every score; what could not be computed is null
           trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
-                                  times [T], update_s [T]
+                                  times [T], update_s [T], lost [T,K], turn_known [T,K]
           scene.ply               the Gaussians of the first frame, with their labels
           renders/CAM/FRAME.png   rendered images
           video_CAM.mp4           input, render, error and labels side by side

@@ -38,7 +38,7 @@ from gsjax.cli.scoring import (
 )
 from gsjax.cli.summary import print_summary, write_run_report
 from gsjax.cli.views import views
-from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, start_scene
+from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, scene_from_shapes, start_scene
 from gsjax.scene.frame import Frame
 
 
@@ -149,8 +149,6 @@ def _start(
         if mask.labels is not None:
             scene = start_scene(frame, mask.labels, recording.tracked.camera_ids.index(mask.camera), config)
         else:
-            from gsjax.methods.object_tracker import scene_from_shapes
-
             scene = scene_from_shapes(recording.tracked.models, frame, config)
     warn_of_missing(recording, mask, scene.label_ids, notes)
     seconds = perf_counter() - begun

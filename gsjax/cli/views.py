@@ -31,7 +31,7 @@ class View(NamedTuple):
         image, depth, mask: what the camera saw; None where there is no such file.
         render, render_depth: the scene; depth 0 where nothing is drawn.
         groups: the group on top in each pixel, 0 for background.
-        covered: share of the pixels where something is drawn.
+        covered: where something is drawn.
     """
 
     t: int

@@ -209,7 +209,7 @@ def score_grasp(
     far = _contact(cosines, high - local[:, 1], between)
     near, far = jnp.where(near_seen, near, far), jnp.where(far_seen, far, near)
     cosine = jnp.where(near_seen | far_seen, jnp.minimum(near, far), 0.0)
-    score = cosine * jnp.where(near_seen & far_seen, 1.0, unseen)
+    score = jnp.where(sound, cosine * jnp.where(near_seen & far_seen, 1.0, unseen), 0.0)
     holds = held & (score > 0) & (cosine >= 1 / jnp.hypot(1.0, gripper.friction))
 
     pose = pose.at[:3, 3].add(middle * axes[:, 1])

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsjax.cli import machine, main
+from gsjax.cli import experiment_sweep, machine, main
 from gsjax.cli.experiment import choose
 from gsjax.cli.experiment_sweep import Cell, read_experiment
 
@@ -321,10 +321,22 @@ def test_machines_are_named_in_the_rows_where_they_differ(toy, gsjax):
     record = json.loads(cell_files()[0].read_text())
     cell_files()[0].write_text(json.dumps({**record, "machine": record["machine"] | {"processor": "abacus"}}))
     _, out, _ = gsjax("table", "toy")
-    assert re.search(r"Machine: abacus, .*, gsjax 0.1.0 \(1 of 4 cells\)\.", out)
+    assert re.search(r"Machine: abacus, .*, gsjax 0.1.0\+\w{8} \(1 of 4 cells\)\.", out)
     found = results(folder)
     assert "machine" not in found["same"]
     assert sum(row["machine"]["processor"] == "abacus" for row in found["rows"]) == 1
+
+
+def test_rows_of_two_versions_are_said_to_be(toy, gsjax):
+    """What experiments share may change between two cells, as gsjax itself may: neither makes them stale."""
+    folder = toy()
+    gsjax("run", "toy", "--only", "size=320")
+    (folder.parent / "shared.py").write_text("WIDTH = 640")
+    experiment_sweep._hash_of.cache_clear()
+    _, out, _ = gsjax("run", "toy")
+    made = re.findall(r"Machine: .*, gsjax 0.1.0\+(\w{8}) \((\d) of (\d) cells\)", out)
+    assert len({version for version, *_ in made}) == len(made) == 2
+    assert sum(int(count) for _, count, _ in made) == int(made[0][2])
 
 
 def test_without_columns_the_table_has_every_plain_figure(toy, gsjax):

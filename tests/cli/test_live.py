@@ -20,8 +20,9 @@ def standing_still(scene, first, frames, config, *, budget_ms):
     info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
     info["lost"] = jnp.arange(groups) == groups - 1
     info["turn_known"] = jnp.arange(groups) > 0
-    for _ in frames:
-        yield Tracked(scene, first_pose(scene), None, info, 0.001, 0.0, None, 2)
+    for count, _ in enumerate(frames):
+        now = info | {"skipped": count == 2}
+        yield Tracked(scene, first_pose(scene), None, now, 0.001, 0.0, None, 2)
 
 
 def unfitted(frame, mask, camera, config):
@@ -52,6 +53,8 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert frames["offered"] == 10
     assert frames["used"] + frames["dropped"] == 10
     assert found["complete"]
+    assert found["skipped"] == 1
+    assert "1 updates came to nothing finite" in said
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
     assert "10 offered" in said

@@ -172,6 +172,19 @@ def test_what_is_to_be_ignored_must_be_there(gsjax, tracked):
     assert "has no object 'gripper'; it has robot, carton" in said
 
 
+@pytest.mark.parametrize("approach", [("0", "0", "0"), ("0", "0", "nan")])
+def test_an_approach_must_have_a_direction(gsjax, tracked, approach):
+    code, said = gsjax("grasp", tracked, "can", "--approach", *approach)
+    assert code == 2
+    assert f"--approach: expected a direction, such as 0 0 -1, found {' '.join(approach)}" in said
+
+
+def test_nothing_at_all_may_be_ignored(gsjax, run):
+    """A list that is empty by itself means all there is; one that is not, none."""
+    code, said = gsjax("grasp", run, "can", "--samples", "16", "--ignore")
+    assert code in (0, 3), said
+
+
 def test_a_grasp_is_drawn_where_it_is():
     picture = np.full((200, 300, 3), 40, np.uint8)
     K = np.array([[200.0, 0, 150], [0, 200, 100], [0, 0, 1]])

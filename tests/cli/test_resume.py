@@ -2,14 +2,19 @@
 
 import errno
 import json
+import warnings
+from unittest.mock import Mock
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gsjax.cli.loop
 import gsjax.cli.resume
 import gsjax.methods.object_tracker
-from gsjax.methods.object_tracker import track
+from gsjax.cli.loop import Tracking
+from gsjax.methods.object_tracker import Pose, Tracked, track
 
 OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--tracker.start.iterations", "5")
 
@@ -74,3 +79,28 @@ def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, 
     assert code == 0, said
     assert "could not save what --resume needs" in said
     assert "no space left on device" in said.lower()
+
+
+def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatch):
+    """The poses fit on the disk, the larger state does not; or a run is killed between the two."""
+
+    def tracked_up_to(frames: int):
+        rows = [Pose(jnp.full((3, 3), float(t)), jnp.full((3, 4), float(t))) for t in range(frames)]
+        notes = {"joined": 0, "update_s": [], "skipped": 0, "visible": [], "lost": [], "turn_known": []}
+        return Mock(spec=Tracking, poses=rows, num_frames=frames, scene=None, everywhere=[], **notes)
+
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    update = Mock(spec=Tracked, scene=None, pose=None, state=None, chosen=None)
+    monkeypatch.setattr(gsjax.cli.resume, "_shapes", lambda scene: {})
+    monkeypatch.setattr(gsjax.cli.resume, "_chosen_metadata", lambda chosen: None)
+    saver, written = gsjax.cli.resume.Saver(tmp_path), []
+    for frames, save in ((10, written.append), (20, full), (30, written.append)):
+        monkeypatch.setattr(gsjax.cli.resume, "save_checkpoint", lambda path, *_, save=save: save(path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            saver(tracked_up_to(frames), update, True)
+    assert len(written) == 2
+    saved = gsjax.cli.resume._saved_poses(tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0]))
+    assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))

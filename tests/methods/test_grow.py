@@ -100,7 +100,7 @@ def test_full_slots_overwrite_nothing(table, torn, plan):
     assert jnp.isfinite(pose.means).all()
 
 
-def test_reach_and_distance_of_nothing_grow_nothing(table, torn, plan):
+def test_no_distance_and_no_gap_so_wide_grow_nothing(table, torn, plan):
     frame = table()[1][0]
     for config in (replace(CONFIG, distance=1e-6), replace(CONFIG, min_gap=10.0)):
         scene, _ = grown(with_slots(torn, 64), frame, plan, config=config)

@@ -1,5 +1,6 @@
 """The tracker from end to end on a tiny simulated table. Figures are millimetres at 96 x 72 pixels."""
 
+import re
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from gsjax.methods.object_tracker import (
+    AlignConfig,
+    GrowConfig,
     MatchConfig,
     TrackedScene,
     TrackerConfig,
@@ -72,6 +75,21 @@ def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, q
         assert not result.info["skipped"]
     with pytest.raises(ValueError, match=r"redraw: expected all where refine.iterations is above 0"):
         replace(quick, redraw="moving")
+
+
+@pytest.mark.parametrize(
+    ("config", "changes", "said"),
+    [
+        (AlignConfig, {"everywhere": -1}, "AlignConfig.everywhere: expected 0 or more, found -1"),
+        (AlignConfig, {"shading": float("nan")}, "AlignConfig.shading: expected 0 or more, found nan"),
+        (AlignConfig, {"turns": (0.2, -0.2)}, "AlignConfig.turns: expected more than 0, pi at most, found"),
+        (MatchConfig, {"min_score": float("nan")}, "MatchConfig.min_score: expected -1 or more, found nan"),
+        (GrowConfig, {"min_gap": -0.1}, "GrowConfig.min_gap: expected more than 0, found -0.1"),
+    ],
+)
+def test_settings_without_meaning_are_refused(config, changes, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        config(**changes)
 
 
 def test_labels_keep_the_masks_values(table, started):
@@ -138,6 +156,8 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     assert info["overflow"]
     assert info["skipped"]
     jax.tree.map(np.testing.assert_array_equal, (new, new_state), (pose, state))
+    assert not np.any(info["motion"].twists)
+    np.testing.assert_array_equal(info["turn_known"], state.watch.turn_known)
 
     monkeypatch.setattr(tracking, "plan_tracker", lambda *_: small)
     before = tracked[0]._replace(scene=scene, pose=pose, state=state)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsjax.cli.summary import MOVED_MM
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
 from gsjax.methods.object_tracker import (
@@ -25,7 +26,6 @@ from gsjax.methods.object_tracker import (
 from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
 
 FRAMES, WIDTH, HEIGHT, CAMERAS, MASK_CAMERA = 24, 240, 180, 2, 1
-MOVED_MM = 30.0  # an object that moves less says little about a tracker
 WARM_UP = 2  # updates whose times are left out
 KINDS = {"fixed": False, "moving": True}
 

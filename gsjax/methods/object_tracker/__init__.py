@@ -1,7 +1,6 @@
 """The object-aware tracker (Object-Aware Gaussian Splatting for Robotic Manipulation): from one view's mask.
 
-Read the files as the data flows: config, scene, fit, shapes, motion, layers, matching, points, align,
-search, region, refine, tracker, grow, budget, tracking; and what it is for: features, query.
+docs/architecture.md has the files in the order in which the data flows.
 """
 
 from gsjax.methods.object_tracker.config import (

@@ -1,5 +1,6 @@
 """The settings of the object-aware tracker, with their units and what they trade."""
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -60,7 +61,8 @@ class MatchConfig:
     """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
 
     def __post_init__(self):
-        _check(self, above_zero=("max_residual",), at_least={"patch": 8, "radius": 1, "margin": 0})
+        least = {"patch": 8, "radius": 1, "margin": 0, "min_score": -1}
+        _check(self, above_zero=("max_residual",), at_least=least)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class AlignConfig:
     """Direct alignment of pixels, before anything is rendered."""
 
     iterations: int = 6
-    """Gauss-Newton iterations a frame; 0 leaves it out."""
+    """Levenberg-Marquardt iterations a start; with 0, `reach` 0 and `turns` () alignment is left out."""
     color_scale: float = 0.1
     """A difference of log colours that is large; they span about 0 to 1."""
     depth_scale: float = 0.01
@@ -112,9 +114,14 @@ class AlignConfig:
                 "pixels": 1,
                 "reach": 0,
                 "keyframe_turn": 0,
+                "shading": 0,
                 "max_turn": 0,
             },
         )
+        if self.everywhere is not None:
+            _check(self, at_least={"everywhere": 0})
+        if not all(0 < turn <= math.pi for turn in self.turns):
+            raise ValueError(f"AlignConfig.turns: expected more than 0, pi at most, found {self.turns}")
 
 
 @dataclass(frozen=True)
@@ -172,7 +179,8 @@ class GrowConfig:
     """... and in colour, 0 to 1. Both count together, and the background's Gaussians compete."""
 
     def __post_init__(self):
-        _check(self, above_zero=("distance", "color"), at_least={"slots": 0, "candidates": 1, "reach": 0})
+        lengths = ("min_gap", "distance", "color")
+        _check(self, above_zero=lengths, at_least={"slots": 0, "candidates": 1, "reach": 0})
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def track(
 
     Args:
         scene: from `start_scene` or `scene_from_shapes`.
-        first: the frame that `scene` or `pose` shows.
+        first: the frame that `scene` shows; with `after`, the frame that it shows.
         frames: the frames after it, in order of time; all of one size and number of cameras.
         config: see `TrackerConfig`.
         budget_ms: what an update may take, milliseconds. The richest settings that keep to it are then chosen
