@@ -173,9 +173,10 @@ def test_what_is_to_be_ignored_must_be_there(gsjax, tracked):
 
 
 @pytest.mark.parametrize("approach", [("0", "0", "0"), ("0", "0", "nan")])
-def test_an_approach_must_have_a_direction(gsjax, tracked, approach):
-    code, said = gsjax("grasp", tracked, "can", "--approach", *approach)
-    assert code == 2
+def test_an_approach_must_have_a_direction(capfd, tracked, approach):
+    with pytest.raises(SystemExit, match="2"):
+        main(["grasp", str(tracked), "can", "--approach", *approach])
+    said = " ".join(capfd.readouterr().err.replace("│", " ").split())
     assert f"--approach: expected a direction, such as 0 0 -1, found {' '.join(approach)}" in said
 
 
