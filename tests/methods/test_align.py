@@ -408,7 +408,7 @@ def test_a_watch_knows_what_is_usual_and_who_waits():
     for t in range(60):
         shown = jnp.array([t, 60.0 - t])
         sure = Confidence(jnp.array([0.9, 0.2]), jnp.array([0.8, 0.1]), jnp.array([True, t > 0]))
-        watch = watch.after(jnp.array([0.4, 0.0]), nothing_of([False, True]), shown, sure)
+        watch = watch.after(jnp.array([0.4, 0.0]), nothing_of([False, True]), shown, sure, shown < 0)
         np.testing.assert_array_equal(watch.lost, [False, t > 0])  # where nothing tells, all is as before
     np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
     np.testing.assert_allclose(watch.waited, [60, 0])
@@ -439,7 +439,7 @@ def test_what_is_lost_is_found_only_when_it_shows_itself():
     ]
     for agrees, shows, lost in told:
         sure = Confidence(jnp.array([agrees]), jnp.array([shows]), one)
-        watch = watch.after(none, nothing_of([True]), none, sure)
+        watch = watch.after(none, nothing_of([True]), none, sure, none > 0)
         assert bool(watch.lost[0]) == lost, (agrees, shows)
 
 
@@ -457,5 +457,9 @@ def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
     ]
     for agrees, lead, known in told:
         sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
-        watch = watch.after(none, nothing_of([True], lead), none, sure)
+        watch = watch.after(none, nothing_of([True], lead), none, sure, none > 0)
         assert bool(watch.turn_known[0]) == known, (agrees, lead)
+    for agrees, known in ((0.9, True), (0.62, False)):  # moved to where it was found, though it was not lost
+        sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
+        watch = watch.after(none, nothing_of([True]), none, sure, one)
+        assert bool(watch.turn_known[0]) == known, agrees

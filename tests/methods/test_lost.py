@@ -15,7 +15,7 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.methods.object_tracker import GrowConfig, RefineConfig, first_pose, track
 from gsjax.methods.object_tracker.align import coarse_shifts
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.firsts import all_facing, as_facing, as_last_seen, firsts_of
+from gsjax.methods.object_tracker.firsts import Firsts, all_facing, as_facing, as_last_seen, firsts_of, radii
 from gsjax.methods.object_tracker.layers import Shown
 from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, is_found
 from gsjax.methods.object_tracker.motion import facing
@@ -241,6 +241,14 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
     moved = carry(points, twists[1], center)
     again = carry(moved, since(twists[0], twists[1]), center + twists[1, :3]).means
     np.testing.assert_allclose(again, there, atol=1e-4)
+
+
+def test_radii_are_of_those_that_there_are():
+    means = jnp.zeros((2, 3, 4)).at[0, 0].set(jnp.array([3.0, 5.0, 1.0, 9.0])).at[1, 2, 0].set(7.0)
+    real = jnp.array([[True, True, False, False], [False] * 4])
+    firsts = Firsts(means, means, means, real)
+    found = radii(firsts, jnp.array([[4.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(found, [5**0.5, 0.0], rtol=1e-6)
 
 
 def test_depths_of_others_are_those_of_what_is_not_astray(carton):

@@ -41,6 +41,12 @@ def firsts_of(scene: TrackedScene, pose: Pose, config: AlignConfig) -> Firsts:
     return Firsts(*(jnp.swapaxes(a, 1, 2) for a in (pose.means[rows], normals, colors)), real)
 
 
+def radii(firsts: Firsts, centers: Float[Array, "k 3"]) -> Float[Array, "k"]:
+    """How far they lie from what their groups turn about, root mean square, metres."""
+    squared = jnp.sum((firsts.means - centers[..., None]) ** 2, axis=-2)
+    return jnp.sqrt(jnp.sum(squared * firsts.real, axis=-1) / jnp.maximum(firsts.real.sum(-1), 1))
+
+
 def as_last_seen(firsts: Firsts, shown: Shown, cameras: Camera, gap: float) -> Points:
     """Those of every group, of which cameras look for what they saw in the last frame.
 

@@ -146,6 +146,7 @@ class Watch(NamedTuple):
         sought: Sought,
         shown: Float[Array, "k"],
         sure: Confidence,
+        retaken: Bool[Array, "k"],
     ) -> "Watch":
         """One frame later.
 
@@ -154,12 +155,13 @@ class Watch(NamedTuple):
             sought: what the search found.
             shown: pixels that showed each group.
             sure: whether each group is where it is believed to be.
+            retaken: groups that were moved to where they were found.
         """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
         lost = jnp.where(self.lost, ~is_found(sure, self.showed), sure.agrees < LOST)
         lost = jnp.where(sure.tells, lost, self.lost)
         as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
-        told = jnp.where(self.lost, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
+        told = jnp.where(self.lost | retaken, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
         return Watch(
             usual,
             jnp.where(sought.looked_for, 0.0, self.waited + 1.0),

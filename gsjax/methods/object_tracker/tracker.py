@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker.config import TrackerConfig
-from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of
+from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of, radii
 from gsjax.methods.object_tracker.layers import (
     Backdrop,
     Shown,
@@ -278,7 +278,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         sure = jax.tree.map(partial(of_groups, state.watch.lost), faced, sure)
         better = evidence(again.sure) > _BETTER * evidence(faced)
         twice = is_found(again.sure, state.watch.showed) & is_found(again.before, state.watch.showed)
-        retaken = sought.recovered & better & twice
+        # What is not lost is seen where it is. Turned otherwise there, it is in no other place.
+        away = jnp.linalg.norm(again.twists[:, :3], axis=-1) > radii(firsts, centers)
+        retaken = sought.recovered & better & twice & (state.watch.lost | away)
         hunches = of_groups(sought.recovered, again.twists, state.hunches)
         kept = _select(retaken, Motion(again.twists, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
@@ -297,7 +299,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, sought, counts, sure)
+        watch = state.watch.after(residual, sought, counts, sure, retaken)
         hunches = of_groups(watch.doubtful & ~retaken, since(hunches, kept.twists), still)
         going = _select(retaken, jax.tree.map(jnp.zeros_like, kept), kept, groups)  # a find is no velocity
         new_state = TrackerState(going, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
