@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 
 @cache
@@ -17,6 +19,22 @@ def host_options() -> dict[str, Any]:
     """
     wide = jax.default_backend() == "cpu" and has_avx512()
     return {"xla_cpu_prefer_vector_width": 512} if wide else {}
+
+
+def in_memory(arrays: Any, true: Bool[Array, ""]) -> Any:
+    """`arrays`, worked out before anything reads them. It is for what tells where to read.
+
+    XLA:CPU fuses that with the reading and works it out again for every number read: the place of a pixel for
+    each of its channels, and of those of its three neighbours. It drops `jax.lax.optimization_barrier` before
+    it fuses; a branch is a barrier that it keeps.
+
+    Args:
+        arrays: a pytree.
+        true: a flag that is true, which the compiler cannot know; of no axis that is mapped over.
+    """
+    if jax.default_backend() != "cpu":
+        return arrays
+    return jax.lax.cond(true, lambda: arrays, lambda: jax.tree.map(jnp.zeros_like, arrays))
 
 
 def has_avx512() -> bool:

@@ -18,6 +18,7 @@ from gsjax.methods.object_tracker.align import (
     ball,
     bilinear,
     disagreement,
+    spot,
     turned,
 )
 from gsjax.methods.object_tracker.config import AlignConfig
@@ -211,7 +212,7 @@ def test_a_keyframe_is_carried_and_renewed_where_a_group_has_turned():
 def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():
     image = jnp.asarray(np.mgrid[0:4, 0:5].transpose(1, 2, 0) + 0.5, jnp.float32)  # (row, column) of centres
     places = jnp.array([[2.3, 1.7], [0.5, 0.5], [4.5, 3.5]])
-    read = bilinear(image, *places.T)
+    read = bilinear(image, spot(*places.T, 5, 4))
     np.testing.assert_allclose(read.values.T, places[:, ::-1], atol=2e-3)
     np.testing.assert_allclose(read.slopes, np.tile([[[0], [1]], [[1], [0]]], 3), atol=1e-6)
     np.testing.assert_allclose(read.nearest.T, [[1.5, 2.5], [0.5, 0.5], [3.5, 4.5]])

@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.points import Points, Sight, carry, rotated
+from gsjax.optim.compiler import in_memory
 
 
 def widened(config: AlignConfig) -> AlignConfig:
@@ -38,15 +39,27 @@ class Read(NamedTuple):
     nearest: Float[Array, "d p"]  # of the pixel that the place lies in
 
 
-def bilinear(image: Float[Array, "h w d"], x: Float[Array, "p"], y: Float[Array, "p"]) -> Read:
-    """`image` between pixel centres (at +0.5); outside, its border."""
-    height, width, channels = image.shape
+class Spot(NamedTuple):
+    """Where p places lie between the centres of four pixels, which are at +0.5."""
+
+    pixel: Int[Array, "p"]  # the upper left one, counted row by row
+    right: Float[Array, "p"]  # how far right of it, pixels: 0 to 1
+    down: Float[Array, "p"]
+
+
+def spot(x: Float[Array, "p"], y: Float[Array, "p"], width: int, height: int) -> Spot:
+    """The spot of a place (x, y), pixels; outside of the image, the nearest on its border."""
     x = jnp.clip(x - 0.5, 0.0, width - 1.001)
     y = jnp.clip(y - 0.5, 0.0, height - 1.001)
     column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
-    right, down = x - column, y - row
-    place, pixels = row * width + column, image.reshape(-1, channels)
-    a, b, c, d = (pixels[place + offset].T for offset in (0, 1, width, width + 1))
+    return Spot(row * width + column, x - column, y - row)
+
+
+def bilinear(image: Float[Array, "h w d"], at: Spot) -> Read:
+    """`image` there."""
+    _, width, channels = image.shape
+    (pixel, right, down), pixels = at, image.reshape(-1, channels)
+    a, b, c, d = (pixels[pixel + offset].T for offset in (0, 1, width, width + 1))
     upper, lower = a + right * (b - a), c + right * (d - c)
     across = (b - a) + down * ((d - c) - (b - a))
     above, below = jnp.where(right < 0.5, a, b), jnp.where(right < 0.5, c, d)
@@ -69,13 +82,14 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
     """Of one group's points."""
     height, width, channels = sight.pixels.shape[1:]
     scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
+    true = sight.cameras.K[0, 0, 0] > 0
 
     def one(means, tones, viewmat, K, image):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = jnp.maximum(local[2], 1e-6)
         x, y, _ = rotated(K, local) / z
         inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
-        found, (across, along), nearest = bilinear(image, x, y)
+        found, (across, along), nearest = bilinear(image, in_memory(spot(x, y, width, height), true))
         wanted, counts = tones, jnp.broadcast_to(inside, tones.shape)
         if channels == 4:
             # The depth between pixels that lie on two surfaces is nobody's: there, the nearest pixel's.

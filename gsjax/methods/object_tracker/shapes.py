@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.geometry.cameras import project
 from gsjax.geometry.neighbors import nearest
 from gsjax.geometry.spherical_harmonics import rgb_to_sh0
-from gsjax.methods.object_tracker.align import bilinear
+from gsjax.methods.object_tracker.align import bilinear, spot
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.layers import render_labels
@@ -176,9 +176,9 @@ def _cost(poses, means, colors, frame):
 
         def view(viewmat, K, image):
             pixels, z = project(moved, viewmat, K)
-            size = jnp.array([image.shape[1], image.shape[0]])
-            inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-            gap = jnp.abs(bilinear(image, *pixels.T).values.T - colors).mean(-1)
+            size = image.shape[1::-1]
+            inside = ((pixels > 0) & (pixels < jnp.array(size))).all(-1) & (z > 0)
+            gap = jnp.abs(bilinear(image, spot(*pixels.T, *size)).values.T - colors).mean(-1)
             return jnp.where(inside, jnp.minimum(gap, _COLOR_LIMIT), _COLOR_LIMIT).mean()
 
         return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images).mean()
@@ -202,10 +202,10 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
 
     def view(viewmat, K, image, near):
         pixels, z = project(scene.gaussians.means, viewmat, K)
-        size = jnp.array([image.shape[1], image.shape[0]])
-        inside = ((pixels > 0) & (pixels < size)).all(-1) & (z > 0)
-        close = bilinear(near[..., None], *pixels.T).values[0] > 0.1
-        return bilinear(image, *pixels.T).values.T, inside, close
+        size = image.shape[1::-1]
+        inside = ((pixels > 0) & (pixels < jnp.array(size))).all(-1) & (z > 0)
+        at = spot(*pixels.T, *size)
+        return bilinear(image, at).values.T, inside, bilinear(near[..., None], at).values[0] > 0.1
 
     return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images, near)
 
