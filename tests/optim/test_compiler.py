@@ -1,0 +1,32 @@
+"""What makes programs faster on the host changes none of what they give."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.optim.compiler import in_memory
+
+
+def read(image, x, true):
+    """The sum of the two pixels around each place."""
+    pixel = jnp.floor(x).astype(jnp.int32)
+    pixel = pixel if true is None else in_memory(pixel, true)
+    return image[pixel] + image[pixel + 1]
+
+
+def test_what_is_written_to_memory_is_the_same_mapped_and_differentiated():
+    image, true = jax.random.normal(jax.random.key(0), (50, 4)), jnp.array(True)
+    x = jax.random.uniform(jax.random.key(1), (3, 20), maxval=48.0)
+    mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
+    np.testing.assert_array_equal(mapped(image, x, true), jnp.stack([read(image, row, None) for row in x]))
+    slopes = [jax.grad(lambda a, flag=flag: (read(a, x[0], flag) ** 2).sum())(image) for flag in (true, None)]
+    np.testing.assert_allclose(*slopes, rtol=1e-6)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere it is nothing")
+def test_the_compiler_keeps_the_branch():
+    """It would drop jax.lax.optimization_barrier. The flag is of no axis that is mapped over."""
+    image, x = jnp.ones((50, 4)), jnp.ones((3, 20))
+    mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
+    assert " conditional(" in mapped.lower(image, x, jnp.array(True)).compile().as_text()
