@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.cameras import Camera, camera_centers, project, resized
 from gsjax.methods.object_tracker.motion import Pose, facing, place
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.optim.compiler import in_memory
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.scene.frame import Frame
@@ -138,7 +139,8 @@ def show_moving(
     on_top = (alphas > 0.5) & ~behind
     labels = jnp.where(on_top & (labels <= scene.num_objects), labels, 0)
     depths = jnp.where(on_top, depths, backdrop.depths)
-    return Shown(labels, depths, on_top | backdrop.covers), meta.needed.max()
+    shown = in_memory(Shown(labels, depths, on_top | backdrop.covers), cameras.K[0, 0, 0] > 0)
+    return shown, meta.needed.max()
 
 
 def seen_from(
