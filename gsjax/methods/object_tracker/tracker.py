@@ -173,14 +173,14 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             return shown_by(rendered), rendered.meta.needed.max()
         return show_moving(scene, pose, backdrop, plan.near, config.coarseness)
 
-    def look_again(params: Pose, last: _Last, backdrop: Backdrop | None, batch: TrackerBatch):
-        """What the last scene shows to the cameras of now, and what capacity that took."""
-        before = last.shown, jnp.int32(0)
-        if backdrop is None:
-            return before
+    def look_again(params: Pose, last: _Last, backdrop: Backdrop | None, batch: TrackerBatch, asked):
+        """What the last scene shows to the cameras of now, if that is asked, and what capacity that took."""
         scene, frame, plan, _ = batch
-        same = are_same(last.cameras, backdrop.cameras)
-        return jax.lax.cond(same, lambda: before, lambda: show(scene, params, frame, backdrop, plan))
+        before = last.shown, jnp.int32(0)
+        if backdrop is None or frame.depths is None:
+            return before
+        moved = asked & ~are_same(last.cameras, backdrop.cameras)
+        return jax.lax.cond(moved, lambda: show(scene, params, frame, backdrop, plan), lambda: before)
 
     def look_back(params: Pose, state: TrackerState, batch: TrackerBatch) -> _Last:
         """What the last scene shows."""
@@ -223,7 +223,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         points = join(weighted, state.pixels, remembered)
         # What is doubtful is looked for elsewhere in two frames, which finding takes, and followed in two.
         astray = state.watch.lost | (state.watch.doubtful & (state.count % 4 < 2))
-        before_now, near_needed = look_again(params, last, backdrop, batch)
+        before_now, near_needed = look_again(params, last, backdrop, batch, astray.any())
         others = depths_of_others(before_now, astray)
         around = Around(sight, background, others, state.strangers)
 
@@ -304,7 +304,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         going = _select(retaken, jax.tree.map(jnp.zeros_like, kept), kept, groups)  # a find is no velocity
         new_state = TrackerState(going, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
-        kept, watch = jax.tree.map(lambda a: jnp.where(sound, a, jnp.zeros_like(a)), kept), new_state.watch
+        kept, watch = keep_if(sound, kept, jax.tree.map(jnp.zeros_like, kept)), new_state.watch
         info |= {
             "overflow": overflow,
             "needed": needed,
