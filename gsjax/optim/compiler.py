@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Float
 
 
 @cache
@@ -21,19 +21,21 @@ def host_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if wide else {}
 
 
-def in_memory(arrays: Any, true: Bool[Array, ""]) -> Any:
-    """`arrays`, worked out before anything reads them. It is for what tells where to read.
+def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
+    """`arrays`, worked out before anything reads them. It is for what is read more than once.
 
-    XLA:CPU fuses that with the reading and works it out again for every number read: the place of a pixel for
-    each of its channels, and of those of its three neighbours. It drops `jax.lax.optimization_barrier` before
-    it fuses; a branch is a barrier that it keeps.
+    XLA:CPU fuses what is worked out with the reading, and works it out again for every number read: the place
+    of a pixel for each of its channels, and of those of its three neighbours. It drops
+    `jax.lax.optimization_barrier` before it fuses; a branch is a barrier that it keeps.
 
     Args:
         arrays: a pytree.
-        true: a flag that is true, which the compiler cannot know; of no axis that is mapped over.
+        finite: numbers that are, which the compiler cannot know; of no axis that is mapped over. Where the
+            first is not, what comes back is zeros.
     """
     if jax.default_backend() != "cpu":
         return arrays
+    true = jnp.isfinite(finite.ravel()[0])
     return jax.lax.cond(true, lambda: arrays, lambda: jax.tree.map(jnp.zeros_like, arrays))
 
 

@@ -258,7 +258,8 @@ def test_normal_equations_are_those_of_differentiation(moved, depth):
     jacobian, base = jax.jacfwd(values)(jnp.zeros(6)), _residuals(points, sight, CONFIG)
     squared = base.values**2
     squared = squared.at[:, :3].set(squared[:, :3].mean(1, keepdims=True))
-    weights = points.seen[:, None] * base.counts / (1 + squared) ** 2
+    counts = base.counts[:, [0, 0, 0, 1][: squared.shape[1]]]  # the channels of colour share theirs
+    weights = points.seen[:, None] * counts / (1 + squared) ** 2
     expected = jnp.einsum("cdpi,cdp,cdpj->ij", jacobian, weights, jacobian)
     np.testing.assert_allclose(fit.hessian, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
     expected = jnp.einsum("cdpi,cdp,cdp->i", jacobian, weights, base.values)

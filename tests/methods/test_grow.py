@@ -10,7 +10,14 @@ import pytest
 
 from gsjax.methods.object_tracker import first_pose, render_labels
 from gsjax.methods.object_tracker.config import GrowConfig
-from gsjax.methods.object_tracker.grow import EMPTY, empty_slots, grow, unexplained, with_slots
+from gsjax.methods.object_tracker.grow import (
+    EMPTY,
+    _some_of,
+    empty_slots,
+    grow,
+    unexplained,
+    with_slots,
+)
 from gsjax.methods.object_tracker.layers import shown_by
 from gsjax.metrics.tracking import true_labels
 from gsjax.scene.render import plan_render, render
@@ -46,6 +53,21 @@ def grown(scene, frame, plan, steps=1, config=CONFIG):
     for step in range(steps):
         scene, pose = once(scene, pose, step)
     return scene, pose
+
+
+@pytest.mark.parametrize("num_chosen", [0, 3, 16, 700, 1000])
+def test_some_of_the_chosen_are_taken_and_all_get_their_turn(num_chosen):
+    size, count = 1000, 16
+    chosen = np.zeros(size, bool)
+    chosen[np.random.default_rng(0).permutation(size)[:num_chosen]] = True
+    some_of = jax.jit(lambda step: _some_of(jnp.asarray(chosen), step, count))
+    taken = set()
+    for step in range(400):
+        places, real = map(np.asarray, some_of(step))
+        assert chosen[places[real]].all()
+        assert real.all() or num_chosen < 20 * count
+        taken |= set(places[real].tolist())
+    assert taken == set(np.flatnonzero(chosen)) if num_chosen <= count else len(taken) > 0.9 * num_chosen
 
 
 def test_slots_draw_nothing_and_belong_to_nobody(table, started, plan):

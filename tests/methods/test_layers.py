@@ -8,6 +8,7 @@ import pytest
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker import first_pose, render_labels
 from gsjax.methods.object_tracker.layers import (
+    OUTLINES,
     Backdrop,
     background_of,
     draw_backdrop,
@@ -29,7 +30,7 @@ def plans(table, started):
     return (
         plan_render(started.gaussians, cameras, headroom=2.0),
         plan_render(background_of(started), cameras, headroom=2.0),
-        plan_render(moving, cameras, headroom=2.0, sh_degree=None),
+        plan_render(moving, cameras, headroom=2.0, sh_degree=None, **OUTLINES),
     )
 
 
@@ -54,6 +55,17 @@ def test_layers_show_what_the_whole_scene_shows(both, started):
     assert (np.asarray(whole.covered) == np.asarray(shown.covered)).mean() > 0.98
     inside = agree & (np.asarray(whole.labels) > 0)
     assert np.median(np.abs(whole.depths - shown.depths)[inside]) < 2e-3
+
+
+def test_faint_rims_and_what_is_hidden_change_no_label(both, started):
+    _, outlines, backdrop = both
+    moving = moving_of(started, first_pose(started))
+    plan = plan_render(moving, backdrop.cameras, headroom=2.0, sh_degree=None)
+    exact, _ = show_moving(started, first_pose(started), backdrop, plan)
+    agree = np.asarray(exact.labels) == np.asarray(outlines.labels)
+    assert agree.mean() > 0.995
+    apart = np.abs(exact.depths - outlines.depths)[agree]
+    assert np.quantile(apart, 0.99) < 5e-3  # half a pixel of this small table
 
 
 def test_cameras_see_the_same_gaussians_in_both(both, started, table):

@@ -8,19 +8,19 @@ import pytest
 from gsjax.optim.compiler import in_memory
 
 
-def read(image, x, true):
+def read(image, x, finite):
     """The sum of the two pixels around each place."""
     pixel = jnp.floor(x).astype(jnp.int32)
-    pixel = pixel if true is None else in_memory(pixel, true)
+    pixel = pixel if finite is None else in_memory(pixel, finite)
     return image[pixel] + image[pixel + 1]
 
 
 def test_what_is_written_to_memory_is_the_same_mapped_and_differentiated():
-    image, true = jax.random.normal(jax.random.key(0), (50, 4)), jnp.array(True)
+    image, finite = jax.random.normal(jax.random.key(0), (50, 4)), jnp.ones(1)
     x = jax.random.uniform(jax.random.key(1), (3, 20), maxval=48.0)
     mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
-    np.testing.assert_array_equal(mapped(image, x, true), jnp.stack([read(image, row, None) for row in x]))
-    slopes = [jax.grad(lambda a, flag=flag: (read(a, x[0], flag) ** 2).sum())(image) for flag in (true, None)]
+    np.testing.assert_array_equal(mapped(image, x, finite), jnp.stack([read(image, row, None) for row in x]))
+    slopes = [jax.grad(lambda a, by=by: (read(a, x[0], by) ** 2).sum())(image) for by in (finite, None)]
     np.testing.assert_allclose(*slopes, rtol=1e-6)
 
 
@@ -29,4 +29,4 @@ def test_the_compiler_keeps_the_branch():
     """It would drop jax.lax.optimization_barrier. The flag is of no axis that is mapped over."""
     image, x = jnp.ones((50, 4)), jnp.ones((3, 20))
     mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
-    assert " conditional(" in mapped.lower(image, x, jnp.array(True)).compile().as_text()
+    assert " conditional(" in mapped.lower(image, x, jnp.ones(1)).compile().as_text()

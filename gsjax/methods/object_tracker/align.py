@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import Points, Sight, carry, rotated
+from gsjax.methods.object_tracker.points import Points, Sight, carry, rotated, sum_of_three
 from gsjax.optim.compiler import in_memory
 
 
@@ -74,7 +74,7 @@ class Residuals(NamedTuple):
     """How points differ from the images: red, green, blue and, where the frame has it, depth."""
 
     values: Float[Array, "c d p"]  # in units of their scales
-    counts: Bool[Array, "c d p"]  # whether there is something to compare with
+    counts: Bool[Array, "c kinds p"]  # whether there is a colour, and a depth, to compare with
     gradients: Float[Array, "c 3 d p"]  # with respect to the point, a metre
 
 
@@ -82,22 +82,22 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
     """Of one group's points."""
     height, width, channels = sight.pixels.shape[1:]
     scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
-    true = sight.cameras.K[0, 0, 0] > 0
 
     def one(means, tones, viewmat, K, image):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = jnp.maximum(local[2], 1e-6)
         x, y, _ = rotated(K, local) / z
         inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
-        found, (across, along), nearest = bilinear(image, in_memory(spot(x, y, width, height), true))
-        wanted, counts = tones, jnp.broadcast_to(inside, tones.shape)
+        at = in_memory(spot(x, y, width, height), sight.cameras.K)
+        found, (across, along), nearest = bilinear(image, at)
+        wanted, counts = tones, inside[None]
         if channels == 4:
             # The depth between pixels that lie on two surfaces is nobody's: there, the nearest pixel's.
             smooth = jnp.abs(found[3] - nearest[3]) < config.depth_scale
             found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
             across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
             wanted = jnp.concatenate([tones, local[2:]])
-            counts = jnp.concatenate([counts, (inside & (nearest[3] > 0))[None]])
+            counts = jnp.stack([inside, inside & (nearest[3] > 0)])
         # d pixel / d local = (K - pixel e_z^T) / z
         gradients = K[0, :, None, None] * (across / z) + K[1, :, None, None] * (along / z)
         gradients = gradients.at[2].add(-(x * across + y * along) / z)
@@ -109,11 +109,15 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
     return jax.vmap(one)(points.means, points.tones, sight.cameras.viewmat, sight.cameras.K, sight.pixels)
 
 
-def _squared(residuals: Residuals) -> Float[Array, "c d p"]:
-    """Squared residuals, in which each colour channel has the mean of the three."""
-    squared = residuals.values**2
-    mean = squared[:, :3].mean(1, keepdims=True)
-    return jnp.concatenate([jnp.broadcast_to(mean, squared[:, :3].shape), squared[:, 3:]], axis=1)
+def _by_kind(products: Float[Array, "c d p"]) -> list[Float[Array, "c p"]]:
+    """Sums over the channels of colour and, if there is one, of depth."""
+    return [sum_of_three(products[:, :3], axis=1), *(products[:, i] for i in range(3, products.shape[1]))]
+
+
+def _squared(residuals: Residuals) -> list[Float[Array, "c p"]]:
+    """Squared residuals, in which each channel of colour has the mean of the three."""
+    color, *depth = _by_kind(residuals.values**2)
+    return [color / 3, *depth]
 
 
 class _Fit(NamedTuple):
@@ -131,28 +135,29 @@ def _normal_equations(
     """Cost, J^T W J and J^T W r after `twist`, for a small one about the moved centre that follows it."""
     moved = carry(points, twist, center)
     residuals = _residuals(moved, sight, config)
-    squared, weights = _squared(residuals), points.seen[:, None]
+    kinds = list(zip((3, 1), _squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=False))
     # What falls outside the picture, or is truncated, costs as much as a bad fit.
-    cost = jnp.sum(weights * jnp.where(residuals.counts, squared / (1 + squared), 0.5))
-    weights = weights * residuals.counts / (1 + squared) ** 2
+    costs = points.seen * sum(n * jnp.where(counts, r / (1 + r), 0.5) for n, r, counts in kinds)
+    weights = [points.seen * counts / (1 + r) ** 2 for _, r, counts in kinds]
     arms = tuple(jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0))
     x, y, z = jnp.moveaxis(residuals.gradients, 1, 0)
 
     def over_channels(a, b) -> Float[Array, "c p"]:
-        return jnp.sum(weights * a * b, axis=1)
+        return sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True))
 
     # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
     # the sum of g g^T over its channels. No row is written down, which XLA:CPU would do for a product.
-    xx, xy, xz = (over_channels(x, other) for other in (x, y, z))
-    yy, yz, zz = over_channels(y, y), over_channels(y, z), over_channels(z, z)
+    products = [over_channels(*pair) for pair in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
+    pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
+    (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), sight.cameras.K)
     forces = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
     levers = [_cross(arms, force) for force in forces]  # of A F, a column each
     torques = [_cross(arms, lever) for lever in zip(*levers, strict=True)]
     upper = [(*force, *lever) for force, lever in zip(forces, levers, strict=True)]
     lower = [(*lever, *torque) for lever, torque in zip(zip(*levers, strict=True), torques, strict=True)]
-    pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
     hessian = jnp.stack([jnp.stack(row).sum((1, 2)) for row in upper + lower])
-    return _Fit(twist, cost, hessian, jnp.stack([*pulls, *_cross(arms, pulls)]).sum((1, 2)))
+    *gradient, cost = jnp.stack([*pulls, *_cross(arms, pulls), costs]).sum((1, 2))
+    return _Fit(twist, cost, hessian, jnp.stack(gradient))
 
 
 def _cross(a, b):
@@ -234,7 +239,9 @@ def disagreement(
     Colour and depth count the same; what falls outside the picture counts half.
     """
     residuals = _residuals(carry(points, twist, center), sight, config)
-    squared, counts = _squared(residuals)[:, 2:], residuals.counts[:, 2:]
-    cost = jnp.sum(counts * squared / (1 + squared), axis=1) / jnp.maximum(counts.sum(1), 1)
-    cost = jnp.where(counts[:, 0], cost, 0.5)
-    return jnp.sum(points.seen * cost) / jnp.maximum(points.seen.sum(), 1e-6)
+    kinds = list(zip(_squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=True))
+    cost = sum(counts * r / (1 + r) for r, counts in kinds)
+    compared = sum(counts.astype(cost.dtype) for _, counts in kinds)
+    cost = jnp.where(compared > 0, cost / jnp.maximum(compared, 1), 0.5)
+    costs = in_memory(points.seen * cost, sight.cameras.K)
+    return jnp.sum(costs) / jnp.maximum(points.seen.sum(), 1e-6)

@@ -16,7 +16,15 @@ from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.layers import Shown, seen_from
 from gsjax.methods.object_tracker.motion import Pose
-from gsjax.methods.object_tracker.points import Points, Sight, carry, first_members, rotated, tones
+from gsjax.methods.object_tracker.points import (
+    Points,
+    Sight,
+    carry,
+    first_members,
+    rotated,
+    sum_of_three,
+    tones,
+)
 from gsjax.methods.object_tracker.scene import TrackedScene
 
 
@@ -73,7 +81,8 @@ def as_facing(firsts: Firsts, twist: Float[Array, "6"], center: Float[Array, "3"
     normals = rotated(jaxlie.SO3.exp(twist[3:]).as_matrix(), firsts.normals)
     rays = camera_centers(sight.cameras.viewmat)[:, :, None] - moved.means
     one_sided = jnp.any(normals != 0, axis=0)
-    faces = firsts.real & ((jnp.sum(normals * rays, axis=1) > 0) | ~one_sided)
+    toward = sum_of_three(normals * rays, axis=1)
+    faces = firsts.real & ((toward > 0) | ~one_sided)
     of_each = (jnp.broadcast_to(a, (len(rays), *a.shape)) for a in (moved.means, firsts.tones))
     return Points(*of_each, faces.astype(rays.dtype))
 

@@ -9,6 +9,7 @@ Gaussian of that object. Shapes are static: new ones take slots that were laid o
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import unproject
@@ -17,6 +18,7 @@ from gsjax.methods.object_tracker.config import GrowConfig
 from gsjax.methods.object_tracker.layers import Shown
 from gsjax.methods.object_tracker.motion import Pose
 from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.rasterize.lanes import LANES, columns_in_lanes, in_lanes
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, take
 
@@ -80,9 +82,7 @@ def grow(
     lattice = max(2, coarseness)
     chosen = unexplained(shown, frame.depths[:, ::coarseness, ::coarseness], config) & near
     chosen = chosen[:, :: lattice // coarseness, :: lattice // coarseness]
-    order = jax.random.uniform(jax.random.fold_in(jax.random.key(2), step), chosen.size)
-    priority, places = jax.lax.top_k(jnp.where(chosen.ravel(), 1.0 + order, 0.0), config.candidates)
-
+    places, real = _some_of(chosen.ravel(), step, config.candidates)
     camera, row, column = jnp.unravel_index(places, chosen.shape)
     row, column = lattice * row, lattice * column
     depth, color = frame.depths[camera, row, column], frame.images[camera, row, column]
@@ -90,7 +90,7 @@ def grow(
     views = (frame.cameras.viewmat[camera], frame.cameras.K[camera])
     points = jax.vmap(unproject)(pixels, depth, *views)
     label, distance = _nearest(points, color, scene, pose, config)
-    wanted = (priority > 0) & (label > 0) & (distance < 1.0)
+    wanted = real & (label > 0) & (distance < 1.0)
     if lost is not None:
         wanted &= ~lost[label - 1]
 
@@ -119,6 +119,25 @@ def grow(
     return scene, pose
 
 
+def _some_of(
+    chosen: Bool[Array, "n"], step: Int[Array, ""], count: int
+) -> tuple[Int[Array, "count"], Bool[Array, "count"]]:
+    """Up to `count` chosen places, others in every step, and which of them are real.
+
+    All places are dealt out at random, to four times as many hands. From a random round and hand on, those
+    come first that have a chosen place first. Ordering all places takes three times as long.
+    """
+    size, hands = chosen.shape[0], 4 * count
+    rounds = -(-size // hands)
+    dealt = (np.random.default_rng(2).permutation(rounds * hands) % size).reshape(rounds, hands)
+    key = jax.random.fold_in(jax.random.key(2), step)
+    first, turn = jax.random.randint(key, (2,), 0, jnp.array([rounds, hands]))
+    waits = (jnp.arange(rounds, dtype=jnp.int32) - first) % rounds
+    wait = jnp.where(chosen[dealt], waits[:, None], rounds).min(0)
+    _, hand = jax.lax.top_k(-(wait * hands + (jnp.arange(hands) - turn) % hands), count)
+    return jnp.asarray(dealt)[(first + wait[hand]) % rounds, hand], wait[hand] < rounds
+
+
 def _nearest(
     points: Float[Array, "p 3"],
     colors: Float[Array, "p 3"],
@@ -128,18 +147,15 @@ def _nearest(
 ) -> tuple[Int[Array, "p"], Float[Array, "p"]]:
     """Label of the nearest Gaussian in position and colour, and its distance in units of the two reaches."""
     means = jnp.concatenate([pose.means, scene.gaussians.means[scene.num_moving :]])
-    own = jnp.concatenate(
-        [means / config.distance, (scene.gaussians.sh0[:, 0] * SH_C0 + 0.5) / config.color], axis=1
-    )
+    own = (means / config.distance, (scene.gaussians.sh0[:, 0] * SH_C0 + 0.5) / config.color)
+    columns = [column for array in own for column in columns_in_lanes(array)]
     ask = jnp.concatenate([points / config.distance, colors / config.color], axis=1)
     taken = (scene.labels <= scene.num_objects).at[: scene.num_moving].min(~empty_slots(scene))
-
-    # |a - b|^2 by one product of matrices, around a common middle for the rounding's sake.
-    middle = own.mean(0)
-    own, ask = own - middle, ask - middle
-    squared = jnp.sum(own**2, -1)[:, None] - 2 * own @ ask.T + jnp.sum(ask**2, -1)
-    squared = jnp.where(taken[:, None], squared, jnp.inf)
-    # XLA:CPU's argmin takes many times as long.
-    rows = jnp.arange(len(own), dtype=jnp.int32)[:, None]
-    best = jnp.where(squared == squared.min(0), rows, len(own) - 1).min(0)
-    return scene.labels[best], jnp.linalg.norm(own[best] - ask, axis=-1)
+    squared = sum((a - b[:, None, None]) ** 2 for a, b in zip(columns, ask.T, strict=True))
+    squared = jnp.where(in_lanes(taken), squared, jnp.inf)
+    # XLA:CPU's argmin is slow over many numbers: first the lane of the least, then its row.
+    lane = jnp.argmin(squared.min(1), axis=1)
+    rows = jnp.take_along_axis(squared, lane[:, None, None], axis=2)[..., 0]
+    row = jnp.argmin(rows, axis=1)
+    best = row * LANES + lane
+    return scene.labels[best], jnp.sqrt(rows.min(1))

@@ -1,8 +1,9 @@
 """What a scene shows: which label is on top in each pixel, and how deep it lies.
 
 Two ways. The whole scene is drawn, or what moves is drawn over what stands: the background is drawn once and
-kept, and drawn again only when a camera has moved. The second is exact where the background is opaque and a
-pixel's moving Gaussians lie all in front of it or all behind; else a pixel belongs to what is nearer.
+kept, and drawn again only when a camera has moved. The second is exact, but for faint rims, where the
+background is opaque and a pixel's moving Gaussians lie all in front of it or all behind; else a pixel belongs
+to what is nearer.
 """
 
 from typing import NamedTuple
@@ -22,6 +23,11 @@ from gsjax.rasterize.rasterization import rasterization
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import Rendered, render
+
+# Options of the plan for `show_moving`. Only labels and depths are asked for, and neither a Gaussian's faint
+# rim nor what lies behind opaque ones changes these. Small tiles fit small Gaussians, and a few of them end
+# sooner than many. On tabletop_1 a fifth of the work of the defaults remains.
+OUTLINES = {"alpha_min": 0.03, "min_transmittance": 0.01, "tile_size": 4, "tiles_per_batch": 384}
 
 
 class Shown(NamedTuple):
@@ -139,7 +145,7 @@ def show_moving(
     on_top = (alphas > 0.5) & ~behind
     labels = jnp.where(on_top & (labels <= scene.num_objects), labels, 0)
     depths = jnp.where(on_top, depths, backdrop.depths)
-    shown = in_memory(Shown(labels, depths, on_top | backdrop.covers), cameras.K[0, 0, 0] > 0)
+    shown = in_memory(Shown(labels, depths, on_top | backdrop.covers), cameras.K)
     return shown, meta.needed.max()
 
 

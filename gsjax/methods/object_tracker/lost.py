@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gsjax.methods.object_tracker.points import Points, Sight, rotated
+from gsjax.methods.object_tracker.points import Points, Sight, rotated, sum_of_three
 
 COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
 _FEWEST = 6.0  # points that can tell
@@ -52,14 +52,14 @@ def confidence(
     """
     height, width = sight.pixels.shape[1:3]
 
-    def one(means, tones, seen, viewmat, K, image, background, others):
+    def one(means, tones, seen, viewmat, K, image, measures, background, others):
         local = rotated(viewmat[:3, :3], means) + viewmat[:3, 3:]
         z = local[2]
         column, row, _ = jnp.floor(rotated(K, local) / jnp.maximum(z, 1e-6)).astype(jnp.int32)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 1e-3)
         row, column = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
         found = image[row, column]
-        squared = jnp.mean((found[:, :3].T - tones) ** 2, axis=0) / COLOR_SCALE**2
+        squared = sum_of_three((found[:, :3].T - tones) ** 2, axis=0) / (3 * COLOR_SCALE**2)
         asked = seen > 0
         alike, hidden, known = 1 / (1 + squared), jnp.zeros_like(inside), inside & asked
         of_a_card, flat = alike, jnp.zeros_like(inside)
@@ -72,7 +72,7 @@ def confidence(
         if sight.depths is not None:
             off = found[:, 3] - z
             hidden, known = off < -gap, known & (found[:, 3] > 0)
-            asked &= (image[..., 3] > 0).any()  # a camera that failed is not asked
+            asked &= measures  # a camera that failed is not asked
             alike = jnp.where(off > gap, 0.0, alike)
             if others is not None:
                 alike = jnp.where(lies_in(found[:, 3], others), 0.0, alike)
@@ -83,10 +83,10 @@ def confidence(
         clear = known & ~hidden
         return clear * alike, clear * of_a_card, clear & flat, clear, asked
 
-    surfaces = (background, others)
-    over_cameras = jax.vmap(one, in_axes=(0,) * 6 + tuple(None if s is None else 0 for s in surfaces))
-    over_groups = jax.vmap(over_cameras, in_axes=(0, 0, 0, None, None, None, None, None))
-    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, *surfaces)
+    maybe = (sight.measures, background, others)
+    over_cameras = jax.vmap(one, in_axes=(0,) * 6 + tuple(None if a is None else 0 for a in maybe))
+    over_groups = jax.vmap(over_cameras, in_axes=(0,) * 3 + (None,) * 6)
+    views = (sight.cameras.viewmat, sight.cameras.K, sight.pixels, *maybe)
     alike, of_a_card, flat, clear, asked = (a.sum((1, 2), dtype=float) for a in over_groups(*centers, *views))
     alike = jnp.where(flat > _FLAT * clear, of_a_card, alike)
     return Confidence(alike / jnp.maximum(clear, 1), alike / jnp.maximum(asked, 1), clear >= _FEWEST)

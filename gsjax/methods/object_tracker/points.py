@@ -13,7 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from gsjax.geometry.cameras import Camera, pixel_grid, unproject
+from gsjax.geometry.cameras import Camera, unproject
 from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.rasterize.sorting import sort_keys
 from gsjax.scene.frame import Frame
@@ -37,6 +37,7 @@ class Sight(NamedTuple):
 
     cameras: Camera
     pixels: Float[Array, "c height width d"]
+    measures: Bool[Array, "c"] | None = None  # cameras with depth, where the frame has it: others have failed
 
     @property
     def tones(self) -> Float[Array, "c height width 3"]:
@@ -53,7 +54,10 @@ def sight_of(frame: Frame, shading: float) -> Sight:
     seen = tones(frame.images, shading)
     if frame.depths is None:
         return Sight(frame.cameras, seen)
-    return Sight(frame.cameras, jnp.concatenate([seen, frame.depths[..., None]], axis=-1))
+    # As a concatenation this is a loop with branches on a CPU.
+    padded = jnp.pad(seen, [(0, 0)] * 3 + [(0, 1)])
+    pixels = jnp.where(np.arange(4) < 3, padded, frame.depths[..., None])
+    return Sight(frame.cameras, pixels, (frame.depths > 0).any((1, 2)))
 
 
 def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
@@ -83,6 +87,12 @@ def rotated(matrix: Float[Array, "3 3"], vectors: Float[Array, "*n 3 p"]) -> Flo
     """matrix @ vectors, written out: XLA:CPU takes longer to set up a product so thin than to do it."""
     x, y, z = (vectors[..., i : i + 1, :] for i in range(3))
     return matrix[:, :1] * x + matrix[:, 1:2] * y + matrix[:, 2:] * z
+
+
+def sum_of_three(values: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
+    """Along an axis of length 3, written out: XLA:CPU works out a reduction's numbers one by one."""
+    x, y, z = (jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(3))
+    return x + y + z
 
 
 def first_members(
@@ -128,18 +138,17 @@ def pixels_of_groups(
             than a group is thick is something else.
         coarseness: labels and depths are of every so-manieth pixel.
     """
-    height, width = sight.pixels.shape[1:3]
-    grid = pixel_grid(width, height)[::coarseness, ::coarseness].reshape(-1, 2)
     sight = sight._replace(pixels=sight.pixels[:, ::coarseness, ::coarseness])
+    width = sight.pixels.shape[2]
     measured = depths
-    if sight.depths is not None:
-        with_depth = (sight.depths > 0).any((1, 2))[:, None, None]
-        measured = jnp.where(with_depth, sight.depths, depths)
+    if sight.depths is not None and sight.measures is not None:
+        measured = jnp.where(sight.measures[:, None, None], sight.depths, depths)
     usable = (measured > 0) & (jnp.abs(measured - depths) < config.max_thickness)
 
     def one(viewmat, K, groups, depth, image):
         rows, real = first_members(groups.ravel(), num_groups, config.pixels)
-        points = unproject(grid[rows], depth.ravel()[rows], viewmat, K)
+        pixels = coarseness * jnp.stack([rows % width, rows // width], axis=-1) + 0.5
+        points = unproject(pixels, depth.ravel()[rows], viewmat, K)
         seen = image.reshape(-1, 3)[rows]
         return jnp.swapaxes(points, 1, 2), jnp.swapaxes(seen, 1, 2), real.astype(points.dtype)
 

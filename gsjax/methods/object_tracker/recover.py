@@ -18,7 +18,7 @@ from gsjax.methods.object_tracker.config import AlignConfig
 from gsjax.methods.object_tracker.firsts import Firsts, as_facing
 from gsjax.methods.object_tracker.layers import Shown
 from gsjax.methods.object_tracker.lost import COLOR_SCALE, Confidence, confidence
-from gsjax.methods.object_tracker.points import Points, Sight
+from gsjax.methods.object_tracker.points import Points, Sight, sum_of_three
 
 _LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
 _NEAR_HUNCH = 0.3  # radians; how a guess that goes on from a hunch is turned
@@ -159,15 +159,16 @@ def guesses(
     count = len(shifts)
     place, pair, axis, angle, small = jax.random.split(key, 5)
     to, colors, there = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in strangers)
-    chosen = jax.random.categorical(place, jnp.where(there > 0, 0.0, -jnp.inf), shape=(count,))
-    apart = jnp.sum((colors[:, chosen, None] - firsts.tones[:, None]) ** 2, axis=0) / COLOR_SCALE**2
+    any_there = there.sum() > 0
+    chosen = jax.random.choice(place, len(there), (count,), p=there + ~any_there)
+    apart = sum_of_three((colors[:, chosen, None] - firsts.tones[:, None]) ** 2, axis=0) / COLOR_SCALE**2
     paired = jax.random.categorical(pair, jnp.where(firsts.real, -apart, -jnp.inf))
     turns = jax.random.normal(axis, (count, 3))
     turns /= jnp.linalg.norm(turns, axis=1, keepdims=True)
     turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1)) * (config.max_turn > 0)
     offsets = firsts.means[:, paired].T - center
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
-    strange = (jnp.arange(count) % 2 == 1) & (there.sum() > 0)
+    strange = (jnp.arange(count) % 2 == 1) & any_there
     far = jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
     nearly = _NEAR_HUNCH * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
     near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(hunch, far.shape))

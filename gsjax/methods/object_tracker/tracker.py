@@ -11,6 +11,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of, radii
 from gsjax.methods.object_tracker.layers import (
+    OUTLINES,
     Backdrop,
     Shown,
     are_same,
@@ -372,7 +373,7 @@ def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackerC
             thinned(moving_of(scene, pose), config.coarseness),
         )
         full = plan_render(background_of(scene), views, headroom=headroom)
-        near = plan_render(moving, views, headroom=headroom, sh_degree=None)
+        near = plan_render(moving, views, headroom=headroom, sh_degree=None, **OUTLINES)
         return TrackerPlan(full, near, 0)
     full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
     rendered = render(place(scene, pose), frame.cameras, full)
