@@ -98,7 +98,7 @@ def draw_policies(rows: list[dict[str, Any]], path: Path) -> None:
             at = place + 0.1 * (i - (len(seeds) - 1) / 2)
             axes.plot(at, rate, "o", ms=6, mfc="white", mec=INK, mew=1.2, zorder=4, clip_on=False)
         plural = "" if len(seeds) == 1 else "s"
-        ticks.append(f"{kind}\n{len(mine)} rollouts, {len(seeds)} training seed{plural}")
+        ticks.append(f"{kind}\n{len(mine)} rollouts,\n{len(seeds)} training seed{plural}")
     axes.set_xticks(range(len(kinds)), ticks, color=INK)
     axes.set(ylim=(0, 1.17), yticks=np.linspace(0, 1, 6), xlim=(-0.5, len(kinds) - 0.5))
     axes.grid(axis="x", visible=False)

@@ -222,8 +222,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         named = as_last_seen(firsts, last.shown, last.cameras, gap)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, state.pixels, remembered)
-        # What is doubtful is looked for elsewhere in two frames, which finding takes, and followed in two.
-        astray = state.watch.lost | (state.watch.doubtful & (state.count % 4 < 2))
+        # What is doubtful is looked for elsewhere in two frames, which finding takes, and followed in two; every
+        # second group when the others are not, for it takes time.
+        turns = state.count + 2 * jnp.arange(num_objects)
+        astray = state.watch.lost | (state.watch.doubtful & (turns % 4 < 2))
         before_now, near_needed = look_again(params, last, backdrop, batch, astray.any())
         others = depths_of_others(before_now, astray)
         around = Around(sight, background, others, state.strangers)
