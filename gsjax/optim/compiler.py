@@ -31,12 +31,16 @@ def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
     Args:
         arrays: a pytree.
         finite: numbers that are, which the compiler cannot know; of no axis that is mapped over. Where the
-            first is not, what comes back is zeros.
+            first is not, nor is what comes back, as far as it can be.
     """
     if jax.default_backend() != "cpu":
         return arrays
     true = jnp.isfinite(finite.ravel()[0])
-    return jax.lax.cond(true, lambda: arrays, lambda: jax.tree.map(jnp.zeros_like, arrays))
+
+    def nothing(array):
+        return jnp.full_like(array, jnp.nan if jnp.issubdtype(array.dtype, jnp.inexact) else 0)
+
+    return jax.lax.cond(true, lambda: arrays, lambda: jax.tree.map(nothing, arrays))
 
 
 def has_avx512() -> bool:

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.object_tracker import first_pose, render_labels
 from gsjax.methods.object_tracker.config import GrowConfig
 from gsjax.methods.object_tracker.grow import (
     EMPTY,
+    _nearest,
     _some_of,
     empty_slots,
     grow,
@@ -55,9 +57,12 @@ def grown(scene, frame, plan, steps=1, config=CONFIG):
     return scene, pose
 
 
-@pytest.mark.parametrize("num_chosen", [0, 3, 16, 700, 1000])
-def test_some_of_the_chosen_are_taken_and_all_get_their_turn(num_chosen):
-    size, count = 1000, 16
+@pytest.mark.parametrize(
+    ("size", "num_chosen"),
+    [(1000, 0), (1000, 3), (1000, 16), (1000, 700), (1000, 1000), (600, 50), (63, 63), (65, 20), (1, 1)],
+)
+def test_some_of_the_chosen_are_taken_and_all_get_their_turn(size, num_chosen):
+    count = 16
     chosen = np.zeros(size, bool)
     chosen[np.random.default_rng(0).permutation(size)[:num_chosen]] = True
     some_of = jax.jit(lambda step: _some_of(jnp.asarray(chosen), step, count))
@@ -65,9 +70,33 @@ def test_some_of_the_chosen_are_taken_and_all_get_their_turn(num_chosen):
     for step in range(400):
         places, real = map(np.asarray, some_of(step))
         assert chosen[places[real]].all()
+        assert len(set(places[real].tolist())) == real.sum() <= num_chosen
+        assert ((places >= 0) & (places < size)).all()
         assert real.all() or num_chosen < 20 * count
         taken |= set(places[real].tolist())
     assert taken == set(np.flatnonzero(chosen)) if num_chosen <= count else len(taken) > 0.9 * num_chosen
+
+
+@pytest.mark.parametrize("none_taken", [False, True])
+def test_the_nearest_is_that_of_all_distances(started, none_taken):
+    """The count of Gaussians fills no row of lanes; empty slots are nobody's neighbour."""
+    scene = with_slots(started, 32)
+    if none_taken:
+        scene = eqx.tree_at(lambda s: s.labels, scene, jnp.full_like(scene.labels, scene.num_objects + 1))
+    assert scene.gaussians.num % 256
+    key = jax.random.key(0)
+    own_colors = scene.gaussians.sh0[:, 0] * SH_C0 + 0.5
+    own = np.c_[scene.gaussians.means / CONFIG.distance, own_colors / CONFIG.color]
+    rows = jnp.r_[jax.random.permutation(key, scene.gaussians.num)[:40], scene.gaussians.num - 1]
+    points = scene.gaussians.means[rows] + 0.004 * jax.random.normal(key, (41, 3))
+    colors = jax.random.uniform(key, (41, 3))
+    label, distance = _nearest(points, colors, scene, first_pose(scene), CONFIG)
+    ask = np.c_[points / CONFIG.distance, colors / CONFIG.color]
+    all_distances = np.linalg.norm(own[:, None] - ask, axis=-1)
+    all_distances[np.asarray(scene.labels) > scene.num_objects] = np.inf
+    np.testing.assert_allclose(distance, all_distances.min(0), rtol=1e-4)
+    if not none_taken:
+        np.testing.assert_array_equal(label, np.asarray(scene.labels)[all_distances.argmin(0)])
 
 
 def test_slots_draw_nothing_and_belong_to_nobody(table, started, plan):

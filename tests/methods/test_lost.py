@@ -29,6 +29,7 @@ from gsjax.methods.object_tracker.recover import (
     since,
     with_strangers,
 )
+from gsjax.methods.object_tracker.tracker import has_turn
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -251,12 +252,19 @@ def test_radii_are_of_those_that_there_are():
     np.testing.assert_allclose(found, [5**0.5, 0.0], rtol=1e-6)
 
 
-def test_depths_of_others_are_those_of_what_is_not_astray(carton):
+def test_depths_of_others_are_those_of_what_is_not_in_doubt(carton):
     sight, _ = carton
     labels = jnp.zeros(sight.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
     shown = Shown(labels, jnp.full(labels.shape, 0.7), labels > 0)
     found = depths_of_others(shown, jnp.array([False, True]))
     np.testing.assert_allclose(found[0, 0, :3], [0.0, 0.7, 0.0])
+
+
+def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
+    turns = np.array([has_turn(jnp.int32(count), 3) for count in range(8)])
+    np.testing.assert_array_equal(turns[:, 0], [True, True, False, False] * 2)
+    np.testing.assert_array_equal(turns[:, 1], ~turns[:, 0])
+    np.testing.assert_array_equal(turns[:, 2], turns[:, 0])
 
 
 @pytest.mark.parametrize("redraw", ["moving", "all"])

@@ -30,3 +30,10 @@ def test_the_compiler_keeps_the_branch():
     image, x = jnp.ones((50, 4)), jnp.ones((3, 20))
     mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
     assert " conditional(" in mapped.lower(image, x, jnp.ones(1)).compile().as_text()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere it is nothing")
+def test_what_is_not_finite_after_all_is_not_hidden():
+    costs, pixels = in_memory((jnp.ones(3), jnp.arange(3)), jnp.array([jnp.nan, 1.0]))
+    assert jnp.isnan(costs).all()
+    np.testing.assert_array_equal(pixels, 0)

@@ -31,6 +31,9 @@ def widened(config: AlignConfig) -> AlignConfig:
     return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
 
 
+_CHANNELS = (3, 1)  # of colour, each of which has the mean of the three, and of depth
+
+
 class Read(NamedTuple):
     """An image at p places, each of its d channels side by side."""
 
@@ -88,6 +91,7 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
         z = jnp.maximum(local[2], 1e-6)
         x, y, _ = rotated(K, local) / z
         inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
+        # Not this camera's own K: over that is mapped, and a branch would be computed both ways.
         at = in_memory(spot(x, y, width, height), sight.cameras.K)
         found, (across, along), nearest = bilinear(image, at)
         wanted, counts = tones, inside[None]
@@ -135,7 +139,8 @@ def _normal_equations(
     """Cost, J^T W J and J^T W r after `twist`, for a small one about the moved centre that follows it."""
     moved = carry(points, twist, center)
     residuals = _residuals(moved, sight, config)
-    kinds = list(zip((3, 1), _squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=False))
+    squared = _squared(residuals)
+    kinds = list(zip(_CHANNELS[: len(squared)], squared, jnp.moveaxis(residuals.counts, 1, 0), strict=True))
     # What falls outside the picture, or is truncated, costs as much as a bad fit.
     costs = points.seen * sum(n * jnp.where(counts, r / (1 + r), 0.5) for n, r, counts in kinds)
     weights = [points.seen * counts / (1 + r) ** 2 for _, r, counts in kinds]

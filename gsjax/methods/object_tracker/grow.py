@@ -125,17 +125,20 @@ def _some_of(
     """Up to `count` chosen places, others in every step, and which of them are real.
 
     All places are dealt out at random, to four times as many hands. From a random round and hand on, those
-    come first that have a chosen place first. Ordering all places takes three times as long.
+    come first that have a chosen place first; of two in one hand, one waits for another step. That takes a
+    CPU a fraction of the time of ordering all places.
     """
     size, hands = chosen.shape[0], 4 * count
     rounds = -(-size // hands)
-    dealt = (np.random.default_rng(2).permutation(rounds * hands) % size).reshape(rounds, hands)
+    dealt = np.random.default_rng(2).permutation(rounds * hands).reshape(rounds, hands)
+    chosen = jnp.pad(chosen, (0, rounds * hands - size))
     key = jax.random.fold_in(jax.random.key(2), step)
     first, turn = jax.random.randint(key, (2,), 0, jnp.array([rounds, hands]))
     waits = (jnp.arange(rounds, dtype=jnp.int32) - first) % rounds
     wait = jnp.where(chosen[dealt], waits[:, None], rounds).min(0)
     _, hand = jax.lax.top_k(-(wait * hands + (jnp.arange(hands) - turn) % hands), count)
-    return jnp.asarray(dealt)[(first + wait[hand]) % rounds, hand], wait[hand] < rounds
+    places = jnp.asarray(dealt)[(first + wait[hand]) % rounds, hand]
+    return jnp.minimum(places, size - 1), wait[hand] < rounds
 
 
 def _nearest(

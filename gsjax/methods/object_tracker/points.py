@@ -37,7 +37,7 @@ class Sight(NamedTuple):
 
     cameras: Camera
     pixels: Float[Array, "c height width d"]
-    measures: Bool[Array, "c"] | None = None  # cameras with depth, where the frame has it: others have failed
+    measures: Bool[Array, "c"] | None  # which cameras measured any depth; None without depth
 
     @property
     def tones(self) -> Float[Array, "c height width 3"]:
@@ -53,7 +53,7 @@ def sight_of(frame: Frame, shading: float) -> Sight:
     """The frame in tones."""
     seen = tones(frame.images, shading)
     if frame.depths is None:
-        return Sight(frame.cameras, seen)
+        return Sight(frame.cameras, seen, None)
     # As a concatenation this is a loop with branches on a CPU.
     padded = jnp.pad(seen, [(0, 0)] * 3 + [(0, 1)])
     pixels = jnp.where(np.arange(4) < 3, padded, frame.depths[..., None])
@@ -67,8 +67,8 @@ def tones(colors: Float[Array, "*n 3"], shading: float) -> Float[Array, "*n 3"]:
     rolls under a lamp looks more like one that stands still, lit as before.
     """
     logs = 0.5 * jnp.log(jnp.maximum(colors, 0.0) + 0.1)  # the offset keeps the noise of dark pixels down
-    mean = (logs[..., :1] + logs[..., 1:2] + logs[..., 2:]) / 3  # fused, which a reduction on a CPU is not
-    return logs - (1 - shading) * mean
+    mean = sum_of_three(logs, axis=-1) / 3
+    return logs - (1 - shading) * mean[..., None]
 
 
 def of_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[Array, "k *d"]):
@@ -141,7 +141,8 @@ def pixels_of_groups(
     sight = sight._replace(pixels=sight.pixels[:, ::coarseness, ::coarseness])
     width = sight.pixels.shape[2]
     measured = depths
-    if sight.depths is not None and sight.measures is not None:
+    if sight.depths is not None:
+        assert sight.measures is not None
         measured = jnp.where(sight.measures[:, None, None], sight.depths, depths)
     usable = (measured > 0) & (jnp.abs(measured - depths) < config.max_thickness)
 

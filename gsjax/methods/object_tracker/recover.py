@@ -47,7 +47,7 @@ class Around(NamedTuple):
 
     sight: Sight
     background: Float[Array, "c h w"] | None  # its depth, metres, where it is known; else 0
-    others: Float[Array, "c h w"]  # depth of groups that are where they should be, see `depths_of_others`
+    others: Float[Array, "c h w"]  # depth of groups that are not in doubt, see `depths_of_others`
     strangers: Points  # pixels of the last frame that no group explains
 
 
@@ -110,10 +110,10 @@ def evidence(sure: Confidence) -> Float[Array, "*k"]:
     return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
 
 
-def depths_of_others(shown: Shown, astray: Bool[Array, "k"]) -> Float[Array, "c h w"]:
-    """Depth of the groups that are not astray, where they were last seen; else 0. What shows these shows no
-    group that is astray."""
-    sound = (shown.labels > 0) & ~astray[shown.labels - 1]
+def depths_of_others(shown: Shown, doubtful: Bool[Array, "k"]) -> Float[Array, "c h w"]:
+    """Depth of the groups that are not in doubt, where they were last seen; else 0. What shows these shows no
+    group that is looked for: that may be where another is believed to be that is elsewhere itself."""
+    sound = (shown.labels > 0) & ~doubtful[shown.labels - 1]
     return jnp.where(sound, shown.depths, 0.0)
 
 

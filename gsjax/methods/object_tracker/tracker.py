@@ -11,7 +11,6 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of, radii
 from gsjax.methods.object_tracker.layers import (
-    OUTLINES,
     Backdrop,
     Shown,
     are_same,
@@ -19,6 +18,7 @@ from gsjax.methods.object_tracker.layers import (
     draw_backdrop,
     keep_backdrop,
     moving_of,
+    plan_moving,
     reduced,
     render_labels,
     show_moving,
@@ -222,12 +222,10 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         named = as_last_seen(firsts, last.shown, last.cameras, gap)
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, state.pixels, remembered)
-        # What is doubtful is looked for elsewhere in two frames, which finding takes, and followed in two; every
-        # second group when the others are not, for it takes time.
-        turns = state.count + 2 * jnp.arange(num_objects)
-        astray = state.watch.lost | (state.watch.doubtful & (turns % 4 < 2))
+        doubtful = state.watch.doubtful
+        astray = state.watch.lost | (doubtful & has_turn(state.count, num_objects))
         before_now, near_needed = look_again(params, last, backdrop, batch, astray.any())
-        others = depths_of_others(before_now, astray)
+        others = depths_of_others(before_now, doubtful)
         around = Around(sight, background, others, state.strangers)
 
         def recovered(group) -> Elsewhere:
@@ -330,6 +328,12 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
     return Step(init, update)
 
 
+def has_turn(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]:
+    """Which groups are looked for elsewhere in this frame, if in doubt: each in two of four, which finding
+    takes, and followed in two. Odd and even ones take turns, so that no update looks for all."""
+    return (count + 2 * jnp.arange(num_objects)) % 4 < 2
+
+
 def _match(template: Template | None, frame: Frame, num_objects: int, config: TrackerConfig, reduction: int):
     """Where template matching says that each group has gone, whether it found it, and its scores [C, K]."""
     if not config.matching:
@@ -375,7 +379,7 @@ def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackerC
             thinned(moving_of(scene, pose), config.coarseness),
         )
         full = plan_render(background_of(scene), views, headroom=headroom)
-        near = plan_render(moving, views, headroom=headroom, sh_degree=None, **OUTLINES)
+        near = plan_moving(moving, views, headroom)
         return TrackerPlan(full, near, 0)
     full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
     rendered = render(place(scene, pose), frame.cameras, full)
