@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.machine import resident_mb
+from gsjax.cli.machine import keep_to_cores, resident_mb
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
@@ -53,6 +53,8 @@ class Options:
     """Which frames of the recording are replayed."""
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
+    cores: int | None = None
+    """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
     overwrite: bool = False
@@ -84,6 +86,7 @@ def run(options: Options) -> int:
         ValueError, OSError: what was asked cannot be done; what was followed before that is on disk.
     """
     _check(options)
+    keep_to_cores(options.cores)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         folder = RunFolder(options.out, overwrite=options.overwrite)

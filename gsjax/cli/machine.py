@@ -1,4 +1,4 @@
-"""What a result was made on. No name that someone gave the machine."""
+"""The machine: what a result was made on (no name that someone gave it), and which of its cores to keep to."""
 
 import os
 import platform
@@ -24,6 +24,26 @@ def describe() -> dict[str, Any]:
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
+
+
+def keep_to_cores(count: int | None) -> None:
+    """Have this process run on `count` of the cores that it may use, the last of them; None changes nothing.
+
+    XLA starts a thread for each core that it finds, so call it before JAX computes anything.
+
+    Raises:
+        ValueError: there are fewer, or this system does not let a process choose.
+    """
+    if count is None:
+        return
+    if not hasattr(os, "sched_setaffinity"):
+        raise ValueError(
+            f"--cores {count}: {platform.system()} does not let a process choose its cores; leave it out"
+        )
+    allowed = sorted(os.sched_getaffinity(0))
+    if not 1 <= count <= len(allowed):
+        raise ValueError(f"--cores: expected 1 to {len(allowed)}, which this process may use, found {count}")
+    os.sched_setaffinity(0, allowed[-count:])
 
 
 def resident_mb() -> float:

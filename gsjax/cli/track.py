@@ -13,6 +13,7 @@ from rich.console import Console
 
 from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.machine import keep_to_cores
 from gsjax.cli.messages import Notes, describe, say_error
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
 from gsjax.cli.recording import (
@@ -62,6 +63,8 @@ class Options:
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     budget_ms: float | None = None
     """What an update may take, milliseconds. The tracker's settings are then chosen by measured cost."""
+    cores: int | None = None
+    """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options."""
     overwrite: bool = False
@@ -93,13 +96,14 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything tracked before that is on disk.
     """
+    keep_to_cores(options.cores)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = dataclasses.replace(options, cameras=recording.tracked.camera_ids)
         if options.resume:
-            folder.check_config(settings, but=("resume", "overwrite", "debug", "out"))
+            folder.check_config(settings, but=("resume", "overwrite", "debug", "out", "cores"))
         folder.write_config(settings)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         draw_ahead(recording, console)

@@ -377,6 +377,11 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
         (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), visible, [1]),
         (first._replace(waited=jnp.array([0.0, 5.0, 100.0])), visible, [2]),
         (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), ~visible.at[0].set(False), [0]),
+        (
+            first._replace(usual=jnp.array([0.3, 0.1, 0.3]), glimpsed=jnp.array([False, False, True])),
+            visible,
+            [2],
+        ),
     ]
     for watch, there, expected in watches:
         one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
@@ -443,6 +448,27 @@ def test_what_is_lost_is_found_only_when_it_shows_itself():
         sure = Confidence(jnp.array([agrees]), jnp.array([shows]), one)
         watch = watch.after(none, nothing_of([True]), none, sure, none > 0)
         assert bool(watch.lost[0]) == lost, (agrees, shows)
+
+
+def test_what_is_found_elsewhere_once_is_glimpsed_and_checked_in_the_next_frame():
+    """A can that came out of a garage was found in one frame, and not looked for in the next four."""
+    watch, none, one = first_watch(jnp.ones(1)), jnp.zeros(1), jnp.array([True])
+    unsure = Confidence(none + 0.4, none + 0.3, one)
+    told = [
+        (0.9, one, ~one, True),
+        (0.9, one, one, False),  # found twice, and so moved there
+        (0.9, one, ~one, True),
+        (0.9, one, ~one, False),  # checked, but no better than where it is believed to be: others may look
+        (0.9, one, ~one, True),
+        (0.4, one, ~one, False),  # not there
+        (0.9, ~one, ~one, False),  # not looked for
+    ]
+    for agrees, recovered, retaken, glimpsed in told:
+        there = Confidence(none + agrees, none + agrees, one)
+        sought = nothing_of([True])._replace(recovered=recovered)
+        sought = sought._replace(again=sought.again._replace(sure=there))
+        watch = watch.after(none, sought, none, unsure, retaken)
+        assert bool(watch.glimpsed[0]) == bool(glimpsed)
 
 
 def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():

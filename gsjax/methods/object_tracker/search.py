@@ -134,6 +134,9 @@ class Watch(NamedTuple):
     lost: Bool[Array, "k"]
     showed: Float[Array, "k"]  # share of it that was seen in the first frame, of what faced the cameras
     turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
+    glimpsed: Bool[
+        Array, "k"
+    ]  # found elsewhere, but in one frame only: the next one says whether it is there
 
     @property
     def doubtful(self) -> Bool[Array, "k"]:
@@ -170,13 +173,15 @@ class Watch(NamedTuple):
             lost,
             self.showed,
             told & ~lost,
+            sought.recovered & is_found(sought.again.sure, self.showed) & ~retaken & ~self.glimpsed,
         )
 
 
 def first_watch(showed: Float[Array, "k"]) -> Watch:
     """Before the first frame, of which `showed` says how much of each group was seen."""
     nothing, certain = jnp.zeros_like(showed), jnp.ones_like(showed)
-    return Watch(jnp.full_like(showed, 0.1), nothing, nothing, certain, nothing > 0, showed, certain > 0)
+    no, yes = nothing > 0, certain > 0
+    return Watch(jnp.full_like(showed, 0.1), nothing, nothing, certain, no, showed, yes, no)
 
 
 def search(
@@ -201,7 +206,7 @@ def search(
         watch: how groups have been followed so far.
         visible: groups that a camera sees; of others only what is lost is looked for.
         everywhere: how many groups are looked for everywhere, those first that agree worst beside what is
-            usual for them, or that have waited longest.
+            usual for them, or that have waited longest; before all others what was glimpsed elsewhere.
         astray: groups that are lost, or may be: they are recovered where others are followed, unless they are
             not lost and have just moved; None: nobody.
         recover: says where the astray group of this index may be instead.
@@ -219,6 +224,7 @@ def search(
     shifts = coarse_shifts(config, sight)
 
     urgency = found.residuals / watch.usual + _PATIENCE * watch.waited + _IN_DOUBT * watch.doubtful
+    urgency = jnp.where(watch.glimpsed, jnp.inf, urgency)
     there = visible | watch.lost
     order = jnp.argsort(-jnp.where(there, urgency, -jnp.inf))
     count = jnp.minimum(everywhere, there.sum())

@@ -223,7 +223,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         weighted = named._replace(seen=config.align.center_weight * named.seen)
         points = join(weighted, state.pixels, remembered)
         doubtful = state.watch.doubtful
-        astray = state.watch.lost | (doubtful & has_turn(state.count, num_objects))
+        in_turn = has_turn(state.count, num_objects) | state.watch.glimpsed
+        astray = state.watch.lost | (doubtful & in_turn)
         before_now, near_needed = look_again(params, last, backdrop, batch, astray.any())
         others = depths_of_others(before_now, doubtful)
         around = Around(sight, background, others, state.strangers)

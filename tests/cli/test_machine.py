@@ -1,0 +1,54 @@
+"""Which cores a process keeps to."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from gsjax.cli.machine import keep_to_cores
+
+needs_affinity = pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores"
+)
+
+KEPT = """
+import os
+import jax
+from gsjax.cli.machine import describe, keep_to_cores
+
+before = os.sched_getaffinity(0)
+keep_to_cores(1)
+assert os.sched_getaffinity(0) == {max(before)}
+cores = describe()["cores"]
+jax.block_until_ready(jax.numpy.ones((500, 500)) @ jax.numpy.ones((500, 500)))
+names = {t: open(f"/proc/self/task/{t}/comm").read() for t in os.listdir("/proc/self/task")}
+pool = [int(t) for t, name in names.items() if "XLA" in name or "tf_" in name]
+print(cores, len(pool) > 0, all(os.sched_getaffinity(t) == {max(before)} for t in pool))
+"""
+
+
+@needs_affinity
+def test_jax_starts_its_threads_on_the_cores_that_are_kept_to():
+    said = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["1", "True", "True"]
+
+
+@needs_affinity
+@pytest.mark.parametrize("count", [0, -1, 100_000])
+def test_more_cores_than_there_are_is_an_error(count):
+    before = os.sched_getaffinity(0)
+    with pytest.raises(ValueError, match=rf"--cores: expected 1 to {len(before)}, .* found {count}"):
+        keep_to_cores(count)
+    assert os.sched_getaffinity(0) == before
+
+
+def test_none_changes_nothing(monkeypatch):
+    monkeypatch.delattr(os, "sched_setaffinity", raising=False)
+    keep_to_cores(None)
+
+
+def test_a_system_without_a_choice_says_so(monkeypatch):
+    monkeypatch.delattr(os, "sched_setaffinity", raising=False)
+    with pytest.raises(ValueError, match="--cores 1: .* does not let a process choose its cores; leave it"):
+        keep_to_cores(1)
