@@ -1,4 +1,4 @@
-"""The machine: what a result was made on (no name that someone gave it), and which of its cores to keep to."""
+"""The machine: what a result was made on (no name that someone gave it), and which cores to keep to."""
 
 import os
 import platform

@@ -50,5 +50,5 @@ def test_none_changes_nothing(monkeypatch):
 
 def test_a_system_without_a_choice_says_so(monkeypatch):
     monkeypatch.delattr(os, "sched_setaffinity", raising=False)
-    with pytest.raises(ValueError, match="--cores 1: .* does not let a process choose its cores; leave it"):
+    with pytest.raises(ValueError, match=r"--cores 1: .* does not let a process choose its cores; leave it"):
         keep_to_cores(1)

@@ -136,7 +136,7 @@ class Watch(NamedTuple):
     turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
     glimpsed: Bool[
         Array, "k"
-    ]  # found elsewhere, but in one frame only: the next one says whether it is there
+    ]  # found elsewhere, in one frame only: the next says whether it is there
 
     @property
     def doubtful(self) -> Bool[Array, "k"]:
