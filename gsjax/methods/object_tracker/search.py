@@ -134,9 +134,7 @@ class Watch(NamedTuple):
     lost: Bool[Array, "k"]
     showed: Float[Array, "k"]  # share of it that was seen in the first frame, of what faced the cameras
     turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
-    glimpsed: Bool[
-        Array, "k"
-    ]  # found elsewhere, in one frame only: the next says whether it is there
+    glimpsed: Bool[Array, "k"]  # found elsewhere, in one frame only: the next says whether it is there
 
     @property
     def doubtful(self) -> Bool[Array, "k"]:
