@@ -11,6 +11,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsjax.cli.machine import usable_cores
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
 from gsjax.methods.object_tracker import (
@@ -26,7 +27,10 @@ from gsjax.methods.object_tracker.budget import Chosen
 from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
-"""Frames that are read while an update runs."""
+"""Frames that are read while an update runs, where there is a second core for that."""
+
+_SHOWN_EVERY_S = 0.1
+"""The progress bar is drawn between updates, for a thread of its own would make some of them late."""
 
 
 @dataclass
@@ -139,7 +143,8 @@ def follow(
         after: the last update, where tracking goes on from an earlier run.
         saved: called after each update, and once more, with True, where the loop is stopped early.
     """
-    frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), LOADED_AHEAD)
+    ahead = LOADED_AHEAD if usable_cores() > 1 else 0
+    frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), ahead)
     update = after
     columns = (
         TextColumn("[bold]{task.description}"),
@@ -148,8 +153,8 @@ def follow(
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    begun, plans = perf_counter(), set()
-    with Progress(*columns, console=console, expand=True) as progress:
+    begun, plans, drawn = perf_counter(), set(), 0.0
+    with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task(
             "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"
         )
@@ -172,6 +177,9 @@ def follow(
                 plans.add(update.plan)
                 saved(tracking, update, False)
                 progress.update(task, advance=1, rate=_rate(tracking))
+                if perf_counter() - drawn > _SHOWN_EVERY_S:
+                    progress.refresh()
+                    drawn = perf_counter()
             if update is not None and update.info:
                 saved(tracking, update, True)
         except (KeyboardInterrupt, Exception) as stopped:

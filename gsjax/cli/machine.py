@@ -17,13 +17,18 @@ def describe() -> dict[str, Any]:
     processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
     return {
         "processor": processor or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "avx512": has_avx512(),
         "device": devices[0].device_kind,
         "devices": len(devices),
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def keep_to_cores(count: int | None) -> None:

@@ -232,7 +232,7 @@ Loaded = TypeVar("Loaded")
 
 
 class Prefetched(Generic[Loaded]):
-    """Iterate over `load(0), load(1), ...`, each loaded by a thread while the one before is in use.
+    """Iterate over `load(0), load(1), ...`, each by a thread, up to `ahead` while one is in use.
 
     Attributes:
         waited: seconds that the iteration had to wait for a load so far.
