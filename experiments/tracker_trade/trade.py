@@ -128,7 +128,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def in_one_time(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """With the times that they would have taken had `fast`, which ran beside each, always taken its median."""
+    """The times that they would have taken had `fast`, which ran beside each, always taken its median."""
     usual = {}
     for recording in {row["recording"] for row in rows}:
         beside = [row["update_ms"] / row["ratio"] for row in rows if row["recording"] == recording]
