@@ -192,7 +192,14 @@ def _report(grasps: Grasp, answer: Answer, folder) -> int:
     else:
         print(
             f"{answer.name}: a feasible grasp in {feasible.sum()} of {len(feasible)} frames, "
-            f"score {grasps.score[feasible].mean():.2f}, {1e3 * grasps.width[feasible].mean():.0f} mm wide"
+            f"score {grasps.score[feasible].mean():.2f} in the mean, "
+            f"{_between(1e3 * grasps.width[feasible])} mm wide"
         )
     print(f"grasp   {folder}")
     return 0 if feasible.any() else NOT_THERE
+
+
+def _between(values: Float[np.ndarray, "n"]) -> str:
+    """A range in words, or the one number that all are."""
+    low, high = round(values.min()), round(values.max())
+    return f"{low}" if low == high else f"{low} to {high}"

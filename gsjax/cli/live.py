@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import keep_to_cores, resident_mb
-from gsjax.cli.messages import Notes
+from gsjax.cli.messages import FITTING, Notes, stage
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run_folder import RunFolder
@@ -40,7 +40,7 @@ class Options:
     out: Path
     """Folder for the run. It must be new, empty, or hold an unfinished run."""
     seconds: float = 60.0
-    """How long to follow."""
+    """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
     hz: float = 30.0
     """Frames a second: of the replay, and what the budget comes from."""
     budget_ms: float | None = None
@@ -148,7 +148,7 @@ def _open(options: Options, console: Console) -> Source:
         )
     draw_ahead(recording, console)
     frames = [recording.tracked.frame(t) for t in range(recording.tracked.num_frames)]
-    with console.status("fitting the scene to the first frame"):
+    with stage(console, FITTING):
         scene = start_scene(frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera), CONFIG)
     names = label_names(recording, mask.source)
     return Source(frames[0], scene, names, replay(frames, options.hz, options.seconds))
@@ -282,7 +282,8 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
                 return
 
     try:
-        with console.status("measuring what updates cost") as status:
+        console.print("measuring what updates cost; each setting takes a minute or two to compile")
+        with console.status("compiling and measuring") as status:
             updates = track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms)
             for update in updates:
                 if not arrived:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.machine import usable_cores
+from gsjax.cli.messages import COMPILING
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
 from gsjax.methods.object_tracker import (
@@ -154,6 +155,8 @@ def follow(
         TimeRemainingColumn(),
     )
     begun, plans, drawn = perf_counter(), set(), 0.0
+    if not console.is_terminal:  # where the bar is drawn once only, at the end
+        console.print(COMPILING)
     with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task(
             "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"

@@ -47,7 +47,8 @@ def keep_to_cores(count: int | None) -> None:
         )
     allowed = sorted(os.sched_getaffinity(0))
     if not 1 <= count <= len(allowed):
-        raise ValueError(f"--cores: expected 1 to {len(allowed)}, which this process may use, found {count}")
+        cores = "1 core" if len(allowed) == 1 else f"1 to {len(allowed)} cores"
+        raise ValueError(f"--cores: expected {cores}, which is what this process may use, found {count}")
     os.sched_setaffinity(0, allowed[-count:])
 
 

@@ -4,6 +4,8 @@ import re
 import sys
 import warnings
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +16,9 @@ from rich.text import Text
 
 from gsjax.cli.interrupts import heard_interrupts
 from gsjax.data.errors import DataWarning
+
+FITTING = "fitting the scene to the first frame, which takes half a minute to two"
+COMPILING = "compiling the update, which takes a minute or two"
 
 # ValueError covers DataError and PlyError, and whatever an argument is checked for.
 USER_ERRORS = (ValueError, OSError)
@@ -67,6 +72,17 @@ def _expect_values(options: Any, arguments: list[str]) -> None:
         flag = "--" + field.name.replace("_", "-")
         if getattr(options, field.name) == field.default == () and flag in given:
             raise ValueError(f"{flag}: expected one value or more, found none")
+
+
+@contextmanager
+def stage(console: Console, words: str) -> Iterator[None]:
+    """Say what takes a while: a spinner for people, a line for a log."""
+    if console.is_terminal:
+        with console.status(words):
+            yield
+    else:
+        console.print(words, soft_wrap=True)
+        yield
 
 
 def describe(error: BaseException) -> str:

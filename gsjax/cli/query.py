@@ -112,7 +112,8 @@ def run(options: Options) -> int:
         write_json(folder / "query.json", told)
     hidden = sum(count == 0 for count in pixels)
     unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
-    print(f"{len(answer.rows)} Gaussians{unseen}")
+    score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"
+    print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
     print(f"query   {folder}")
     return 0
 
@@ -125,6 +126,7 @@ def ask(options: Asked, console: Console, notes: Notes) -> tuple[SavedRun, Answe
     """
     _check_encoder(options)
     saved = open_run(options.run)
+    saved.seen_by(options.camera)  # one that is not there need not wait for the rest either
     encoder = _encoder(options, saved)
     wanted = encoder.embed_text(options.text)  # first: a word that nobody knows need not wait for the rest
     with console.status("looking at the first frame"):

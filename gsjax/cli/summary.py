@@ -100,6 +100,10 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     for columns, rows in ((narrow, object_rows(found)), (CAMERA_COLUMNS, camera_rows(found))):
         if rows:
             console.print(_grid(columns, rows))
+    for name, scored in found["objects"].items():
+        if scored.get("turn_unknown_from") is not None:
+            since = f"from frame {scored['turn_unknown_from']} on"
+            console.print(f"{name}: how it is turned is not known {since}")
     frames, rate = found["frames"], found["update_hz"]
     speed = f"{rate:.2f} Hz ({found['update_ms']['mean']:.0f} ms an update)" if rate else "no updates"
     part = "" if found["complete"] else " [bold yellow](partial run)[/]"

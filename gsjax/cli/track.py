@@ -14,7 +14,7 @@ from rich.console import Console
 from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import keep_to_cores
-from gsjax.cli.messages import Notes, describe, say_error
+from gsjax.cli.messages import FITTING, Notes, describe, say_error, stage
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
 from gsjax.cli.recording import (
     FirstMask,
@@ -62,7 +62,8 @@ class Options:
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     budget_ms: float | None = None
-    """What an update may take, milliseconds. The tracker's settings are then chosen by measured cost."""
+    """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given counts only
+    how the scene starts, and how much may join it."""
     cores: int | None = None
     """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
     resume: bool = False
@@ -72,7 +73,7 @@ class Options:
     debug: bool = False
     """Show Python's traceback when something fails."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
-    """What the tracker's settings are unless given: for small errors, or for 30 Hz."""
+    """The tracker's settings unless given: for small errors, between, for 30 Hz, or as in the paper."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """The tracker's own settings."""
 
@@ -96,6 +97,8 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything tracked before that is on disk.
     """
+    if options.budget_ms is not None and not options.budget_ms > 0:
+        raise ValueError(f"--budget-ms: expected more than 0, found {options.budget_ms}")
     keep_to_cores(options.cores)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
@@ -149,7 +152,7 @@ def _start(
 ) -> tuple[TrackedScene, float]:
     """The scene at the first frame, and the seconds that it took."""
     begun = perf_counter()
-    with console.status("fitting the scene to the first frame"):
+    with stage(console, FITTING):
         if mask.labels is not None:
             scene = start_scene(frame, mask.labels, recording.tracked.camera_ids.index(mask.camera), config)
         else:
@@ -349,7 +352,7 @@ def _note_what_is_missing(
             notes.add(f"{name}: lost in {len(lost)} frames, from {lost[0]} {ended}.")
         unknown = turn_unknown_from(tracking, values, label)
         if unknown is not None and not to_the_end:
-            why = "it was lost, or other turns agree as well"
+            why = "it was lost before" if len(lost) else "other turns agree as well"
             notes.add(f"{name}: from frame {unknown} on it is not known how it is turned: {why}.")
     for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
         name = names.get(label, f"object {label}")

@@ -38,7 +38,7 @@ def test_jax_starts_its_threads_on_the_cores_that_are_kept_to():
 @pytest.mark.parametrize("count", [0, -1, 100_000])
 def test_more_cores_than_there_are_is_an_error(count):
     before = os.sched_getaffinity(0)
-    with pytest.raises(ValueError, match=rf"--cores: expected 1 to {len(before)}, .* found {count}"):
+    with pytest.raises(ValueError, match=rf"--cores: expected 1 .* found {count}"):
         keep_to_cores(count)
     assert os.sched_getaffinity(0) == before
 
