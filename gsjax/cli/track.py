@@ -62,8 +62,8 @@ class Options:
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     budget_ms: float | None = None
-    """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given counts only
-    how the scene starts, and how much may join it."""
+    """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given, only
+    how the scene starts and how much may join it count."""
     cores: int | None = None
     """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
     resume: bool = False
