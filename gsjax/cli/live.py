@@ -10,12 +10,13 @@ import jax
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.live import Live
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import keep_to_cores, resident_mb
-from gsjax.cli.messages import FITTING, Notes, stage
+from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run_folder import RunFolder
@@ -54,7 +55,8 @@ class Options:
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     cores: int | None = None
-    """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
+    """How many of the processor's cores to use, for everything; updates are steadiest on 1. All unless given.
+    They are the last ones: for two programs at once, taskset each to its own."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
     overwrite: bool = False
@@ -114,9 +116,10 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    for name in ("seconds", "hz", "patience"):
-        if not getattr(options, name) > 0:
-            raise ValueError(f"--{name}: expected more than 0, found {getattr(options, name)}")
+    for name in ("seconds", "hz", "patience", "budget_ms"):
+        found = getattr(options, name)
+        if found is not None and not found > 0:
+            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {found}")
     if options.source.startswith(CAMERA_PREFIX):
         for name in ("cameras", "mask_camera", "frames", "masks"):
             if getattr(options, name) != getattr(Options, name):
@@ -139,7 +142,9 @@ def _open(options: Options, console: Console) -> Source:
         first = next(stream).frame
         image, depth = np.asarray(first.images[0]), np.asarray(first.depths)[0]
         mask = PlaneOrRegionSegmenter()((255 * image).astype(np.uint8), depth, camera.K)
-        return Source(first, start_scene(first, mask.astype(np.int32), 0, CONFIG), {}, stream)
+        with stage(console, FITTING):
+            scene = start_scene(first, mask.astype(np.int32), 0, CONFIG)
+        return Source(first, scene, {}, stream)
     recording = open_recording(options.source, options.cameras, (), options.frames)
     mask = first_mask(recording.tracked, options.mask_camera, options.masks)
     if mask.labels is None:
@@ -282,18 +287,18 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
                 return
 
     try:
-        console.print("measuring what updates cost; each setting takes a minute or two to compile")
-        with console.status("compiling and measuring") as status:
+        console.print(MEASURING)
+        # Drawn between updates: a thread of its own would make some of them late.
+        with Live(console=console, auto_refresh=False, transient=True) as shown:
             updates = track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms)
             for update in updates:
                 if not arrived:
                     continue
                 log.add(update, arrived[0], budget_ms / 1e3)
                 if len(log.times) % 15 == 0:
-                    worst = 1e3 * max(log.latencies)
-                    status.update(
-                        f"{newest.counts.used} frames, {newest.counts.dropped} dropped, {worst:.0f} ms"
-                    )
+                    worst, counts = 1e3 * max(log.latencies), newest.counts
+                    words = f"{counts.used} frames, {counts.dropped} dropped, {worst:.0f} ms at worst"
+                    shown.update(words, refresh=True)
     except (KeyboardInterrupt, Exception) as stopped:
         return stopped
     finally:

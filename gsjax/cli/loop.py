@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.machine import usable_cores
-from gsjax.cli.messages import COMPILING
+from gsjax.cli.messages import COMPILING, MEASURING
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
 from gsjax.methods.object_tracker import (
@@ -144,7 +144,8 @@ def follow(
         after: the last update, where tracking goes on from an earlier run.
         saved: called after each update, and once more, with True, where the loop is stopped early.
     """
-    ahead = LOADED_AHEAD if usable_cores() > 1 else 0
+    shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
+    ahead = 0 if shared else LOADED_AHEAD
     frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), ahead)
     update = after
     columns = (
@@ -155,8 +156,8 @@ def follow(
         TimeRemainingColumn(),
     )
     begun, plans, drawn = perf_counter(), set(), 0.0
-    if not console.is_terminal:  # where the bar is drawn once only, at the end
-        console.print(COMPILING)
+    if not console.is_terminal and tracking.num_frames < tracked.num_frames:  # the bar is drawn at the end
+        console.print(COMPILING if budget_ms is None else MEASURING, soft_wrap=True)
     with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task(
             "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"

@@ -2,6 +2,7 @@
 
 import os
 import platform
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ def usable_cores() -> int:
 def keep_to_cores(count: int | None) -> None:
     """Have this process run on `count` of the cores that it may use, the last of them; None changes nothing.
 
-    XLA starts a thread for each core that it finds, so call it before JAX computes anything.
+    XLA starts a thread for each core that it finds, so call it before JAX computes anything. Threads that
+    there are already are kept to them too.
 
     Raises:
         ValueError: there are fewer, or this system does not let a process choose.
@@ -47,9 +49,12 @@ def keep_to_cores(count: int | None) -> None:
         )
     allowed = sorted(os.sched_getaffinity(0))
     if not 1 <= count <= len(allowed):
-        cores = "1 core" if len(allowed) == 1 else f"1 to {len(allowed)} cores"
-        raise ValueError(f"--cores: expected {cores}, which is what this process may use, found {count}")
-    os.sched_setaffinity(0, allowed[-count:])
+        most = "1 core" if len(allowed) == 1 else f"1 to {len(allowed)} cores"
+        raise ValueError(f"--cores: expected {most}, which is what this process may use, found {count}")
+    tasks = Path("/proc/self/task")
+    for thread in [int(task.name) for task in tasks.iterdir()] if tasks.is_dir() else [0]:
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setaffinity(thread, allowed[-count:])
 
 
 def resident_mb() -> float:
@@ -68,7 +73,7 @@ def resident_mb() -> float:
 def name(machine: dict[str, Any]) -> str:
     """What two runs must share for their milliseconds to be compared: processor, cores and device."""
     device = "" if machine["device"] == "cpu" else f", {machine['device']}"
-    return f"{machine['processor']}, {machine['cores']} cores{device}"
+    return f"{machine['processor']}, {_cores(machine)}{device}"
 
 
 def in_words(machine: dict[str, Any]) -> str:
@@ -76,4 +81,8 @@ def in_words(machine: dict[str, Any]) -> str:
     extra = ", AVX-512" if machine["avx512"] else ""
     devices = f"{machine['devices']} x " if machine["devices"] > 1 else ""
     versions = f"JAX {machine['jax']}, Python {machine['python']}, {devices}{machine['device']}"
-    return f"{machine['processor']}, {machine['cores']} cores{extra}; {versions}"
+    return f"{machine['processor']}, {_cores(machine)}{extra}; {versions}"
+
+
+def _cores(machine: dict[str, Any]) -> str:
+    return "1 core" if machine["cores"] == 1 else f"{machine['cores']} cores"

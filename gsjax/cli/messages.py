@@ -19,6 +19,7 @@ from gsjax.data.errors import DataWarning
 
 FITTING = "fitting the scene to the first frame, which takes half a minute to two"
 COMPILING = "compiling the update, which takes a minute or two"
+MEASURING = "measuring what updates cost; each setting takes a minute or two to compile"
 
 # ValueError covers DataError and PlyError, and whatever an argument is checked for.
 USER_ERRORS = (ValueError, OSError)

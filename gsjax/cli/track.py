@@ -65,7 +65,8 @@ class Options:
     """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given, only
     how the scene starts and how much may join it count."""
     cores: int | None = None
-    """How many of the processor's cores to use; 1 is the steadiest. All unless given."""
+    """How many of the processor's cores to use, for everything; updates are steadiest on 1. All unless given.
+    They are the last ones: for two programs at once, taskset each to its own."""
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options."""
     overwrite: bool = False
@@ -352,7 +353,7 @@ def _note_what_is_missing(
             notes.add(f"{name}: lost in {len(lost)} frames, from {lost[0]} {ended}.")
         unknown = turn_unknown_from(tracking, values, label)
         if unknown is not None and not to_the_end:
-            why = "it was lost before" if len(lost) else "other turns agree as well"
+            why = "it was lost then" if unknown in lost else "other turns agree as well"
             notes.add(f"{name}: from frame {unknown} on it is not known how it is turned: {why}.")
     for label in sorted({ids[group + 1] for group in np.flatnonzero(counts)}):
         name = names.get(label, f"object {label}")

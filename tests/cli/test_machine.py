@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gsjax.cli.machine import keep_to_cores
+from gsjax.cli.machine import describe, in_words, keep_to_cores, name
 
 needs_affinity = pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores"
@@ -14,11 +14,19 @@ needs_affinity = pytest.mark.skipif(
 
 KEPT = """
 import os
+import threading
 import jax
+import gsjax.cli.live
 from gsjax.cli.machine import describe, keep_to_cores
 
 before = os.sched_getaffinity(0)
+done = threading.Event()
+thread = threading.Thread(target=done.wait)
+thread.start()
 keep_to_cores(1)
+there = os.sched_getaffinity(thread.native_id)
+done.set()
+assert there == {max(before)}
 assert os.sched_getaffinity(0) == {max(before)}
 cores = describe()["cores"]
 jax.block_until_ready(jax.numpy.ones((500, 500)) @ jax.numpy.ones((500, 500)))
@@ -29,7 +37,8 @@ print(cores, len(pool) > 0, all(os.sched_getaffinity(t) == {max(before)} for t i
 
 
 @needs_affinity
-def test_jax_starts_its_threads_on_the_cores_that_are_kept_to():
+def test_threads_run_on_the_cores_that_are_kept_to_those_of_jax_too():
+    """Importing a command must not have started JAX's yet."""
     said = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
     assert said.stdout.split() == ["1", "True", "True"]
 
@@ -41,6 +50,13 @@ def test_more_cores_than_there_are_is_an_error(count):
     with pytest.raises(ValueError, match=rf"--cores: expected 1 .* found {count}"):
         keep_to_cores(count)
     assert os.sched_getaffinity(0) == before
+
+
+def test_one_core_is_singular():
+    machine = describe()
+    assert "1 core," in in_words(machine | {"cores": 1})
+    assert name(machine | {"cores": 1}).endswith(", 1 core")
+    assert name(machine | {"cores": 2}).endswith(", 2 cores")
 
 
 def test_none_changes_nothing(monkeypatch):

@@ -17,7 +17,7 @@ from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
-CAN, BALL = 3, 4
+CARTON, CAN, BALL = 2, 3, 4
 QUICK = ("--tracker.start.iterations", "2")
 CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 
@@ -187,35 +187,46 @@ def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsj
 def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     pristine, tmp_path, gsjax_track, still, monkeypatch
 ):
-    """The can is lost in update 1 alone, and from update 2 on it is not known how the ball is turned."""
+    """The can is lost in update 1 alone, as is the ball, whose turn is then known for one more update; from
+    update 3 on it is not. How the carton is turned is not known since it was lost, in update 2."""
     ids: list[int] = []
 
     def flagged(scene, first, frames, config, **how):
         ids[:] = scene.label_ids[1:]
         for t, update in enumerate(still(scene, first, frames, config), 1):
             lost, known = np.zeros(len(ids), bool), np.ones(len(ids), bool)
-            lost[ids.index(CAN)] = t == 1
-            known[ids.index(BALL)] = t < 2
+            lost[[ids.index(CAN), ids.index(BALL)]] = t == 1
+            lost[ids.index(CARTON)] = t == 2
+            known[ids.index(BALL)] = t == 2
+            known[ids.index(CARTON)] = t < 2
             yield update._replace(info=update.info | {"lost": lost, "turn_known": known})
 
     monkeypatch.setattr(gsjax.cli.loop, "track", flagged)
     assert gsjax_track(pristine, "--cameras", "1")[0] == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    notes = [note for note in found["notes"] if note.startswith(("can:", "ball:"))]
-    assert notes == [
+    assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [
+        "carton: lost in 1 frames, from 2 to 2.",
+        "carton: from frame 2 on it is not known how it is turned: it was lost then.",
         "can: lost in 1 frames, from 1 to 1.",
-        "ball: from frame 2 on it is not known how it is turned: other turns agree as well.",
+        "ball: lost in 1 frames, from 1 to 1.",
+        "ball: from frame 3 on it is not known how it is turned: other turns agree as well.",
     ]
     objects = found["objects"]
-    assert {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]} == {"can": 1}
+    lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
+    assert lost == {"carton": 1, "can": 1, "ball": 1}
     unknown = {name: o["turn_unknown_from"] for name, o in objects.items() if o["turn_unknown_from"]}
-    assert unknown == {"ball": 2}
+    assert unknown == {"carton": 2, "ball": 3}
     with np.load(tmp_path / "run" / "trajectory.npz") as stored:
         objects = stored["label_ids"][1:].tolist()
         frames, of = np.nonzero(stored["lost"])
-        assert (frames.tolist(), [objects[k] for k in of]) == ([1], [CAN])
+        assert {(t, objects[k]) for t, k in zip(frames, of, strict=True)} == {
+            (1, CAN),
+            (1, BALL),
+            (2, CARTON),
+        }
         frames, of = np.nonzero(~stored["turn_known"])
-        assert (frames.tolist(), [objects[k] for k in of]) == ([2, 3], [BALL, BALL])
+        unknown = {(t, objects[k]) for t, k in zip(frames, of, strict=True)}
+        assert unknown == {(1, BALL), (3, BALL), (2, CARTON), (3, CARTON)}
 
 
 def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):

@@ -415,7 +415,7 @@ def test_a_watch_knows_what_is_usual_and_who_waits():
     for t in range(60):
         shown = jnp.array([t, 60.0 - t])
         sure = Confidence(jnp.array([0.9, 0.2]), jnp.array([0.8, 0.1]), jnp.array([True, t > 0]))
-        watch = watch.after(jnp.array([0.4, 0.0]), nothing_of([False, True]), shown, sure, shown < 0)
+        watch = watch.after(jnp.array([0.4, 0.0]), nothing_of([False, True]), shown, sure, *2 * [shown < 0])
         np.testing.assert_array_equal(watch.lost, [False, t > 0])  # where nothing tells, all is as before
     np.testing.assert_allclose(watch.usual, [0.4, 0.02], rtol=1e-2)
     np.testing.assert_allclose(watch.waited, [60, 0])
@@ -446,7 +446,7 @@ def test_what_is_lost_is_found_only_when_it_shows_itself():
     ]
     for agrees, shows, lost in told:
         sure = Confidence(jnp.array([agrees]), jnp.array([shows]), one)
-        watch = watch.after(none, nothing_of([True]), none, sure, none > 0)
+        watch = watch.after(none, nothing_of([True]), none, sure, ~one, ~one)
         assert bool(watch.lost[0]) == lost, (agrees, shows)
 
 
@@ -461,14 +461,16 @@ def test_what_is_found_elsewhere_once_is_glimpsed_and_checked_in_the_next_frame(
         (0.9, one, ~one, False),  # checked, but no better than where it is believed to be: others may look
         (0.9, one, ~one, True),
         (0.4, one, ~one, False),  # not there
-        (0.9, ~one, ~one, False),  # not looked for
+        (0.9, ~one, ~one, False),  # not looked for, or no better than in its place
     ]
-    for agrees, recovered, retaken, glimpsed in told:
+    for agrees, elsewhere, retaken, glimpsed in told:
         there = Confidence(none + agrees, none + agrees, one)
-        sought = nothing_of([True])._replace(recovered=recovered)
+        sought = nothing_of([True])
         sought = sought._replace(again=sought.again._replace(sure=there))
-        watch = watch.after(none, sought, none, unsure, retaken)
+        watch = watch.after(none, sought, none, unsure, elsewhere, retaken)
         assert bool(watch.glimpsed[0]) == bool(glimpsed)
+    certain = Confidence(none + 0.8, none + 0.7, one)  # and so not looked for elsewhere in the next frame
+    assert not watch.after(none, sought, none, certain, one, ~one).glimpsed[0]
 
 
 def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
@@ -485,9 +487,9 @@ def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
     ]
     for agrees, lead, known in told:
         sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
-        watch = watch.after(none, nothing_of([True], lead), none, sure, none > 0)
+        watch = watch.after(none, nothing_of([True], lead), none, sure, ~one, ~one)
         assert bool(watch.turn_known[0]) == known, (agrees, lead)
     for agrees, known in ((0.9, True), (0.62, False)):  # moved to where it was found, though it was not lost
         sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
-        watch = watch.after(none, nothing_of([True]), none, sure, one)
+        watch = watch.after(none, nothing_of([True]), none, sure, one, one)
         assert bool(watch.turn_known[0]) == known, agrees

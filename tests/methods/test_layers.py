@@ -18,6 +18,8 @@ from gsjax.methods.object_tracker.layers import (
     show_moving,
     shown_by,
 )
+from gsjax.rasterize.rasterization import rasterization
+from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render
 
 GAP = 0.015
@@ -74,6 +76,25 @@ def test_what_the_plan_leaves_out_changes_hardly_a_label(both, started, more):
     assert agree[drawn].mean() > 0.97
     apart = np.abs(exact.depths - shown.depths)[agree & drawn]
     assert np.quantile(apart, 0.9) < 5e-3  # half a pixel of this small table
+
+
+@pytest.mark.parametrize("opacity", [0.5, 0.9, 0.99, 1.0])
+def test_a_single_gaussian_in_front_of_another_is_drawn_at_almost_its_depth(opacity):
+    means = jnp.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.9]])
+    quats, ones = jnp.tile(jnp.eye(4)[0], (2, 1)), jnp.ones((2, 3))
+    two = gaussians_from_activated(means, quats, 0.05 * ones, jnp.array([opacity, 0.99]), ones)
+    K = jnp.array([[50.0, 0, 8.5], [0, 50.0, 8.5], [0, 0, 1]])
+    camera = Camera(jnp.eye(4)[None], K[None], 17, 17)
+    args = (two.means, two.quats, two.scales, two.opacities, ones[:, :1], camera.viewmat, camera.K, 17, 17)
+
+    def at_the_middle(plan):
+        images, alphas, _ = rasterization(*args, plan=plan, render_mode="RGB+ED")
+        return float(images[0, 8, 8, 1]), float(alphas[0, 8, 8, 0])
+
+    exact, _ = at_the_middle(plan_render(two, camera, sh_degree=None))
+    depth, alpha = at_the_middle(plan_moving(two, camera, 2.0))
+    assert abs(depth - exact) <= 0.1 * 0.3
+    assert alpha > 0.89
 
 
 def test_cameras_see_the_same_gaussians_in_both(both, started, table):

@@ -236,6 +236,6 @@ FAST = replace(
     coarseness=2,
 )
 PRESETS = {"accurate": TrackerConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
-"""`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on two cores,
+"""`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on one core,
 and looks for two objects everywhere in an update. `paper` has all of the paper's stages, template matching
 and photometric refinement too, which cost much and gain little: see docs/results-tracking.md."""

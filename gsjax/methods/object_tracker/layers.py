@@ -110,9 +110,11 @@ def are_same(a: Camera, b: Camera) -> Bool[Array, ""]:
 
 
 def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
-    """For `show_moving`, of which only labels and depths are asked: shares of a pixel below 3 %, and its last
-    1 %, are left out. A Gaussian that would take what is left is not drawn, so none may take that much alone:
-    `alpha_max`. Small tiles fit small Gaussians, and a few of them end sooner than many (tuned on a CPU)."""
+    """For `show_moving`, of which only labels and depths are asked: shares of a pixel below 3 % are left out,
+    and all that lies behind once less than a tenth is left. A Gaussian that would leave less than 1 % is not
+    drawn, so none may take that much alone: `alpha_max`. So where one alone is all that shows of an opaque
+    thing, depth leans by up to 9 % of the way to what moves behind it. Small tiles fit small Gaussians, and a
+    few of them end sooner than many (tuned on a CPU)."""
     limits = {"alpha_min": 0.03, "alpha_max": 0.9, "min_transmittance": 0.01}
     tiles = {"tile_size": 4, "tiles_per_batch": 384}
     return plan_render(moving, cameras, headroom=headroom, sh_degree=None, **limits, **tiles)

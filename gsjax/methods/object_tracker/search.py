@@ -134,7 +134,7 @@ class Watch(NamedTuple):
     lost: Bool[Array, "k"]
     showed: Float[Array, "k"]  # share of it that was seen in the first frame, of what faced the cameras
     turn_known: Bool[Array, "k"]  # since the first frame, or since it was found again
-    glimpsed: Bool[Array, "k"]  # found elsewhere, in one frame only: the next says whether it is there
+    glimpsed: Bool[Array, "k"]  # found elsewhere in this frame, which the next one is to confirm
 
     @property
     def doubtful(self) -> Bool[Array, "k"]:
@@ -147,6 +147,7 @@ class Watch(NamedTuple):
         sought: Sought,
         shown: Float[Array, "k"],
         sure: Confidence,
+        elsewhere: Bool[Array, "k"],
         retaken: Bool[Array, "k"],
     ) -> "Watch":
         """One frame later.
@@ -156,14 +157,15 @@ class Watch(NamedTuple):
             sought: what the search found.
             shown: pixels that showed each group.
             sure: whether each group is where it is believed to be.
-            retaken: groups that were moved to where they were found.
+            elsewhere: groups of which more is seen in another place than in theirs.
+            retaken: those of them that were moved there.
         """
         usual = 0.8 * self.usual + 0.2 * jnp.maximum(residuals, _LEAST_USUAL)
         lost = jnp.where(self.lost, ~is_found(sure, self.showed), sure.agrees < LOST)
         lost = jnp.where(sure.tells, lost, self.lost)
         as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
         told = jnp.where(self.lost | retaken, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
-        return Watch(
+        watch = Watch(
             usual,
             jnp.where(sought.looked_for, 0.0, self.waited + 1.0),
             jnp.maximum(self.largest, shown),
@@ -171,8 +173,9 @@ class Watch(NamedTuple):
             lost,
             self.showed,
             told & ~lost,
-            sought.recovered & is_found(sought.again.sure, self.showed) & ~retaken & ~self.glimpsed,
+            elsewhere & is_found(sought.again.sure, self.showed) & ~retaken & ~self.glimpsed,
         )
+        return watch._replace(glimpsed=watch.glimpsed & watch.doubtful)
 
 
 def first_watch(showed: Float[Array, "k"]) -> Watch:

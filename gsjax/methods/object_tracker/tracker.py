@@ -256,8 +256,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             )
         how = (config.align, state.watch, visible, everywhere)
         # Without depth, what hides a group cannot be told from what is not it.
-        elsewhere = () if sight.depths is None else (astray, recovered)
-        sought = search(jnp.stack(starts), points, centers, sight, *how, *elsewhere)
+        beyond = () if sight.depths is None else (astray, recovered)
+        sought = search(jnp.stack(starts), points, centers, sight, *how, *beyond)
         residual = sought.found.residuals
         kept = begun = Motion(sought.found.twists, delta)
         needed, info, shifted = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
@@ -282,7 +282,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         twice = is_found(again.sure, state.watch.showed) & is_found(again.before, state.watch.showed)
         # What is not lost is seen where it is. Turned otherwise there, it is in no other place.
         away = jnp.linalg.norm(again.twists[:, :3], axis=-1) > radii(firsts, centers)
-        retaken = sought.recovered & better & twice & (state.watch.lost | away)
+        elsewhere = sought.recovered & better & (state.watch.lost | away)
+        retaken = elsewhere & twice
         hunches = of_groups(sought.recovered, again.twists, state.hunches)
         kept = _select(retaken, Motion(again.twists, jnp.zeros_like(delta)), kept, groups)
         sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
@@ -301,7 +302,7 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         keyframe = carry_keyframe(state.keyframe, kept.twists, centers)
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
-        watch = state.watch.after(residual, sought, counts, sure, retaken)
+        watch = state.watch.after(residual, sought, counts, sure, elsewhere, retaken)
         hunches = of_groups(watch.doubtful & ~retaken, since(hunches, kept.twists), still)
         going = _select(retaken, jax.tree.map(jnp.zeros_like, kept), kept, groups)  # a find is no velocity
         new_state = TrackerState(going, pixels, keyframe, strangers, hunches, watch, state.count + 1, *told)
