@@ -148,16 +148,18 @@ def gaussians_from_activated(
     arrays = {name: jnp.asarray(value, dtype) for name, value in arrays.items()}
     for name, columns in wanted.items():
         _check_array(name, arrays[name], (count,) if columns is None else (count, columns))
-    opacities = jnp.clip(arrays["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
-    return Gaussians(
-        means=arrays["means"],
-        quats=arrays["quats"],
-        log_scales=jnp.log(jnp.maximum(arrays["scales"], _MIN_SCALE)),
-        logit_opacities=jnp.log(opacities) - jnp.log1p(-opacities),
-        sh0=rgb_to_sh0(arrays["colors"])[:, None, :],
-        shN=None if shN is None else jnp.asarray(shN, dtype),
-        features=None if features is None else jnp.asarray(features, dtype),
-    )
+    extra = {"shN": shN, "features": features}
+    extra = {name: None if value is None else jnp.asarray(value, dtype) for name, value in extra.items()}
+    return Gaussians(arrays["means"], arrays["quats"], *_raw(arrays), **extra)
+
+
+@jax.jit
+def _raw(activated: dict[str, Array]) -> tuple[Array, Array, Array]:
+    """Log scales, logits of opacities, and sh0. One program, for a count of Gaussians seldom comes twice."""
+    opacities = jnp.clip(activated["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
+    logits = jnp.log(opacities) - jnp.log1p(-opacities)
+    log_scales = jnp.log(jnp.maximum(activated["scales"], _MIN_SCALE))
+    return log_scales, logits, rgb_to_sh0(activated["colors"])[:, None, :]
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:

@@ -48,6 +48,9 @@ from gsjax.methods.object_tracker.search import (
 )
 
 CONFIG = AlignConfig(iterations=12)
+# Compiled once for calls that differ in values alone.
+search = jax.jit(search, static_argnums=(4, 9))
+found_by = jax.jit(align, static_argnums=4)
 CARTON = 2
 SIZE = {"width": 160, "height": 120}
 
@@ -77,7 +80,7 @@ def middle(points):
 
 def run(points, center, sight, config=CONFIG):
     """(the twist found from standing still, where it carries the points)."""
-    found = align(jnp.zeros(6), points, center, sight, config)
+    found = found_by(jnp.zeros(6), points, center, sight, config)
     return found, np.asarray(carry(points, found, center).means)
 
 

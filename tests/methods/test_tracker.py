@@ -125,6 +125,7 @@ def background_of(scene: TrackedScene) -> np.ndarray:
     return np.asarray(scene.gaussians.means)[scene.num_moving :]
 
 
+@pytest.mark.slow
 def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, centroid_errors):
     """Without matching nothing is found; without a warm start the last motion changes nothing."""
     sequence, frames, _ = table()
@@ -142,6 +143,7 @@ def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, ce
     assert max(errors.values()) < 10e-3, errors
 
 
+@pytest.mark.slow
 def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick, monkeypatch):
     """Capacities too small for the scene, in the step alone and then under `track`."""
     _, frames, _ = table()

@@ -19,7 +19,7 @@ def check(seed: int) -> None:
 
 
 # RGB+ED, antialiased, SH 1, features, other limits; ED, classic, 7 channels, features.
-@pytest.mark.parametrize("seed", [29, 42])
+@pytest.mark.parametrize("seed", [29, pytest.param(42, marks=pytest.mark.slow)])
 def test_images_and_gradients_equal_the_reference(seed):
     check(seed)
 

@@ -226,7 +226,9 @@ def test_all_at_equal_depth_are_drawn_in_the_order_of_the_input():
     assert gradient <= 1e-3
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4096), (17, 33)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(1, 1), pytest.param(1, 4096, marks=pytest.mark.slow), (17, 33)]
+)
 def test_images_of_any_shape(width, height):
     scene = scene_before(width, height)
     image, gradient, meta = errors(scene, plan=plan_for(width, height))
@@ -399,7 +401,9 @@ def half_precision(dtype, scene, this):
 
 
 # Half the spacing of values: 2^-9 of a bfloat16, 2^-12 of a float16.
-@pytest.mark.parametrize(("dtype", "spacing"), [(jnp.bfloat16, 2**-9), (jnp.float16, 2**-12)])
+@pytest.mark.parametrize(
+    ("dtype", "spacing"), [(jnp.bfloat16, 2**-9), pytest.param(jnp.float16, 2**-12, marks=pytest.mark.slow)]
+)
 def test_colours_in_half_precision_cost_their_own_rounding_and_no_more(dtype, spacing):
     scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")
     image, painted, others = half_precision(dtype, scene, this)

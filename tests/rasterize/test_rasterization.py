@@ -167,7 +167,9 @@ def test_cameras_that_see_nothing_are_empty_with_zero_gradients(small):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 33), (1, 64)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(17, 33), *(pytest.param(1, h, marks=pytest.mark.slow) for h in (1, 64))]
+)
 def test_images_that_are_no_multiple_of_a_tile(small, width, height):
     _, scene = small(dtype=np.float64, width=width, height=height)
     scene["Ks"] = jnp.array([[[20.0, 0.0, width / 2], [0.0, 20.0, height / 2], [0.0, 0.0, 1.0]]])

@@ -268,6 +268,7 @@ def test_forward_derivatives_over_four_devices(on_four):
     assert on_four["forward"] <= 1e-5
 
 
+@pytest.mark.slow
 def test_two_processes():
     with socket.socket() as free:
         free.bind(("localhost", 0))
