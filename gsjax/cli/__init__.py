@@ -14,6 +14,7 @@ from rich.table import Table
 COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
+    "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs, and report on it"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
     "query": ("gsjax.cli.query", "find the object of a run that a text means, and show it over time"),
     "grasp": ("gsjax.cli.grasp", "find the best grasp of the object that a text means, in every frame"),

@@ -1,6 +1,7 @@
-"""`gsjax info`: what is understood of a recording, before anything is made of it."""
+"""`gsjax info`: what is understood of a recording or of photographs, before anything is made of them."""
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -9,7 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gsjax.cli.messages import Notes
-from gsjax.data import Sequence, open_sequence
+from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence
+from gsjax.data.open import is_of_photographs
+from gsjax.methods.reconstruction import extent_of
 
 MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
 
@@ -19,7 +22,9 @@ class Options:
     """What `gsjax info` is told."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of a recording, or a built-in scene such as simulated:tabletop."""
+    """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """What the layout of the data leaves open."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -30,22 +35,70 @@ def run(options: Options) -> int:
     Raises:
         DataError, ValueError: it cannot be read.
     """
+    if is_of_photographs(options.dataset):
+        return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):
-        sequence = open_sequence(options.dataset)
+        sequence = open_sequence(options.dataset, options.read)
         for c in range(sequence.num_cameras):
             sequence.image(0, c)  # says what is wrong with it
         masks = first_masks(sequence)
-        table = Table.grid(padding=(0, 3, 0, 0))
-        for name, text in describe_sequence(sequence, masks).items():
-            table.add_row(f"[bold]{name}[/]", text)
-    console = Console(highlight=False)
-    console.print(f"[bold cyan]{sequence.name}[/]")
-    console.print(table)
+    console = _print(sequence.name, describe_sequence(sequence, masks))
     pixels = mask_table(masks, sequence)
     if pixels is not None:
         console.print()
         console.print(pixels)
     return 0
+
+
+def _print_photographs(options: Options) -> int:
+    with Notes(Console(stderr=True, highlight=False)):
+        photographs = open_photographs(options.dataset, options.read)
+        photographs.image(0)  # says what is wrong with it
+    _print(photographs.name, describe_photographs(photographs))
+    return 0
+
+
+def _print(name: str, described: dict[str, str]) -> Console:
+    console, table = Console(highlight=False), Table.grid(padding=(0, 3, 0, 0))
+    for what, text in described.items():
+        table.add_row(f"[bold]{what}[/]", text)
+    console.print(f"[bold cyan]{name}[/]")
+    console.print(table)
+    return console
+
+
+def describe_photographs(photographs: Photographs) -> dict[str, str]:
+    """What there is, in words; opens nothing but the first depth image."""
+    sizes = Counter(map(tuple, photographs.sizes.tolist()))
+    degrees = np.degrees(2 * np.arctan(photographs.sizes[:, 0] / (2 * photographs.Ks[:, 0, 0])))
+    extent = extent_of(photographs.viewmats)
+    focus = ", ".join(f"{value:.2f}" for value in extent.focus)
+    times, splits, cloud = photographs.times, photographs.splits, photographs.cloud
+    return {
+        "photographs": f"{photographs.num}: {photographs.names[0]} to {photographs.names[-1]}",
+        "size": ", ".join(
+            f"{width} x {height}" + (f" ({n})" if len(sizes) > 1 else "")
+            for (width, height), n in sizes.most_common(4)
+        )
+        + (", ..." if len(sizes) > 4 else ""),
+        "view": f"{degrees.min():.0f}° wide" + (f" to {degrees.max():.0f}°" if np.ptp(degrees) >= 1 else ""),
+        "cameras": f"within {extent.radius:.2f} of their middle, looking at ({focus})",
+        "splits": "none"
+        if splits is None
+        else ", ".join(f"{n} {name}" for name, n in Counter(splits).items()),
+        "points": "none" if cloud is None else f"{len(cloud.points):,}",
+        "depth": "none" if photographs.load_depth is None else _depth_range(photographs),
+        "masks": "none" if photographs.load_mask is None else "yes",
+        "times": "none" if times is None else f"{times.min():.3f} to {times.max():.3f} s",
+    }
+
+
+def _depth_range(photographs: Photographs) -> str:
+    depth = photographs.depth(0)
+    if depth is None or not (depth > 0).any():
+        return "some, none in the first"
+    low, high = np.percentile(depth[depth > 0], [1, 99])
+    return f"{low:.2f} to {high:.2f} in the first"
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:

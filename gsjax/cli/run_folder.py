@@ -12,7 +12,7 @@ import yaml
 
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
-_FILES = ("config.yml", "metrics.json", "trajectory.npz", "scene.ply", "report.html")
+_FILES = ("config.yml", "metrics.json", "metrics.jsonl", "trajectory.npz", "scene.ply", "report.html")
 _FOLDERS = ("renders", "plots", "query", "grasp", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
@@ -30,10 +30,11 @@ class RunFolder:
         RUN/
           config.yml              the settings, written first; its first line marks the folder as a run's
           metrics.json            every score; what could not be computed is null
+          metrics.jsonl           of a fit: loss, PSNR, count of Gaussians while it goes on, a line each
           trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
-          scene.ply               the Gaussians of the first frame, with their labels
-          renders/CAM/FRAME.png   rendered images
+          scene.ply               the Gaussians: of a fit, or of the first frame with their labels
+          renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
           video_CAM.mp4           input, render, error and labels side by side
           plots/NAME.svg|png      update time, error over frames, ...
           report.html             all of it on one page, written last
@@ -99,6 +100,10 @@ class RunFolder:
     @property
     def config(self) -> Path:
         return self.path / "config.yml"
+
+    @property
+    def metrics_lines(self) -> Path:
+        return self.path / "metrics.jsonl"
 
     @property
     def resume(self) -> Path:

@@ -50,7 +50,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             return dict(loaded)
     except FileNotFoundError:
         raise DataError(path, "arrays", "no such file", "Check the folder; was it copied whole?") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
 
 
@@ -64,15 +64,53 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photograph in pixels, as it is stored, from the head of its file.
+
+    Raises:
+        DataError: the file is missing or not an image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except FileNotFoundError:
+        raise _no_such_file(path, "an image") from None
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        found = f"something else ({path.stat().st_size} bytes; {error})"
+        raise DataError(path, "an image", found, "Fetch the file again.") from None
+
+
 def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
-    """An 8-bit colour image, RGB.
+    """An 8-bit colour image, RGB, as its pixels are stored: that is how cameras are calibrated, whatever its
+    EXIF data says of its orientation.
 
     Raises:
         DataError: the file is missing, cut off, not an image, or not of this size.
     """
-    image = _decode(path, cv2.IMREAD_COLOR)
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     _check_size(path, image, width, height)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width channels"]:
+    """An image with 3 channels, RGB, or 4 where it is transparent somewhere; 16 bits become 8.
+
+    Raises:
+        DataError: the file is missing, cut off, not an image, or not of this size.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    _check_size(path, image, width, height)
+    if image.dtype == np.uint16:
+        image = np.round(image / 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DataError(path, "an image of 8 or 16 bits", f"{image.dtype}", "Save it as PNG or JPEG.")
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    if image.shape[2] == 3:
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
 
 
 def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.ndarray, "height width"]:
@@ -113,8 +151,7 @@ def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
     try:
         content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        advice = "Restore it, or leave out that frame (of all cameras, in the meta too)."
-        raise DataError(path, kind, "no such file", advice) from None
+        raise _no_such_file(path, kind) from None
     cut_off = any(
         content.startswith(head) and end not in content[-_TAIL:] for head, end in _END_MARKS.items()
     )
@@ -123,6 +160,11 @@ def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
         what = "a file that is cut off" if cut_off else "something else"
         raise DataError(path, kind, f"{what} ({len(content)} bytes)", "Fetch the file again.")
     return image
+
+
+def _no_such_file(path: Path, kind: str) -> DataError:
+    advice = "Restore it, or leave out that frame (of all cameras, in the meta too)."
+    return DataError(path, kind, "no such file", advice)
 
 
 def _check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:

@@ -1,11 +1,15 @@
-"""Opens any recording that some reader here knows."""
+"""Opens any recording, and any set of photographs, that some reader here knows."""
 
 import inspect
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import parse_qsl
 
+from gsjax.data import colmap, poses_bounds, transforms
 from gsjax.data.errors import DataError
+from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
+from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
@@ -25,18 +29,119 @@ _LAYOUTS = {
 }
 
 
-def open_sequence(path: str | Path) -> Sequence:
+@dataclass(frozen=True)
+class ReadOptions:
+    """What some layouts leave open."""
+
+    K: tuple[float, float, float, float] | None = None
+    """fx fy cx cy of folders without intrinsics (Open3D), in pixels, centres at +0.5."""
+    axes: poses_bounds.Axes | None = None
+    """What the columns of poses_bounds.npy are: llff (down, right, back; DyNeRF too) or endonerf (right, up,
+    back)."""
+    images: str = "images"
+    """Folder of the photographs, in COLMAP's and LLFF's layouts."""
+    depth_unit_m: float | None = None
+    """Lengths of one step of a depth image (Open3D, nerfstudio); 0.001 unless given."""
+
+
+def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
     """The sequence in a folder, whose layout is recognised, or a built-in scene.
 
     A built-in scene is "simulated:NAME" with the arguments of its function behind it, as in
     "simulated:tabletop?seed=3&frames=20&hide=true".
 
     Raises:
-        DataError: there is no such folder, or its layout is not known.
-        ValueError: there is no built-in scene of that name, or it has no such argument.
+        DataError: there is no such folder, its layout is not known, or it is one of photographs.
+        ValueError: there is no built-in scene of that name, or it has no such argument; an option is missing.
     """
+    options = options or ReadOptions()
     if str(path).startswith(SIMULATED_PREFIX):
         return _simulate(str(path))
+    root = _folder(path)
+    for mark, (_, read) in _LAYOUTS.items():
+        if next(root.glob(mark), None):
+            return read(root)
+    if is_open3d(root):
+        return _open3d(root, options)
+    if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
+        return poses_bounds.read_dynerf(root, options.axes or "llff")
+    photographs = _photograph_layout(root)
+    if photographs:
+        found = f"photographs ({photographs} layout), which have no order in time"
+        raise DataError(root, "a recording over time", found, "gsjax fit takes them.")
+    raise _unknown(root, {mark: layout for mark, (layout, _) in _LAYOUTS.items()})
+
+
+def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
+    """The photographs in a folder, whose layout is recognised, or all frames of a recording.
+
+    Raises:
+        DataError: there is no such folder, or its layout is not known.
+        ValueError: as `open_sequence`, or `axes` is needed and missing.
+    """
+    options, text = options or ReadOptions(), str(path)
+    if text.startswith(SIMULATED_PREFIX):
+        return photographs_of(open_sequence(text))
+    if text.endswith(".json") and Path(path).is_file():
+        return transforms.read_transforms(path, **_unit(options))
+    root = _folder(path)
+    layout = _photograph_layout(root)
+    if layout == "nerfstudio":
+        return transforms.read_transforms(root, **_unit(options))
+    if layout == "COLMAP":
+        return colmap.read_colmap(root, options.images)
+    if layout == "LLFF":
+        if options.axes is None:
+            raise ValueError(
+                f"{root}: poses_bounds.npy does not say how its columns are meant; give axes (--read.axes), "
+                "llff (down, right, back) or endonerf (right, up, back)"
+            )
+        return poses_bounds.read_llff(root, options.axes, options.images)
+    known = any(next(root.glob(mark), None) for mark in _LAYOUTS) or is_open3d(root)
+    if known or next(root.glob("cam*.mp4"), None):
+        return photographs_of(open_sequence(root, options))
+    marks = {mark: layout for mark, (layout, _) in _LAYOUTS.items()}
+    raise _unknown(root, _PHOTOGRAPHS | marks)
+
+
+def is_of_photographs(path: str | Path) -> bool:
+    """Whether there are photographs of what stands still, rather than a recording over time."""
+    if str(path).startswith(SIMULATED_PREFIX):
+        return False
+    root = Path(path)
+    return (root.is_file() and root.suffix == ".json") or (
+        root.is_dir() and _photograph_layout(root) is not None
+    )
+
+
+_PHOTOGRAPHS = {"transforms.json": "nerfstudio", "sparse/0/cameras.bin": "COLMAP", "poses_bounds.npy": "LLFF"}
+
+
+def _photograph_layout(root: Path) -> str | None:
+    """What a folder of photographs is called, by what lies there."""
+    if next(root.glob("transforms*.json"), None):
+        return "nerfstudio"
+    if any(colmap.find(root / place) for place in colmap.PLACES):
+        return "COLMAP"
+    if poses_bounds.find(root) and not next(root.glob("cam*.mp4"), None):
+        return "LLFF"
+    return None
+
+
+def _open3d(root: Path, options: ReadOptions) -> Sequence:
+    if options.K is None:
+        raise ValueError(
+            f"{root}: an Open3D folder has no intrinsics; give K (--read.K), fx fy cx cy in pixels, centres "
+            "at +0.5 (where its papers count them at integers, add 0.5 to cx and cy)"
+        )
+    return read_open3d(root, options.K, **_unit(options))
+
+
+def _unit(options: ReadOptions) -> dict[str, float]:
+    return {} if options.depth_unit_m is None else {"depth_unit_m": options.depth_unit_m}
+
+
+def _folder(path: str | Path) -> Path:
     root = Path(path)
     if not root.is_dir():
         known = ", ".join(SIMULATED_PREFIX + name for name in SIMULATED_SCENES)
@@ -44,13 +149,14 @@ def open_sequence(path: str | Path) -> Sequence:
         raise DataError(
             root, "a folder with a recording", found, f"Give its folder, or a built-in scene: {known}."
         )
-    for mark, (_, read) in _LAYOUTS.items():
-        if next(root.glob(mark), None):
-            return read(root)
-    marks = ", ".join(f"{mark} ({layout} layout)" for mark, (layout, _) in _LAYOUTS.items())
+    return root
+
+
+def _unknown(root: Path, marks: dict[str, str]) -> DataError:
+    expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
     names = sorted(entry.name for entry in root.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "an empty folder"
-    raise DataError(root, f"one of {marks}", found, "Give the folder that holds one of these.")
+    return DataError(root, f"one of {expected}", found, "Give the folder that holds one of these.")
 
 
 def _simulate(text: str) -> Sequence:

@@ -2,6 +2,7 @@
 
 import threading
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,6 +12,33 @@ from gsjax.data.errors import DataError
 
 # Decoding on is faster than a seek, which starts at the key frame before.
 _SKIP_AT_MOST = 12
+
+
+class VideoFile(NamedTuple):
+    """What a video file says of itself."""
+
+    width: int
+    height: int
+    frames: int
+    rate_hz: float
+
+
+def describe_video(path: Path) -> VideoFile:
+    """The size, number of frames and rate of a video.
+
+    Raises:
+        DataError: the file is missing or no video.
+    """
+    if not path.exists():
+        raise DataError(path, "a video", "no such file", "Check the folder; was it copied whole?")
+    capture = cv2.VideoCapture(str(path))
+    wanted = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
+    width, height, frames = (int(capture.get(which)) for which in wanted)
+    rate_hz = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    if min(width, height, frames, rate_hz) <= 0:
+        raise DataError(path, "a video", "something that does not open", "Fetch the file again.")
+    return VideoFile(width, height, frames, rate_hz)
 
 
 class Video:

@@ -3,7 +3,7 @@
 Only matplotlib's object interface is used: no window, no pyplot, no state shared between plots.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -70,6 +70,25 @@ def error_over_frames(
         _margin_label(axes, limit_mm, f"{limit_mm:g} mm", _FAINT)
     axes.set_ylim(bottom=0)
     _legend(figure, axes)
+    return figure
+
+
+def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out PSNR") -> Figure:
+    """PSNR of held-out views and, behind it, the number of Gaussians, over minutes.
+
+    Args:
+        rows: `seconds`, `alive` and `test_psnr` (None where nobody looked) of each.
+    """
+    figure, axes = _new(title, "minutes", "dB")
+    minutes = np.array([row["seconds"] for row in rows], float) / 60
+    psnr = np.array([np.nan if row["test_psnr"] is None else row["test_psnr"] for row in rows], float)
+    known = np.isfinite(psnr)
+    behind = axes.twinx()
+    behind.plot(minutes, [row["alive"] for row in rows], color=_FAINT, lw=1.0)
+    behind.set_ylabel("Gaussians", color=_FAINT)
+    behind.set_ylim(bottom=0)
+    behind.spines[["top"]].set_visible(False)
+    axes.plot(minutes[known], psnr[known], color=_BLUE, lw=1.6, marker="o", ms=3)
     return figure
 
 

@@ -1,9 +1,11 @@
 """A tiny recording for tests to corrupt, and a tracker that stands still, to test what is around it."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ import gsjax.cli.track
 from gsjax.cli import main
 from gsjax.data import write_panoptic
 from gsjax.data.simulated import tabletop
+from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
 
 
@@ -21,6 +24,26 @@ def pristine(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "table"
     folder.mkdir()
     write_panoptic(tabletop(frames=4, width=80, height=60), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory) -> Path:
+    """Nine photographs of the built-in table, 48x36, and one that is listed and not there."""
+    folder = tmp_path_factory.mktemp("photographs") / "table"
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for t in range(3):
+        sequence = tabletop(frames=4, width=48, height=36)
+        for c in range(3):
+            name = f"images/{t}{c}.png"
+            assert cv2.imwrite(str(folder / name), sequence.image(t, c)[..., ::-1])
+            pose = np.linalg.inv(sequence.viewmats[t, c]) @ OPENGL_TO_OPENCV
+            K = sequence.Ks[t, c]
+            own = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+            frames.append({"file_path": name, "transform_matrix": pose.tolist(), **own})
+    frames.append({"file_path": "images/lost.png", "transform_matrix": np.eye(4).tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     return folder
 
 

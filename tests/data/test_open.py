@@ -1,6 +1,12 @@
+import json
+
+import cv2
+import numpy as np
 import pytest
 
-from gsjax.data import DataError, open_sequence
+from gsjax.data import DataError, ReadOptions, open_photographs, open_sequence
+
+ONE_PIXEL = cv2.imencode(".png", np.array([[[30, 20, 10]]], np.uint8))[1].tobytes()
 
 
 def test_built_in_scenes_take_arguments():
@@ -45,3 +51,83 @@ def test_folders_that_fit_no_layout(tmp_path):
 @pytest.mark.parametrize(("name", "cameras"), [("tabletop_0", 3), ("push_t", 3), ("seven_scenes_kitchen", 1)])
 def test_recordings_are_recognised(shared_data, name, cameras):
     assert open_sequence(shared_data / name).num_cameras == cameras
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "options"),
+    [
+        ("icl_living_room", 71, ReadOptions(K=(525, 525, 320, 240))),
+        ("tissue_0", 60, ReadOptions(axes="endonerf")),
+        ("seven_scenes_kitchen", 100, None),
+    ],
+)
+def test_photographs_are_recognised(shared_data, name, count, options):
+    assert open_photographs(shared_data / name, options).num == count
+
+
+def test_photographs_of_built_in_scenes():
+    scene = open_photographs("simulated:tabletop?frames=2&width=32&height=24&cameras=2")
+    assert (scene.num, scene.image(3).shape) == (4, (24, 32, 3))
+
+
+def transforms(root):
+    (root / "a.png").write_bytes(ONE_PIXEL)
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    (root / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": [frame]}))
+
+
+def llff(root):
+    (root / "images").mkdir()
+    (root / "images/a.png").write_bytes(ONE_PIXEL)
+    matrix = np.concatenate([np.eye(3), [[0, 1], [0, 1], [0, 1]]], axis=1)
+    np.save(root / "poses_bounds.npy", [[*matrix.ravel(), 1, 2]])
+
+
+def colmap(root):
+    (root / "images").mkdir()
+    (root / "images/a.png").write_bytes(ONE_PIXEL)
+    (root / "cameras.txt").write_text("1 SIMPLE_PINHOLE 1 1 1 0.5 0.5\n")
+    (root / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+
+
+@pytest.mark.parametrize(
+    ("write", "layout"), [(transforms, "nerfstudio"), (llff, "LLFF"), (colmap, "COLMAP")]
+)
+def test_photographs_are_no_recording(tmp_path, write, layout):
+    write(tmp_path)
+    scene = open_photographs(tmp_path, ReadOptions(axes="endonerf"))
+    assert (scene.num, scene.image(0).tolist()) == (1, [[[10, 20, 30]]])
+    with pytest.raises(DataError, match=rf"expected a recording .*photographs \({layout} layout\)"):
+        open_sequence(tmp_path)
+
+
+def test_what_a_folder_leaves_open_is_asked_for(tmp_path):
+    llff(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"does not say how its columns are meant; give axes \(--read.axes\)"
+    ):
+        open_photographs(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "images_8")
+    assert open_photographs(tmp_path, ReadOptions(axes="endonerf", images="images_8")).num == 1
+
+
+def test_one_file_of_photographs(tmp_path):
+    transforms(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "mine.json")
+    assert open_photographs(tmp_path / "mine.json").num == 1
+
+
+def test_folders_without_photographs(tmp_path):
+    with pytest.raises(
+        DataError, match=r"expected one of transforms.json \(nerfstudio layout\), .*COLMAP.*LLFF"
+    ):
+        open_photographs(tmp_path)
+    for name in ("notes.txt", "nowhere"):
+        with pytest.raises(DataError, match="expected a folder with a recording, found nothing there"):
+            open_photographs(tmp_path / name)
+    (tmp_path / "cam00.mp4").write_bytes(b"")
+    with pytest.raises(DataError, match=r"found cam00.mp4"):
+        open_photographs(tmp_path)
+    (tmp_path / "transforms_train.json").write_text('{"frames": [{"file_path": "gone.png"}]}')
+    with pytest.raises(DataError, match=r"of 1 listed 1 that have no file \(gone.png\)"):
+        open_photographs(tmp_path)

@@ -1,0 +1,250 @@
+"""`gsjax fit`: a static scene from posed photographs."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
+
+from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
+from gsjax.cli.fit_resume import Saver, load
+from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.messages import Notes
+from gsjax.cli.messages import describe as describe_error
+from gsjax.cli.run_folder import RunFolder
+from gsjax.data.open import ReadOptions, open_photographs
+from gsjax.data.photographs import Photographs
+from gsjax.io.ply import write_ply
+from gsjax.methods.reconstruction import FitConfig, Problem, View, begin, fit
+
+_SHOWN_EVERY_S = 0.2
+_LOGGED_EVERY = 100  # steps
+_JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
+_MEASURED = 50  # steps whose time says how many are left in a budget
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax fit` is told."""
+
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+    """Folder of photographs or of a recording, all of whose frames are taken as photographs of one scene."""
+    out: Path
+    """Folder for the run."""
+    scale: float = 1.0
+    """Fit photographs this many times smaller, as in 0.25; time goes with the number of pixels."""
+    test_every: int = 8
+    """Hold out every so-manieth photograph, to judge by, where the data has no split; 0 holds out none."""
+    minutes: float | None = None
+    """Stop after so many minutes: the number of steps then follows from how fast they are."""
+    until_psnr: float | None = None
+    """Stop when held-out photographs are seen with so many dB."""
+    judge_every: int = 500
+    """Steps between looks at held-out photographs."""
+    resume: bool = False
+    """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
+    overwrite: bool = False
+    """Replace a finished run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """What the layout of the data leaves open."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """How the scene is fitted."""
+
+
+def run(options: Options) -> int:
+    """Fit a scene and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
+    """
+    _check(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        photographs = open_photographs(options.dataset, options.read).scaled(options.scale)
+        chosen, held_out = split(photographs, options.test_every)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        if options.resume:
+            folder.check_config(options, but=("resume", "overwrite", "debug", "out"))
+        folder.write_config(options)
+        views = read_views(photographs, console)
+        cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
+        fitted = [views[i] for i in chosen]
+        problem, state = begin(fitted, options.fit, cloud, photographs.background)
+        curve = Curve()
+        if options.resume:
+            state, curve = load(folder.resume, problem, state)
+            notes.add(f"Resumed after {state.step} steps of an earlier run.")
+        judged = [(photographs.names[i], views[i]) for i in held_out]
+        state, stopped = follow(options, problem, state, curve, judged, folder, console)
+        gaussians, removed = living(state.gaussians)
+        if removed:
+            notes.add(f"{removed} slots held no Gaussian at the end.")
+        write_ply(folder.scene, gaussians)
+        scores = judge(
+            problem, gaussians, judged or [(photographs.names[i], views[i]) for i in chosen[:1]], folder
+        )
+        finished = stopped is None
+        found = {
+            "kind": "fit",
+            "dataset": photographs.name,
+            "complete": finished,
+            "report": True,
+            "stopped": None if finished else describe_error(stopped) or "Ctrl-C",
+            "steps": state.step,
+            "num_gaussians": gaussians.num,
+            "sh_degree": gaussians.sh_degree,
+            "photographs": {"fitted": len(chosen), "held_out": len(held_out)},
+            "size": photographs.sizes.max(0),
+            "start": problem.start,
+            "seconds": {
+                "fit": curve.seconds,
+                "compile": curve.compile_seconds,
+                "total": perf_counter() - begun,
+            },
+            "machine": describe_machine(),
+            "test": scores.mean() if len(held_out) else None,
+            "views": scores.rows,
+            "curve": curve.rows,
+            "notes": notes.all,
+        }
+        folder.write_metrics(found)
+        write_results(folder, found, curve)
+        if finished:
+            folder.forget_resume()
+    print_results(folder, found)
+    if isinstance(stopped, KeyboardInterrupt):
+        return 130
+    if stopped is not None:
+        raise stopped
+    return 0
+
+
+def _check(options: Options) -> None:
+    for name in ("minutes", "until_psnr", "judge_every"):
+        value = getattr(options, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
+    if not 0 < options.scale <= 1:
+        raise ValueError(f"--scale: expected above 0 and at most 1, found {options.scale}")
+    if options.test_every < 0 or options.test_every == 1:
+        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
+    if options.until_psnr is not None and options.test_every == 0:
+        raise ValueError("--until-psnr: nothing is held out to judge by; leave out --test-every 0")
+
+
+def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
+    """Which photographs are fitted and which are held out: as the data says, else every so-manieth.
+
+    Raises:
+        ValueError: none is left to fit.
+    """
+    indices = np.arange(photographs.num)
+    splits = None if photographs.splits is None else np.array(photographs.splits)
+    if splits is not None and (splits != "train").any():
+        held_out = np.isin(splits, "test" if (splits == "test").any() else "val")
+        chosen = indices[splits == "train"]
+    else:
+        held_out = (indices % every == 0) & (photographs.num > 1) if every else np.zeros(len(indices), bool)
+        chosen = indices[~held_out]
+    if not len(chosen):
+        raise ValueError(f"{photographs.name}: of {photographs.num} photographs none is left to fit")
+    return chosen, indices[held_out]
+
+
+def read_views(photographs: Photographs, console: Console) -> list[View]:
+    """All photographs in memory.
+
+    Raises:
+        DataError: one is bad.
+    """
+
+    def read(i: int) -> View:
+        mask, depth = photographs.mask(i), photographs.depth(i)
+        return View(photographs.image(i), mask, depth, photographs.viewmats[i], photographs.Ks[i])
+
+    with ThreadPoolExecutor(2) as executor:
+        jobs = [executor.submit(read, i) for i in range(photographs.num)]
+        try:
+            shown = track(jobs, "reading photographs", console=console, transient=True)
+            return [job.result() for job in shown]
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
+
+
+class Budget:
+    """How many steps there will be: those of the config, or as many as fit into so many minutes."""
+
+    def __init__(self, steps: int, minutes: float | None, curve: Curve):
+        self._steps, self._minutes, self._curve, self._total = steps, minutes, curve, steps
+        self._recent: list[float] = []
+
+    def took(self, seconds: float) -> None:
+        """A step took so long."""
+        self._recent = [*self._recent[1 - _MEASURED :], seconds]
+
+    def __call__(self, step: int) -> int:
+        if self._minutes is not None and len(self._recent) == _MEASURED and step % _MEASURED == 0:
+            left = 60 * self._minutes - self._curve.seconds - self._curve.compile_seconds
+            self._total = min(self._steps, step + max(0, int(left / np.mean(self._recent))))
+        return self._total
+
+
+def follow(
+    options: Options,
+    problem: Problem,
+    state: Any,
+    curve: Curve,
+    judged: list[tuple[str, View]],
+    folder: RunFolder,
+    console: Console,
+) -> tuple[Any, BaseException | None]:
+    """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
+    state, and what stopped it early."""
+    budget, saver = Budget(options.fit.steps, options.minutes, curve), Saver(folder)
+    some = judged[:: max(1, len(judged) // _JUDGED_AT_MOST)][:_JUDGED_AT_MOST]
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[told]}"),
+        TimeRemainingColumn(),
+    )
+    drawn, fitted = 0.0, None
+    with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
+        task = progress.add_task("fitting", total=options.fit.steps, completed=state.step, told="compiling")
+        try:
+            for fitted in fit(problem, state, steps=budget):
+                state, step = fitted.state, fitted.state.step
+                budget.took(fitted.seconds)
+                curve.took(fitted.seconds, fitted.compile_seconds)
+                now = perf_counter()
+                if now - drawn > _SHOWN_EVERY_S or step == budget(step):
+                    told = curve.in_words(fitted, len(judged) > 0)
+                    progress.update(task, completed=step, total=budget(step), told=told)
+                    progress.refresh()
+                    drawn = now
+                last = step >= budget(step)
+                look = step % options.judge_every == 0 or last
+                if step % _LOGGED_EVERY == 0 or look:
+                    psnr = (
+                        judge(problem, fitted.state.gaussians, some).mean()["psnr"] if look and some else None
+                    )
+                    curve.add(fitted, psnr, folder)
+                    if options.until_psnr is not None and psnr is not None and psnr >= options.until_psnr:
+                        break
+                saver(state, curve, last=False)
+        except (KeyboardInterrupt, Exception) as stopped:
+            if fitted is not None:
+                saver(state, curve, last=True)
+            return jax.block_until_ready(state), stopped
+    return state, None

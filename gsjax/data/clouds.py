@@ -1,0 +1,36 @@
+"""Coloured points in PLY files."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.data.errors import DataError
+from gsjax.data.photographs import Cloud
+
+_GREY = 0.5  # points without a colour
+
+
+def read_cloud(path: Path) -> Cloud:
+    """The points of a PLY file; those that are not finite are left out, and those without colour are grey.
+
+    Raises:
+        DataError: the file is missing, cut off, or no PLY file with x, y and z.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        names = {prop.name for prop in vertices.properties}
+        colors = np.full(points.shape, _GREY)
+        if {"red", "green", "blue"} <= names:
+            colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)
+            colors = colors / (255 if np.issubdtype(colors.dtype, np.integer) else 1)
+    except (FileNotFoundError, IsADirectoryError):
+        raise DataError(path, "a point cloud", "no such file", "Restore it, or remove its mention.") from None
+    except (PlyParseError, KeyError, ValueError, TypeError, EOFError, OverflowError, MemoryError) as error:
+        raise DataError(
+            path, "a PLY file with x, y, z", f"something else ({error})", "Fetch it again."
+        ) from None
+    finite = np.isfinite(points).all(-1) & np.isfinite(colors).all(-1)
+    return Cloud(points[finite], np.clip(colors[finite], 0, 1))

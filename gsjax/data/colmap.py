@@ -1,0 +1,340 @@
+"""COLMAP's reconstructions (Schönberger, Frahm 2016), text and binary: world to camera, OpenCV axes.
+
+cameras    CAMERA_ID MODEL WIDTH HEIGHT PARAMS...          pixels, centres at +0.5
+images     IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME    and a line of (X Y POINT3D_ID)
+points3D   POINT3D_ID X Y Z R G B ERROR TRACK...
+
+each .txt or .bin (little endian; lengths as uint64), in sparse/0, sparse, or the folder itself; the
+photographs in images. The layouts are those that colmap.github.io/format.html describes.
+"""
+
+import os
+import struct
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import picture_size, read_image, read_mask
+from gsjax.data.lens import Lens, shrunk, straighten
+from gsjax.data.photographs import Cloud, Photographs
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+"""Where the three files may lie in a folder, those looked for first in front."""
+
+# Model number -> (name, how many parameters); the order of a binary file's model ids.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+}
+_COUNTS = dict(_MODELS.values())
+_UNDISTORT = "Run COLMAP's image_undistorter, and give its folder."
+_AGAIN = "It may be cut off: fetch or export it again."
+
+
+class _Camera(NamedTuple):
+    lens: Lens
+    width: int
+    height: int
+
+
+class _Image(NamedTuple):
+    name: str
+    camera: int
+    viewmat: Float[np.ndarray, "4 4"]
+
+
+def read_colmap(path: str | Path, images: str = "images") -> Photographs:
+    """The registered photographs of a reconstruction, in order of name, and its points.
+
+    Photographs that are not there, and those whose pose is not finite, are left out with a DataWarning that
+    counts them. Distorted ones are straightened (see `gsjax.data.lens`).
+
+    Args:
+        path: the folder that holds the photographs' folder and sparse/0, sparse or the files themselves.
+        images: the photographs' folder in it; masks/NAME.png beside it say which pixels count.
+
+    Raises:
+        DataError: a file is missing, cut off or of another form, no photograph is left, or a camera is of a
+            model that OpenCV does not have.
+    """
+    root = Path(path)
+    model = next((root / place for place in PLACES if find(root / place)), None)
+    if model is None:
+        raise DataError(
+            root, "cameras.bin or cameras.txt in sparse/0, sparse or here", "neither", "Give its folder."
+        )
+    suffix = find(model)
+    cameras = _READERS[suffix]["cameras"](model / f"cameras{suffix}")
+    registered = sorted(_READERS[suffix]["images"](model / f"images{suffix}"), key=lambda image: image.name)
+    cloud = (
+        _READERS[suffix]["points3D"](model / f"points3D{suffix}")
+        if (model / f"points3D{suffix}").exists()
+        else None
+    )
+    usable = [image for image in registered if np.isfinite(image.viewmat).all()]
+    kept = [image for image in usable if os.path.isfile(root / images / image.name)]
+    said = [f"{len(usable) - len(kept)} that are not in {root / images}"] * (len(kept) < len(usable))
+    said += [f"{len(registered) - len(usable)} without a finite pose"] * (len(usable) < len(registered))
+    if not kept:
+        found = f"{len(registered)} registered, " + (" and ".join(said) or "none")
+        raise DataError(model, "registered photographs", found, f"Name their folder, if it is not {images}.")
+    if said:
+        message = f"{root}: of {len(registered)} registered photographs {' and '.join(said)} are left out"
+        warnings.warn(message, DataWarning, stacklevel=2)
+    for image in kept:
+        if image.camera not in cameras:
+            known = sorted(cameras)[:8]
+            raise DataError(
+                model / f"images{suffix}",
+                f"one of the cameras {known}",
+                f"{image.camera} for {image.name}",
+                _AGAIN,
+            )
+    return _photographs(root, root / images, kept, cameras, cloud)
+
+
+def find(folder: Path) -> str | None:
+    """ ".bin" or ".txt" where a folder holds a reconstruction in that form, the newer form first; or None."""
+    there = (
+        suffix
+        for suffix in (".bin", ".txt")
+        if all((folder / f"{n}{suffix}").is_file() for n in ("cameras", "images"))
+    )
+    return next(there, None)
+
+
+def _photographs(root, folder, images, cameras, cloud) -> Photographs:
+    paths = [folder / image.name for image in images]
+    sizes = [picture_size(path) for path in paths]
+    taken_by = [cameras[image.camera] for image in images]
+    lenses = [
+        camera.lens._replace(K=shrunk(camera.lens.K, (camera.width, camera.height), size, path))
+        for camera, size, path in zip(taken_by, sizes, paths, strict=True)
+    ]
+    ideal = [straighten(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+    masks = [
+        next((m for m in _mask_names(root / "masks", image.name) if m.is_file()), None) for image in images
+    ]
+
+    def load_mask(i: int) -> np.ndarray | None:
+        if masks[i] is None:
+            return None
+        counts = (read_mask(masks[i], *sizes[i]) != 0).astype(np.uint8)
+        return ideal[i][1](counts, cv2.INTER_NEAREST) > 0
+
+    return Photographs(
+        name=root.resolve().name,
+        names=tuple(image.name for image in images),
+        sizes=np.array(sizes),
+        Ks=np.stack([K for K, _ in ideal]),
+        viewmats=np.stack([image.viewmat for image in images]),
+        load_image=lambda i: ideal[i][1](read_image(paths[i], *sizes[i]), cv2.INTER_LINEAR),
+        load_mask=load_mask if any(masks) else None,
+        cloud=cloud,
+        locate=lambda kind, i: str(masks[i] if kind == "mask" else paths[i]),
+    )
+
+
+def _mask_names(folder: Path, name: str) -> tuple[Path, Path]:
+    """COLMAP calls the mask of a.jpg a.jpg.png; others call it a.png."""
+    return folder / f"{name}.png", (folder / name).with_suffix(".png")
+
+
+def _lens(path: Path, name: str, p: tuple[float, ...]) -> Lens:
+    """Parameters of a COLMAP model as OpenCV has them."""
+    if name not in _COUNTS or name in ("FOV", "THIN_PRISM_FISHEYE"):
+        known = ", ".join(n for n in _COUNTS if n not in ("FOV", "THIN_PRISM_FISHEYE"))
+        raise DataError(path, f"a camera of a model that OpenCV has: {known}", name, _UNDISTORT)
+    one = name.startswith(("SIMPLE", "RADIAL"))  # focal length
+    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if one else p[:4]
+    rest = p[3:] if one else p[4:]
+    fisheye = name.endswith("FISHEYE")
+    wanted = 4 if fisheye else max(4, len(rest))
+    coeffs = (*rest, *[0.0] * (wanted - len(rest)))
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if not np.isfinite(p).all() or fx <= 0 or fy <= 0:
+        raise DataError(
+            path, "finite parameters with a positive focal length", f"{name} {list(p)}", "Reconstruct again."
+        )
+    return Lens(K, coeffs, fisheye)
+
+
+def _viewmat(quat: tuple[float, ...], translation: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
+    """From w x y z; NaN throughout where the numbers name no pose."""
+    if not np.isfinite([*quat, *translation]).all() or np.linalg.norm(quat) < 1e-9:
+        return np.full((4, 4), np.nan)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+class _Bytes:
+    """A binary file, read from front to back."""
+
+    def __init__(self, path: Path):
+        self.path, self.at = path, 0
+        try:
+            self.content = path.read_bytes()
+        except FileNotFoundError:
+            raise DataError(
+                path, "a part of the reconstruction", "no such file", "Was it copied whole?"
+            ) from None
+
+    def take(self, layout: str) -> tuple:
+        layout = f"<{layout}"
+        end = self.at + struct.calcsize(layout)
+        if end > len(self.content):
+            raise self.cut_off()
+        values = struct.unpack_from(layout, self.content, self.at)
+        self.at = end
+        return values
+
+    def skip(self, count: int) -> None:
+        self.at += count
+        if self.at > len(self.content):
+            raise self.cut_off()
+
+    def text(self) -> str:
+        end = self.content.find(b"\0", self.at)
+        if end < 0:
+            raise self.cut_off()
+        name = self.content[self.at : end].decode("utf-8", "replace")
+        self.at = end + 1
+        return name
+
+    def count(self, least: int) -> int:
+        """How many items follow, of at least so many bytes each."""
+        (count,) = self.take("Q")
+        if count * least > len(self.content) - self.at:
+            found = f"{count} items announced in {len(self.content)} bytes"
+            raise DataError(self.path, "a file of COLMAP", found, _AGAIN)
+        return count
+
+    def cut_off(self) -> DataError:
+        return DataError(
+            self.path, "a whole file of COLMAP", f"its end after {len(self.content)} bytes", _AGAIN
+        )
+
+
+def _cameras_bin(path: Path) -> dict[int, _Camera]:
+    file, cameras = _Bytes(path), {}
+    for _ in range(file.count(24)):
+        number, model, width, height = file.take("iiQQ")
+        if model not in _MODELS:
+            known = f"one of the camera models {sorted(_MODELS)}"
+            raise DataError(path, known, f"number {model}", f"{_AGAIN} Or: {_UNDISTORT}")
+        name, count = _MODELS[model]
+        cameras[number] = _Camera(_lens(path, name, file.take(f"{count}d")), width, height)
+    return cameras
+
+
+def _images_bin(path: Path) -> list[_Image]:
+    file, images = _Bytes(path), []
+    for _ in range(file.count(73)):
+        _, *pose, camera = file.take("i7di")
+        name = file.text()
+        file.skip(24 * file.count(24))
+        images.append(_Image(name, camera, _viewmat(tuple(pose[:4]), tuple(pose[4:]))))
+    return images
+
+
+def _points_bin(path: Path) -> Cloud:
+    file, points, colors = _Bytes(path), [], []
+    for _ in range(file.count(51)):
+        _, *values = file.take("Q3d3Bd")
+        points.append(values[:3])
+        colors.append(values[3:6])
+        file.skip(8 * file.count(8))
+    return _cloud(points, colors)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """The lines with their numbers, comments left out."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        raise DataError(
+            path, "a part of the reconstruction", "no such file", "Was it copied whole?"
+        ) from None
+    return [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+
+
+def _parsed(path: Path, number: int, line: str, expected: str, parse):
+    try:
+        return parse(line.split())
+    except (ValueError, IndexError):
+        raise DataError(f"{path}, line {number}", expected, repr(line[:60]), _AGAIN) from None
+
+
+def _cameras_txt(path: Path) -> dict[int, _Camera]:
+    cameras = {}
+    for number, line in _lines(path):
+        if not line.strip():
+            continue
+
+        def parse(words: list[str]) -> tuple[int, str, int, int, tuple[float, ...]]:
+            return int(words[0]), words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:]))
+
+        which, model, width, height, p = _parsed(
+            path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse
+        )
+        if len(p) != _COUNTS.get(model, len(p)):
+            raise DataError(
+                f"{path}, line {number}", f"{_COUNTS[model]} parameters of {model}", f"{len(p)}", _AGAIN
+            )
+        cameras[which] = _Camera(_lens(path, model, p), width, height)
+    return cameras
+
+
+def _images_txt(path: Path) -> list[_Image]:
+    """Two lines an image, of which the second, its points, may be empty."""
+    lines = _lines(path)
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+
+    def parse(words: list[str]) -> _Image:
+        quat, translation = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
+        return _Image(" ".join(words[9:]) or words[9], int(words[8]), _viewmat(quat, translation))
+
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    return [_parsed(path, number, line, expected, parse) for number, line in lines[::2] if line.strip()]
+
+
+def _points_txt(path: Path) -> Cloud:
+    def parse(words: list[str]) -> list[float]:
+        return [float(word) for word in words[1:7]] if len(words) >= 8 else [float("")]
+
+    expected = "POINT3D_ID X Y Z R G B ERROR TRACK"
+    rows = [_parsed(path, number, line, expected, parse) for number, line in _lines(path) if line.strip()]
+    values = np.array(rows).reshape(-1, 6)
+    return _cloud(values[:, :3], values[:, 3:])
+
+
+def _cloud(points, colors) -> Cloud:
+    points, colors = np.reshape(points, (-1, 3)), np.reshape(colors, (-1, 3)) / 255
+    finite = np.isfinite(points).all(-1) & np.isfinite(colors).all(-1)
+    return Cloud(points[finite], np.clip(colors[finite], 0, 1))
+
+
+_READERS = {
+    ".bin": {"cameras": _cameras_bin, "images": _images_bin, "points3D": _points_bin},
+    ".txt": {"cameras": _cameras_txt, "images": _images_txt, "points3D": _points_txt},
+}

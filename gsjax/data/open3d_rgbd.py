@@ -1,0 +1,137 @@
+"""RGB-D folders as Open3D's reconstruction system has them (Choi et al. 2015): one moving camera.
+
+image/NUMBER.jpg          or color/, rgb/; .png
+depth/NUMBER.png          uint16 millimetres, registered to colour
+trajectory.log            (test_)scene/trajectory.log or beside the images: for each frame three integers, the
+                          first its number, and 4 lines of a matrix, camera to world, OpenCV axes
+
+The folder has no intrinsics (Open3D takes them from a file of the user's), so the caller gives them. A pose
+is of the frame whose file name has its number: folders often hold every third frame only.
+"""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_poses
+from gsjax.geometry.cameras import intrinsics
+
+DEPTH_UNIT_M = 0.001
+_RATE_HZ = 30.0
+_IMAGES = ("image", "color", "rgb")
+_TRAJECTORIES = (
+    "trajectory.log",
+    "scene/trajectory.log",
+    "test_scene/trajectory.log",
+    "fragments/trajectory.log",
+)
+_NUMBER = re.compile(r"(\d+)\.(?:png|jpe?g)", re.IGNORECASE)
+
+
+def is_open3d(root: Path) -> bool:
+    """Whether a folder has this layout."""
+    return (
+        (root / "depth").is_dir()
+        and _first(root, _IMAGES) is not None
+        and _first(root, _TRAJECTORIES) is not None
+    )
+
+
+def read_open3d(
+    path: str | Path,
+    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float],
+    *,
+    depth_unit_m: float = DEPTH_UNIT_M,
+    trajectory: str | None = None,
+) -> Sequence:
+    """The frames that have colour, depth and a pose, at 30 Hz by their numbers.
+
+    Args:
+        path: the folder.
+        K: of the colour camera, or (fx, fy, cx, cy); pixel centres at +0.5 (Open3D and most sensors count
+            them at integers: add 0.5 to cx and cy).
+        depth_unit_m: metres of one step of depth.
+        trajectory: the file of poses, relative to the folder; the first of those above that is there.
+
+    Raises:
+        DataError: the folder has no images or poses, a file is of another form, or no frame has all three.
+        ValueError: `K` is none, or a pose no rigid motion.
+    """
+    root = Path(path)
+    matrix = np.asarray(K, np.float64)
+    if matrix.shape == (4,):
+        matrix = intrinsics(matrix[0], 0, 0, (matrix[2], matrix[3]))
+        matrix[1, 1] = K[1]
+    if matrix.shape != (3, 3):
+        raise ValueError(f"K must be 3x3 or fx, fy, cx, cy; got shape {matrix.shape}")
+    folder, log = _first(root, _IMAGES), root / trajectory if trajectory else _first(root, _TRAJECTORIES)
+    if folder is None or log is None:
+        missing = (
+            f"one of the folders {', '.join(_IMAGES)}"
+            if folder is None
+            else f"one of {', '.join(_TRAJECTORIES)}"
+        )
+        raise DataError(root, missing, "none of them", "Give the folder of an Open3D recording.")
+    poses, images, depths = _read_log(log), _numbered(folder), _numbered(root / "depth")
+    numbers = sorted(images.keys() & depths.keys() & poses.keys())
+    if not numbers:
+        found = (
+            f"{len(images)} images, {len(depths)} depths and {len(poses)} poses without one number in common"
+        )
+        raise DataError(root, "frames with image, depth and pose", found, "Name files by the frame's number.")
+    left_out = len(images) - len(numbers)
+    if left_out:
+        message = f"{root}: {left_out} of {len(images)} frames are left out, without depth or a pose"
+        warnings.warn(message, DataWarning, stacklevel=2)
+    to_world = np.stack([poses[n] for n in numbers])[:, None]
+    advice = "Poses are camera to world in OpenCV axes."
+    check_poses("pose", to_world, lambda i, _: f"frame {numbers[i]} in {log}", advice)
+    width, height = image_size(images[numbers[0]])
+    files = {"image": images, "depth": depths}
+    return Sequence(
+        name=root.resolve().name,
+        camera_ids=(0,),
+        width=width,
+        height=height,
+        times=np.array(numbers) / _RATE_HZ,
+        frame_ids=tuple(numbers),
+        Ks=np.broadcast_to(matrix, (len(numbers), 1, 3, 3)),
+        viewmats=np.linalg.inv(to_world),
+        load_image=lambda t, c: read_image(images[numbers[t]], width, height),
+        load_depth=lambda t, c: read_depth(depths[numbers[t]], depth_unit_m, width, height),
+        locate=lambda kind, t, c: str(files[kind][numbers[t]]),
+    )
+
+
+def _first(root: Path, names: tuple[str, ...]) -> Path | None:
+    return next((root / name for name in names if (root / name).exists()), None)
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """The pictures of a folder by the number in their name."""
+    if not folder.is_dir():
+        return {}
+    return {int(match[1]): file for file in folder.iterdir() if (match := _NUMBER.fullmatch(file.name))}
+
+
+def _read_log(path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Poses by frame number; those that are not finite are left out."""
+    expected = "blocks of a line of three integers and four of four numbers"
+    try:
+        values = np.array(path.read_text().split(), np.float64)
+    except (FileNotFoundError, IsADirectoryError):
+        raise DataError(path, "a trajectory", "no such file", "Name another.") from None
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(path, expected, f"something else ({error})", "Fetch the file again.") from None
+    if values.size % 19 or not values.size:
+        raise DataError(
+            path, expected, f"{values.size} numbers, which are not so many blocks of 19", "Is it cut off?"
+        )
+    blocks = values.reshape(-1, 19)
+    return {int(block[0]): block[3:].reshape(4, 4) for block in blocks if np.isfinite(block).all()}

@@ -1,0 +1,222 @@
+"""Posed photographs of one scene: what static readers give, and what a reconstruction is fitted to."""
+
+from collections.abc import Callable
+from collections.abc import Sequence as Indices
+from dataclasses import dataclass, field, replace
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from gsjax.data.errors import DataError
+from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_intrinsics, check_poses, check_shape
+from gsjax.geometry.cameras import Camera
+
+# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+
+_POSE_ADVICE = "viewmats are world-to-camera in OpenCV axes; correct or leave out that photograph."
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Coloured points of a scene, as structure from motion leaves them.
+
+    Attributes:
+        points: [M,3], in the photographs' world.
+        colors: RGB, 0 to 1, [M,3].
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+
+    points: Float[np.ndarray, "..."]
+    colors: Float[np.ndarray, "..."]
+
+    def __post_init__(self):
+        check_shape("points", self.points, (len(self.points), 3))
+        check_shape("colors", self.colors, (len(self.points), 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """N photographs by calibrated pinhole cameras, each of its own size. They are loaded when asked for and
+    never kept. Lengths are in the data's own unit, which only a sensor of depth makes metres.
+
+    Attributes:
+        name: what to call them.
+        names: of each photograph, as in the data.
+        sizes: width and height in pixels, [N,2].
+        Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3] float64.
+        viewmats: world to camera, OpenCV axes, [N,4,4] float64.
+        load_image: i -> RGB, [H,W,3] uint8, as a pinhole camera sees it.
+        load_mask: i -> which pixels count, [H,W] bool; or None where all do.
+        load_depth: i -> depth along the optical axis, [H,W], 0 = invalid; or None where it has none.
+        times: seconds, [N], where the data has them, or None.
+        splits: "train", "val" or "test" for each, as the data has it; None where it does not say.
+        cloud: points of the scene.
+        background: RGB, 0 to 1, of what was behind transparent photographs; None where none was transparent.
+        locate: (kind, i) -> path of a file, for messages; kind is "image", "mask" or "depth".
+
+    Raises:
+        ValueError: shapes disagree, a pose is no rigid motion, or there is no photograph.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    sizes: Int[np.ndarray, "..."]
+    Ks: Float[np.ndarray, "..."]
+    viewmats: Float[np.ndarray, "..."]
+    load_image: Callable[[int], np.ndarray] = field(repr=False)
+    load_mask: Callable[[int], np.ndarray | None] | None = field(default=None, repr=False)
+    load_depth: Callable[[int], np.ndarray | None] | None = field(default=None, repr=False)
+    times: Float[np.ndarray, "..."] | None = None
+    splits: tuple[str, ...] | None = None
+    cloud: Cloud | None = field(default=None, repr=False)
+    background: tuple[float, float, float] | None = None
+    locate: Callable[[str, int], str] | None = field(default=None, repr=False)
+
+    def __post_init__(self):
+        count = len(self.names)
+        if count == 0:
+            raise ValueError(f"{self.name}: expected at least one photograph, found none.")
+        check_shape("sizes", self.sizes, (count, 2))
+        check_shape("Ks", self.Ks, (count, 3, 3))
+        check_shape("viewmats", self.viewmats, (count, 4, 4))
+        for name in ("times", "splits"):
+            if getattr(self, name) is not None:
+                check_shape(name, np.asarray(getattr(self, name)), (count,))
+        check_intrinsics(self.Ks[:, None], lambda i, _: self.names[i])
+        check_poses("viewmat", self.viewmats[:, None], lambda i, _: self.names[i], _POSE_ADVICE)
+
+    @property
+    def num(self) -> int:
+        """N."""
+        return len(self.names)
+
+    def camera(self, i: int) -> Camera:
+        """The camera of photograph `i`, in JAX's default float type."""
+        dtype = jnp.result_type(float)
+        width, height = (int(size) for size in self.sizes[i])
+        return Camera(jnp.asarray(self.viewmats[i], dtype), jnp.asarray(self.Ks[i], dtype), width, height)
+
+    def image(self, i: int) -> UInt8[np.ndarray, "height width 3"]:
+        """RGB.
+
+        Raises:
+            DataError: the file is bad, or the loader gave another shape or type.
+        """
+        image = np.asarray(self.load_image(i))
+        self._check("image", i, image, (3,), np.uint8)
+        return image
+
+    def mask(self, i: int) -> Bool[np.ndarray, "height width"] | None:
+        """Which pixels count; None where all do.
+
+        Raises:
+            DataError: as `image`.
+        """
+        return self._optional(self.load_mask, "mask", i, np.bool_)
+
+    def depth(self, i: int) -> Float[np.ndarray, "height width"] | None:
+        """Depth along the optical axis, float32, 0 = invalid; None where it has none.
+
+        Raises:
+            DataError: as `image`.
+        """
+        depth = self._optional(self.load_depth, "depth", i, np.floating)
+        if depth is None:
+            return None
+        return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+    def select(self, indices: Indices[int]) -> "Photographs":
+        """Some of them, in this order."""
+        chosen = [int(i) for i in indices]
+        locate = self.locate
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in chosen),
+            sizes=self.sizes[chosen],
+            Ks=self.Ks[chosen],
+            viewmats=self.viewmats[chosen],
+            load_image=lambda i: self.load_image(chosen[i]),
+            load_mask=self.load_mask and (lambda i: self.mask(chosen[i])),
+            load_depth=self.load_depth and (lambda i: self.depth(chosen[i])),
+            times=None if self.times is None else self.times[chosen],
+            splits=None if self.splits is None else tuple(self.splits[i] for i in chosen),
+            locate=locate and (lambda kind, i: locate(kind, chosen[i])),
+        )
+
+    def scaled(self, scale: float) -> "Photographs":
+        """The same views in smaller photographs: colours are means over what a pixel covers, depths and masks
+        those in its middle.
+
+        Raises:
+            ValueError: `scale` is not above 0 and at most 1.
+        """
+        if not 0 < scale <= 1:
+            raise ValueError(f"scale must be above 0 and at most 1, got {scale}")
+        if scale == 1:
+            return self
+        sizes = np.maximum(1, np.round(self.sizes * scale).astype(int))
+        factors = np.concatenate([sizes / self.sizes, np.ones((self.num, 1))], axis=1)
+
+        def resized(load: Callable | None, how: int) -> Callable | None:
+            def smaller(i: int) -> np.ndarray | None:
+                full = load(i)
+                if full is None:
+                    return None
+                small = cv2.resize(
+                    np.asarray(full, full.dtype if full.dtype != bool else np.uint8),
+                    sizes[i],
+                    interpolation=how,
+                )
+                return small.astype(full.dtype)
+
+            return load and smaller
+
+        return replace(
+            self,
+            sizes=sizes,
+            Ks=self.Ks * factors[:, :, None],
+            load_image=resized(self.image, cv2.INTER_AREA),
+            load_mask=resized(self.load_mask and self.mask, cv2.INTER_NEAREST_EXACT),
+            load_depth=resized(self.load_depth and self.depth, cv2.INTER_NEAREST_EXACT),
+        )
+
+    def where(self, kind: str, i: int) -> str:
+        """What errors call the image, mask or depth of a photograph: its path, if it has one."""
+        return f"{self.name}, {kind} {self.names[i]}" if self.locate is None else self.locate(kind, i)
+
+    def _optional(self, loader: Callable | None, kind: str, i: int, dtype: type) -> np.ndarray | None:
+        loaded = None if loader is None else loader(i)
+        if loaded is not None:
+            self._check(kind, i, loaded, (), dtype)
+        return loaded
+
+    def _check(self, kind: str, i: int, array: np.ndarray, channels: tuple[int, ...], dtype: type) -> None:
+        width, height = (int(size) for size in self.sizes[i])
+        if array.shape != (height, width, *channels) or not np.issubdtype(array.dtype, dtype):
+            words = "floats" if dtype == np.floating else np.dtype(dtype).name
+            expected = f"shape {(height, width, *channels)} of {words}"
+            found = f"shape {array.shape} of {array.dtype}"
+            raise DataError(self.where(kind, i), expected, found, "Correct the file or its loader.")
+
+
+def photographs_of(sequence: Sequence) -> Photographs:
+    """All frames of all cameras of a recording as photographs, frame by frame."""
+    frames, cameras = sequence.num_frames, sequence.num_cameras
+    places = [(t, c) for t in range(frames) for c in range(cameras)]
+    names = (f"{sequence.camera_ids[c]}/{sequence.frame_ids[t]}" for t, c in places)
+    return Photographs(
+        name=sequence.name,
+        names=tuple(names),
+        sizes=np.tile([sequence.width, sequence.height], (len(places), 1)),
+        Ks=sequence.Ks.reshape(-1, 3, 3),
+        viewmats=sequence.viewmats.reshape(-1, 4, 4),
+        load_image=lambda i: sequence.image(*places[i]),
+        load_depth=(lambda i: sequence.depth(*places[i])) if sequence.has_depth else None,
+        times=np.repeat(sequence.times, cameras) if frames > 1 else None,
+        locate=lambda kind, i: sequence.where(kind, *places[i]),
+    )

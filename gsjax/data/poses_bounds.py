@@ -1,0 +1,160 @@
+"""poses_bounds.npy (LLFF, Mildenhall et al. 2019), as DyNeRF's and EndoNeRF's recordings have it too.
+
+[N,17], a row a camera: 3x5 [R | t | (height, width, focal length)] by rows, and the nearest and farthest
+depth. R and t are camera to world. The name does not tell how R's columns are meant: LLFF and DyNeRF write
+[down, right, back], EndoNeRF [right, up, back]. So the caller says which.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.data.errors import DataError
+from gsjax.data.files import picture_size, read_arrays, read_image
+from gsjax.data.lens import shrunk
+from gsjax.data.photographs import Photographs
+from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_poses
+from gsjax.data.video import Video, describe_video
+from gsjax.geometry.cameras import intrinsics
+
+Axes = Literal["llff", "endonerf"]
+NAMES = ("poses_bounds.npy", "pose_bounds.npy")
+"""What the file is called; some releases leave out an s."""
+
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+# Columns of R that are right, down and forward, up to sign.
+_TO_OPENCV = {
+    "llff": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+    "endonerf": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]),
+}
+
+
+def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photographs:
+    """Photographs, a row of poses_bounds.npy each, in order of their names.
+
+    Args:
+        path: the folder.
+        axes: what the columns of R are: "llff" down, right, back; "endonerf" right, up, back.
+        images: the photographs' folder in it; smaller ones than the file says are taken as they are.
+
+    Raises:
+        DataError: a file is missing or has another form, or there are more or fewer photographs than rows.
+        ValueError: `axes` is neither, or a pose is no rigid motion.
+    """
+    root = Path(path)
+    file, viewmats, sizes, focals = _read_rows(root, axes)
+    folder = root / images
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    if len(paths) != len(viewmats):
+        expected, found = f"{len(viewmats)} photographs in {folder}, one a row", f"{len(paths)}"
+        raise DataError(file, expected, found, "Name their folder, or fetch them again.")
+    actual = np.array([picture_size(photograph) for photograph in paths])
+    return Photographs(
+        name=root.resolve().name,
+        names=tuple(photograph.name for photograph in paths),
+        sizes=actual,
+        Ks=_intrinsics(paths, focals, sizes, actual),
+        viewmats=viewmats,
+        load_image=lambda i: read_image(paths[i], *actual[i].tolist()),
+        locate=lambda kind, i: str(paths[i]),
+    )
+
+
+def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
+    """The cameras of a DyNeRF scene (Li et al. 2022): cam00.mp4, cam01.mp4, ..., each a row of poses.
+
+    The shortest video says how many frames there are.
+
+    Raises:
+        DataError: as `read_llff`, or videos differ in size.
+    """
+    root = Path(path)
+    file, viewmats, sizes, focals = _read_rows(root, axes)
+    paths = sorted(root.glob("cam*.mp4"))
+    if len(paths) != len(viewmats):
+        expected, found = f"{len(viewmats)} videos cam*.mp4, one a row", f"{len(paths)}"
+        raise DataError(
+            file, expected, found, "Was the folder copied whole? Remove the rows of what is not there."
+        )
+    described = [describe_video(video) for video in paths]
+    shapes = [(video.width, video.height) for video in described]
+    if len(set(shapes)) > 1:
+        odd = next(i for i, shape in enumerate(shapes) if shape != shapes[0])
+        expected, found = (
+            f"{shapes[0][0]}x{shapes[0][1]} as in {paths[0].name}",
+            f"{shapes[odd][0]}x{shapes[odd][1]}",
+        )
+        raise DataError(paths[odd], expected, found, "Bring all videos to one size.")
+    frames = min(video.frames for video in described)
+    videos = [Video(p, *shapes[0], video.frames) for p, video in zip(paths, described, strict=True)]
+    Ks = _intrinsics(paths, focals, sizes, np.array(shapes))
+    return Sequence(
+        name=root.resolve().name,
+        camera_ids=tuple(
+            int(digits) if (digits := p.stem[3:]).isdecimal() else i for i, p in enumerate(paths)
+        ),
+        width=shapes[0][0],
+        height=shapes[0][1],
+        times=np.arange(frames) / described[0].rate_hz,
+        frame_ids=tuple(range(frames)),
+        Ks=np.broadcast_to(Ks, (frames, *Ks.shape)),
+        viewmats=np.broadcast_to(viewmats, (frames, *viewmats.shape)),
+        load_image=lambda t, c: videos[c].frame(t),
+        locate=lambda kind, t, c: f"{paths[c]}, {kind} {t}",
+    )
+
+
+def find(root: Path) -> Path | None:
+    """The file of poses in a folder, or None."""
+    return next((root / name for name in NAMES if (root / name).is_file()), None)
+
+
+def _read_rows(root: Path, axes: str) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray]:
+    """The file, and of each row the view matrix, (width, height) and the focal length."""
+    if axes not in _TO_OPENCV:
+        raise ValueError(
+            "axes must say how the columns of poses_bounds.npy are meant: 'llff' (down, right, back; "
+            f"DyNeRF too) or 'endonerf' (right, up, back); got {axes!r}"
+        )
+    file = find(root)
+    if file is None:
+        raise DataError(root, NAMES[0], "no such file", "Give the folder that holds it.")
+    rows = read_arrays(file).get("")
+    if rows is None or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
+        found = "several arrays" if rows is None else f"shape {rows.shape} of {rows.dtype}"
+        raise DataError(file, "one array [N,17] of numbers", found, "Is it of LLFF's form?")
+    if not np.isfinite(rows).all():
+        row = int(np.argmax(~np.isfinite(rows).all(-1)))
+        raise DataError(
+            file, "finite numbers", f"NaN or infinity in row {row}", "Remove that row and its photograph."
+        )
+    matrices = rows[:, :15].reshape(-1, 3, 5).astype(np.float64)
+    if (matrices[:, :, 4] <= 0).any():
+        row = int(np.argmax((matrices[:, :, 4] <= 0).any(-1)))
+        found = f"{matrices[row, :, 4].tolist()} in row {row}"
+        raise DataError(file, "height, width and focal length above 0", found, "Correct that row.")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = matrices[:, :, :3] @ _TO_OPENCV[axes]
+    poses[:, :3, 3] = matrices[:, :, 3]
+    check_poses("pose", poses[:, None], lambda row, _: f"row {row} of {file}", "Is axes the right one?")
+    return file, np.linalg.inv(poses), matrices[:, 1::-1, 4], matrices[:, 2, 4]
+
+
+def _intrinsics(
+    paths: list[Path],
+    focals: Float[np.ndarray, "n"],
+    said: Float[np.ndarray, "n 2"],
+    actual: Int[np.ndarray, "n 2"],
+) -> Float[np.ndarray, "n 3 3"]:
+    """K of pictures that may be smaller than the file says, the principal point in the middle."""
+    centers = (said / 2).tolist()
+    columns = (focals.tolist(), centers, said.tolist(), actual.tolist())
+    return np.stack(
+        [
+            shrunk(intrinsics(focal, 0, 0, tuple(center)), tuple(size), tuple(now), path)
+            for path, focal, center, size, now in zip(paths, *columns, strict=True)
+        ]
+    )

@@ -1,0 +1,295 @@
+"""transforms.json of nerfstudio, instant-ngp and Blender (NeRF, D-NeRF): camera to world, OpenGL axes.
+
+fl_x, fl_y, cx, cy, w, h       pixels, centres at +0.5; of all frames, or in each frame
+camera_angle_x, camera_angle_y radians, where there are no focal lengths
+k1 .. k4, p1, p2               OpenCV's lens distortion; camera_model (or is_fisheye) says of which model
+frames[]                       file_path (Blender leaves out the extension), transform_matrix [4,4], perhaps
+                               mask_path (0 = does not count), depth_file_path (16 bit), time
+train_filenames, ...           nerfstudio's splits; Blender has a file for each: transforms_train.json, ...
+ply_file_path                  nerfstudio's sparse points
+"""
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.clouds import read_cloud
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import picture_size, read_depth, read_json, read_mask, read_rgba
+from gsjax.data.lens import Lens, shrunk, straighten
+from gsjax.data.photographs import Photographs
+from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
+
+SPLITS = ("train", "val", "test")
+WHITE = (1.0, 1.0, 1.0)
+_DEPTH_UNIT_M = 0.001  # nerfstudio's default
+_MODELS = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), False)
+_MODELS["OPENCV_FISHEYE"] = True
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+class _Frame(NamedTuple):
+    name: str
+    split: str | None
+    viewmat: Float[np.ndarray, "4 4"]
+    lens: Lens
+    size: tuple[int, int]
+    image: Path
+    mask: Path | None
+    depth: Path | None
+    time: float | None
+
+
+def read_transforms(
+    path: str | Path,
+    *,
+    background: tuple[float, float, float] = WHITE,
+    depth_unit_m: float = _DEPTH_UNIT_M,
+) -> Photographs:
+    """The photographs that a transforms.json lists, or a transforms_train.json and its siblings.
+
+    Listed files that do not exist are left out with a DataWarning that counts them, as are frames without a
+    finite pose. Distorted photographs are straightened (see `gsjax.data.lens`). A photograph of another size
+    than is said is taken for one that was made smaller.
+
+    Args:
+        path: the folder, or one such file.
+        background: RGB, 0 to 1, behind transparent photographs; white unless given, as is usual.
+        depth_unit_m: lengths of one step of depth.
+
+    Raises:
+        DataError: a file is missing or has another form, no frame is left, or a camera is of no known model.
+        ValueError: a pose is no rigid motion.
+    """
+    root, files = _files(Path(path))
+    frames: list[_Frame] = []
+    missing: list[str] = []
+    listed, lost, cloud = 0, 0, None
+    for file, split in files.items():
+        meta = read_json(file)
+        if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+            raise DataError(file, "frames, a list of one or more", "none", "Is it a transforms.json?")
+        named = _named_splits(file, meta)
+        listed += len(meta["frames"])
+        for number, entry in enumerate(meta["frames"]):
+            what = _Entry(file, number, meta, entry)
+            image = what.image(root)
+            if image is None:
+                missing.append(str(entry["file_path"]))
+                continue
+            pose = what.pose()
+            if pose is None:
+                lost += 1
+                continue
+            frames.append(what.read(root, image, pose, split or named.get(Path(entry["file_path"]))))
+        if cloud is None and meta.get("ply_file_path") is not None:
+            cloud = read_cloud(root / str(meta["ply_file_path"]))
+    _say_left_out(root, listed, missing, lost, len(frames))
+    return _photographs(root, frames, cloud, background, depth_unit_m)
+
+
+def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
+    """The folder, and the files to read with the split that each is."""
+    if path.suffix == ".json":
+        return path.parent, {path: None}
+    if (path / "transforms.json").is_file():
+        return path, {path / "transforms.json": None}
+    files = {path / f"transforms_{split}.json": split for split in SPLITS}
+    files = {file: split for file, split in files.items() if file.is_file()}
+    if not files:
+        found = (
+            ", ".join(sorted(entry.name for entry in path.iterdir())[:8])
+            if path.is_dir()
+            else "nothing there"
+        )
+        raise DataError(
+            path, "transforms.json or transforms_train.json", found or "an empty folder", "Give its folder."
+        )
+    return path, files
+
+
+def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
+    """Which split each photograph is of, where the file says so."""
+    named = {}
+    for split in SPLITS:
+        names = meta.get(f"{split}_filenames", [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            expected = f"{split}_filenames, a list of names"
+            raise DataError(file, expected, repr(names)[:80], "Correct or remove it.")
+        named |= {Path(name): split for name in names}
+    return named
+
+
+class _Entry(NamedTuple):
+    """One of the frames of a file, with what the file says of all."""
+
+    file: Path
+    number: int
+    meta: dict[str, Any]
+    entry: dict[str, Any]
+
+    def wrong(self, expected: str, found: Any, advice: str) -> DataError:
+        return DataError(f"{self.file}, frame {self.number}", expected, str(found), advice)
+
+    def value(self, *names: str) -> Any:
+        """The first of these that the frame or, after it, the file has; or None."""
+        for name in names:
+            for place in (self.entry, self.meta):
+                if place.get(name) is not None:
+                    return place[name]
+        return None
+
+    def numeral(self, name: str) -> float | None:
+        value = self.value(name)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise self.wrong(f"{name}, a number", repr(value), "Correct the file.")
+        return float(value)
+
+    def image(self, root: Path) -> Path | None:
+        """The file of its photograph, whose name may lack the extension; None where there is none."""
+        if not isinstance(self.entry, dict) or not isinstance(self.entry.get("file_path"), str):
+            raise self.wrong("file_path and transform_matrix", repr(self.entry)[:80], "Correct the file.")
+        path = root / self.entry["file_path"]
+        choices = (path, *(path.with_name(path.name + suffix) for suffix in _SUFFIXES))
+        return next((choice for choice in choices if os.path.isfile(choice)), None)
+
+    def pose(self) -> Float[np.ndarray, "4 4"] | None:
+        """World to camera, OpenCV axes; None where it is not finite."""
+        try:
+            matrix = np.array(self.entry.get("transform_matrix"), np.float64)
+        except (TypeError, ValueError):
+            matrix = np.zeros(0)
+        if matrix.shape == (3, 4):
+            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape != (4, 4):
+            raise self.wrong(
+                "transform_matrix, 4 lines of 4 numbers", f"shape {matrix.shape}", "Correct the file."
+            )
+        if not np.isfinite(matrix).all():
+            return None
+        if abs(np.linalg.det(matrix)) < 1e-9:
+            raise self.wrong(
+                "transform_matrix, a rigid motion", matrix.tolist(), "Correct or remove that frame."
+            )
+        return viewmat_from_opengl(matrix)
+
+    def read(self, root: Path, image: Path, pose: np.ndarray, split: str | None) -> _Frame:
+        width, height = picture_size(image)
+        return _Frame(
+            self.entry["file_path"],
+            split,
+            pose,
+            self.lens(width, height),
+            (width, height),
+            image,
+            self.beside(root, "mask_path"),
+            self.beside(root, "depth_file_path"),
+            self.numeral("time"),
+        )
+
+    def beside(self, root: Path, key: str) -> Path | None:
+        """The file that belongs to its photograph, where it has one."""
+        name = self.value(key)
+        if name is not None and not isinstance(name, str):
+            raise self.wrong(f"{key}, a name", repr(name), "Correct the file.")
+        return root / name if name else None
+
+    def lens(self, width: int, height: int) -> Lens:
+        """The camera, for a photograph of this size."""
+        said_width, said_height = self.numeral("w") or width, self.numeral("h") or height
+        fx, angle = self.numeral("fl_x"), self.numeral("camera_angle_x")
+        if fx is None and angle is None:
+            raise self.wrong("fl_x or camera_angle_x", "neither", "Add one, of the frame or of all.")
+        if fx is None:
+            fx = said_width / (2 * np.tan(angle / 2))
+        fy, angle_y = self.numeral("fl_y"), self.numeral("camera_angle_y")
+        if fy is None:
+            fy = fx if angle_y is None else said_height / (2 * np.tan(angle_y / 2))
+        if not (0 < fx < np.inf and 0 < fy < np.inf):
+            raise self.wrong("focal lengths above 0", f"{fx:g} and {fy:g}", "Correct the file.")
+        cx, cy = self.numeral("cx"), self.numeral("cy")
+        center = (said_width / 2 if cx is None else cx, said_height / 2 if cy is None else cy)
+        K = intrinsics(fx, 0, 0, center)
+        K[1, 1] = fy
+        model = self.value("camera_model") or ("OPENCV_FISHEYE" if self.value("is_fisheye") else "OPENCV")
+        if str(model) not in _MODELS:
+            raise self.wrong(
+                f"a camera_model of {', '.join(_MODELS)}", model, "Undistort the photographs first."
+            )
+        fisheye = _MODELS[model]
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+        coeffs = tuple(self.numeral(name) or 0.0 for name in names)
+        if not fisheye and self.numeral("k4"):  # nerfstudio's is of r^8, which OpenCV's model does not have
+            raise self.wrong(
+                "a k4 of 0 but for a fisheye", self.value("k4"), "Undistort the photographs first."
+            )
+        K = shrunk(K, (said_width, said_height), (width, height), f"{self.file}, frame {self.number}")
+        return Lens(K, coeffs, fisheye)
+
+
+def _say_left_out(root: Path, listed: int, missing: list[str], lost: int, left: int) -> None:
+    said = []
+    if missing:
+        names = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        said.append(f"{len(missing)} that have no file ({names})")
+    if lost:
+        said.append(f"{lost} without a finite pose")
+    if not left:
+        raise DataError(
+            root, "a photograph with a pose", f"of {listed} listed {' and '.join(said)}", "Check the folder."
+        )
+    if said:
+        message = f"{root}: of {listed} listed photographs {' and '.join(said)} are left out"
+        warnings.warn(message, DataWarning, stacklevel=4)
+
+
+def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
+    ideal = [straighten(frame.lens, *frame.size) for frame in frames]
+    clear = np.array(background)
+
+    def load_image(i: int) -> np.ndarray:
+        pixels = read_rgba(frames[i].image, *frames[i].size)
+        if pixels.shape[-1] == 4:
+            alpha = pixels[..., 3:] / 255
+            pixels = np.round(alpha * pixels[..., :3] + (1 - alpha) * 255 * clear).astype(np.uint8)
+        return ideal[i][1](pixels, cv2.INTER_LINEAR)
+
+    def load_mask(i: int) -> np.ndarray | None:
+        if frames[i].mask is None:
+            return None
+        counts = (read_mask(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
+        return ideal[i][1](counts, cv2.INTER_NEAREST) > 0
+
+    def load_depth(i: int) -> np.ndarray | None:
+        if frames[i].depth is None:
+            return None
+        return ideal[i][1](read_depth(frames[i].depth, depth_unit_m, *frames[i].size), cv2.INTER_NEAREST)
+
+    has = {
+        key: any(getattr(frame, key) is not None for frame in frames) for key in ("mask", "depth", "split")
+    }
+    times = np.array([np.nan if frame.time is None else frame.time for frame in frames])
+    moving = np.isfinite(times).all() and np.ptp(times) > 0
+    transparent = read_rgba(frames[0].image, *frames[0].size).shape[-1] == 4
+    return Photographs(
+        name=root.resolve().name,
+        names=tuple(frame.name for frame in frames),
+        sizes=np.array([frame.size for frame in frames]),
+        Ks=np.stack([K for K, _ in ideal]),
+        viewmats=np.stack([frame.viewmat for frame in frames]),
+        load_image=load_image,
+        load_mask=load_mask if has["mask"] else None,
+        load_depth=load_depth if has["depth"] else None,
+        times=times if moving else None,
+        splits=tuple(frame.split or "train" for frame in frames) if has["split"] else None,
+        cloud=cloud,
+        background=tuple(background) if transparent else None,
+        locate=lambda kind, i: str(getattr(frames[i], kind)),
+    )

@@ -1,0 +1,34 @@
+"""A static scene from posed photographs: 3D Gaussian splatting (Kerbl et al. 2023) with a fixed number of
+slots (3DGS-MCMC, Kheradmand et al. 2024).
+
+    problem, state = begin(views, config, cloud)
+    for fitted in fit(problem, state): ...
+
+config.py  what can be set            start.py  the first Gaussians
+step.py    the loss, and one step     fit.py    the loop on the host
+"""
+
+from gsjax.methods.reconstruction.config import FitConfig, GrowthConfig, RatesConfig, StartConfig
+from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, begin, fit
+from gsjax.methods.reconstruction.start import Extent, View, extent_of
+from gsjax.methods.reconstruction.step import Batch, Observation, fit_loss, grow, reconstruction_step
+
+__all__ = [
+    "Batch",
+    "Extent",
+    "FitConfig",
+    "FitState",
+    "Fitted",
+    "GrowthConfig",
+    "Observation",
+    "Problem",
+    "RatesConfig",
+    "StartConfig",
+    "View",
+    "begin",
+    "extent_of",
+    "fit",
+    "fit_loss",
+    "grow",
+    "reconstruction_step",
+]

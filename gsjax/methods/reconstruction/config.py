@@ -1,0 +1,88 @@
+"""How a scene is fitted to photographs. Comments become the command line's help."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """Where the first Gaussians are."""
+
+    source: Literal["auto", "cloud", "depth", "random"] = "auto"
+    """The data's points, its depth, or random places before cameras; auto takes the first that there is."""
+    count: int = 20_000
+    """How many, where they are drawn from depth or at random."""
+    opacity: float = 0.1
+    """Of all of them; more where depth says that something is there."""
+
+
+@dataclass(frozen=True)
+class RatesConfig:
+    """Learning rates of Adam, as in 3DGS."""
+
+    means: float = 1.6e-4
+    """Of places, in radii of the scene; it falls to a hundredth by the end."""
+    quats: float = 1e-3
+    log_scales: float = 5e-3
+    logit_opacities: float = 5e-2
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """Relocation and growth (3DGS-MCMC)."""
+
+    every: int = 100
+    """Steps between relocations."""
+    begin: int = 300
+    """The first of them."""
+    end: float = 0.85
+    """Share of all steps after which nothing is relocated."""
+    factor: float = 1.05
+    """How many times as many Gaussians there may be after each, up to the cap."""
+    noise: float = 5e5
+    """Of the walk of what is almost transparent, in rates of the means."""
+    opacity_cost: float = 0.01
+    """Weight of the mean opacity in the loss, which frees what is not needed."""
+    scale_cost: float = 0.01
+    """Weight of the mean scale, in radii of the scene."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a scene is fitted."""
+
+    steps: int = 7_000
+    """How many photographs are looked at, one a step."""
+    cap: int = 60_000
+    """How many Gaussians there may be."""
+    sh_degree: int = 1
+    """The highest degree of the spherical harmonics, 0 to 3: how colour depends on the direction."""
+    sh_every: int = 1_500
+    """Steps after which the next degree is unlocked."""
+    dssim_weight: float = 0.2
+    """Share of D-SSIM in the loss; the rest is L1."""
+    depth_weight: float = 0.0
+    """Weight of the difference in depth, in radii of the scene, where photographs have depth."""
+    coarse_until: float = 0.25
+    """Share of the steps that look at photographs of half the size, which take a quarter of the time."""
+    antialiased: bool = False
+    """Draw with Mip-Splatting's compensation, for views from other distances."""
+    background: Literal["data", "black", "white", "random"] = "data"
+    """Colour behind the scene; data: what the photographs were composited on, else black."""
+    seed: int = 0
+    start: StartConfig = field(default_factory=StartConfig)
+    rates: RatesConfig = field(default_factory=RatesConfig)
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+
+    def __post_init__(self):
+        positive = ("steps", "cap", "sh_every")
+        for name in positive:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.sh_degree not in range(4):
+            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
+        for name in ("dssim_weight", "coarse_until"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")

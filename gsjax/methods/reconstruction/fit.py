@@ -1,0 +1,248 @@
+"""The host loop of a fit: which photograph is next, at what size, with which capacity."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.geometry.cameras import Camera
+from gsjax.geometry.spherical_harmonics import num_sh_bases
+from gsjax.methods.reconstruction.config import FitConfig
+from gsjax.methods.reconstruction.start import Extent, View, extent_of, in_slots, start_points
+from gsjax.methods.reconstruction.step import Batch, Observation, grow, reconstruction_step
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render
+
+_HEADROOM = 1.3
+_RANDOM_BACKGROUND, _WALK, _GROWTH = range(3)  # what keys are for
+
+
+class Problem(NamedTuple):
+    """What does not change during a fit.
+
+    Attributes:
+        views: the photographs to fit, on the host.
+        config: how.
+        extent: where the scene is.
+        background: RGB behind the scene; None: another in each step.
+        start: where the first Gaussians come from: cloud, depth or random.
+    """
+
+    views: list[View]
+    config: FitConfig
+    extent: Extent
+    background: tuple[float, float, float] | None
+    start: str
+
+
+class FitState(eqx.Module):
+    """What a fit goes on from, to the same bits.
+
+    Attributes:
+        gaussians: of all slots; those that are not alive are empty.
+        optimizer: state of Adam.
+        step: how many steps were made.
+        capacity: of the plan for each size of photographs, a row (shrink, width, height, capacity) each.
+    """
+
+    gaussians: Gaussians
+    optimizer: Any
+    step: int
+    capacity: Int[np.ndarray, "sizes 4"]
+
+
+class Fitted(NamedTuple):
+    """A fit after one more step.
+
+    Attributes:
+        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
+        info: loss, psnr, alive, skipped of this step, on the device.
+        seconds: that it took, without what compiled.
+        compile_seconds: that compiling took in it.
+        shrink: how many times smaller the photograph was.
+    """
+
+    state: FitState
+    info: dict[str, Array]
+    seconds: float
+    compile_seconds: float
+    shrink: int
+
+
+def begin(
+    views: list[View],
+    config: FitConfig,
+    cloud: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+    background: tuple[float, float, float] | None = None,
+) -> tuple[Problem, FitState]:
+    """A fit before its first step.
+
+    Args:
+        views: the photographs.
+        config: how they are fitted.
+        cloud: points of the scene and their colours, 0 to 1.
+        background: what is behind the scene, where the data says so.
+
+    Raises:
+        ValueError: there is no view, or nothing of the kind from which the fit is to start.
+    """
+    if not views:
+        raise ValueError("views: expected at least one photograph to fit, found none")
+    extent = extent_of(np.stack([view.viewmat for view in views]))
+    points, colors, source = start_points(views, cloud, config.start, config.seed)
+    gaussians = in_slots(points, colors, config.cap, config.start.opacity, config.seed)
+    behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
+    behind["data"] = background or behind["black"]
+    problem = Problem(views, config, extent, behind[config.background], source)
+    state = reconstruction_step(config, extent.radius).init(gaussians)
+    return problem, FitState(gaussians, state, 0, np.zeros((0, 4), int))
+
+
+def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None = None) -> Iterator[Fitted]:
+    """Step by step, until as many are made as are wanted. The same state, problem and `steps` give the same
+    bits, wherever the fit was begun or resumed.
+
+    Args:
+        problem: from `begin`.
+        state: from `begin`, or that of an earlier `Fitted`.
+        steps: step -> how many there will be in all, which a budget of time finds out as it goes; those of
+            the config unless given.
+    """
+    config, views = problem.config, problem.views
+    key = jax.random.key(config.seed)
+    plans = {tuple(row[:3].tolist()): int(row[3]) for row in state.capacity}
+    advance, regrow = _compiled(config, problem.extent.radius)
+    seen: dict[tuple[int, int], Observation] = {}
+    gaussians, optimizer = state.gaussians, state.optimizer
+    compiled: set[Any] = set()
+    i = state.step
+    while i < (total := config.steps if steps is None else steps(i)):
+        share = i / total
+        degree = min(config.sh_degree, i // config.sh_every)
+        gaussians, optimizer = with_degree(problem, gaussians, optimizer, degree)
+        v, shrink = _turn(config.seed, i, len(views)), _shrink(config, share)
+        if (v, shrink) not in seen:
+            seen[v, shrink] = _observe(views[v], shrink)
+        observed = seen[v, shrink]
+        size = (shrink, observed.camera.width, observed.camera.height)
+        begun, compiling = perf_counter(), 0.0
+        while True:
+            if size not in plans:
+                plans[size] = _plan(problem, gaussians, observed.camera, 0).capacity
+            plan = _plan(problem, gaussians, observed.camera, plans[size])
+            batch = Batch(observed, _background(problem, key, i), plan)
+            new = (plan, gaussians.sh_degree)
+            if new not in compiled:  # the first call of a program is not the time of a step
+                started = perf_counter()
+            walk = jax.random.fold_in(jax.random.fold_in(key, _WALK), i)
+            gaussians, optimizer, info = advance(gaussians, optimizer, batch, share, walk)
+            overflow = bool(info["overflow"])
+            if new not in compiled:
+                compiling += perf_counter() - started
+                compiled.add(new)
+            if not overflow:
+                break
+            plans[size] = plan.grown(int(info["needed"]), _HEADROOM).capacity
+        if _grows(config, i, share):
+            turn = jax.random.fold_in(jax.random.fold_in(key, _GROWTH), i)
+            gaussians, optimizer = regrow(gaussians, optimizer, turn, config.cap)
+        i += 1
+        capacity = np.array([[*of, room] for of, room in plans.items()], int)
+        now = FitState(gaussians, optimizer, i, capacity)
+        yield Fitted(now, info, perf_counter() - begun - compiling, compiling, shrink)
+
+
+def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
+    """The jitted step and growth; buffers that they replace are given away."""
+    step, options = reconstruction_step(config, radius), host_options()
+
+    @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
+    def advance(gaussians, optimizer, batch, share, key):
+        return step.update(gaussians, optimizer, batch, step=share, key=key)
+
+    @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
+    def regrow(gaussians, optimizer, key, cap):
+        return grow(gaussians, optimizer, key, cap, config.growth.factor)
+
+    return advance, regrow
+
+
+def _turn(seed: int, step: int, count: int) -> int:
+    """Which photograph a step looks at: all of them in a random order, and then in another."""
+    epoch, place = divmod(step, count)
+    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
+
+
+def _shrink(config: FitConfig, share: float) -> int:
+    """How many times smaller photographs are: first 4, then 2."""
+    if share >= config.coarse_until:
+        return 1
+    return 4 if share < config.coarse_until / 3 else 2
+
+
+def _grows(config: FitConfig, step: int, share: float) -> bool:
+    growth = config.growth
+    return step >= growth.begin and step % growth.every == 0 and share < growth.end
+
+
+def _observe(view: View, shrink: int) -> Observation:
+    """A view on the device, in a picture of another size."""
+    image, mask, depth = view.image, view.mask, view.depth
+    height, width = (max(1, side // shrink) for side in image.shape[:2])
+    factors = np.array([width / image.shape[1], height / image.shape[0], 1.0])
+    if shrink > 1:
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        smaller = partial(cv2.resize, dsize=(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        mask = None if mask is None else smaller(mask.astype(np.uint8)) > 0
+        depth = None if depth is None else smaller(depth)
+    dtype = jnp.result_type(float)
+    viewmat, K = (jnp.asarray(a, dtype)[None] for a in (view.viewmat, factors[:, None] * view.K))
+    known = None if depth is None else jnp.asarray(depth, dtype)[None]
+    counts = None if mask is None or mask.all() else jnp.asarray(mask)[None]
+    return Observation(jnp.asarray(image)[None], counts, known, Camera(viewmat, K, width, height))
+
+
+def _plan(problem: Problem, gaussians: Gaussians, cameras: Camera, capacity: int) -> Plan:
+    """A plan of this capacity, or, where that is 0, of what these cameras need."""
+    mode = "antialiased" if problem.config.antialiased else "classic"
+    if capacity == 0:
+        return plan_render(gaussians, cameras, headroom=_HEADROOM, rasterize_mode=mode)
+    options = {"rasterize_mode": mode, "render_mode": "RGB+ED", "sh_degree": gaussians.sh_degree}
+    return Plan(cameras.width, cameras.height, capacity, **options)
+
+
+def _background(problem: Problem, key: Array, step: int) -> Float[Array, "1 3"]:
+    if problem.background is not None:
+        return jnp.array([problem.background])
+    return jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, _RANDOM_BACKGROUND), step), (1, 3))
+
+
+def with_degree(problem: Problem, gaussians: Gaussians, optimizer: Any, degree: int) -> tuple[Gaussians, Any]:
+    """With the coefficients of a degree, of zero where they are new; what Adam knows of others is kept."""
+    missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
+    if missing <= 0:
+        return gaussians, optimizer
+    zeros = jnp.zeros((gaussians.num, missing, 3), gaussians.sh0.dtype)
+    shN = zeros if gaussians.shN is None else jnp.concatenate([gaussians.shN, zeros], axis=1)
+    wider = eqx.tree_at(lambda g: g.shN, gaussians, shN, is_leaf=lambda leaf: leaf is None)
+    begun = reconstruction_step(problem.config, problem.extent.radius).init(wider)
+    known = {
+        jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(optimizer)
+    }
+
+    def kept(path, leaf):
+        old = known.get(jax.tree_util.keystr(path))
+        if old is None:
+            return leaf
+        return old if old.shape == leaf.shape else leaf.at[:, : old.shape[1]].set(old)
+
+    return wider, jax.tree_util.tree_map_with_path(kept, begun)

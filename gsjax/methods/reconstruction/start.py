@@ -1,0 +1,131 @@
+"""The first Gaussians: on the data's points, on its depth, or at random before the cameras. On the host."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.methods.reconstruction.config import StartConfig
+from gsjax.optim.densification import EMPTY_LOGIT
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
+
+
+class View(NamedTuple):
+    """What a photograph shows, on the host.
+
+    Attributes:
+        image: RGB, uint8.
+        mask: which pixels count, or None for all.
+        depth: 0 where unknown, or None.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics in pixels.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray | None
+    depth: np.ndarray | None
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+
+
+class Extent(NamedTuple):
+    """Where a scene is.
+
+    Attributes:
+        focus: the point nearest to all optical axes.
+        radius: how far the cameras stand from their middle, at most; the unit of rates. Cameras that all
+            stand at one place leave it to how far away the focus is, or 1.
+    """
+
+    focus: Float[np.ndarray, "3"]
+    radius: float
+
+
+def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
+    """The extent of a scene that these cameras look at."""
+    rotations = viewmats[:, :3, :3]
+    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
+    axes = rotations[:, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    # Parallel axes meet nowhere: then the point one radius ahead of the middle is as good as any.
+    spread = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    weak = 1e-3 * np.eye(3) * len(centers)
+    ahead = centers.mean(0) + axes.mean(0) * (spread or 1.0)
+    total = np.einsum("nij,nj->i", across, centers) + weak @ ahead
+    focus = np.linalg.solve(across.sum(0) + weak, total)
+    away = float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    return Extent(focus, 1.1 * spread if spread > 1e-6 * max(away, 1e-9) else max(away, 1e-3) or 1.0)
+
+
+def start_points(
+    views: list[View], cloud: tuple[np.ndarray, np.ndarray] | None, config: StartConfig, seed: int
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], str]:
+    """Points and their colours, and where they come from.
+
+    Raises:
+        ValueError: the source that is asked for is not there.
+    """
+    random = np.random.default_rng(seed)
+    has_depth = any(view.depth is not None for view in views)
+    source = config.source
+    if source == "auto":
+        source = "cloud" if cloud is not None and len(cloud[0]) else "depth" if has_depth else "random"
+    if source == "cloud":
+        if cloud is None or not len(cloud[0]):
+            raise ValueError("start.source: the data has no points; use depth, random or auto")
+        return *cloud, source
+    if source == "depth":
+        if not has_depth:
+            raise ValueError("start.source: the data has no depth; use cloud, random or auto")
+        return *_from_depth(views, config.count, random), source
+    return *_at_random(views, config.count, random), source
+
+
+def _from_depth(views, count, random):
+    """Pixels with depth, as many from each view."""
+    each = -(-count // len(views))
+    points, colors = [], []
+    for view in views:
+        if view.depth is None or not (view.depth > 0).any():
+            continue
+        known = view.depth if view.mask is None else np.where(view.mask, view.depth, 0)
+        some = points_from_rgbd(view.image, known, view.viewmat, view.K)
+        kept = random.permutation(len(some[0]))[:each]
+        points.append(some[0][kept])
+        colors.append(some[1][kept])
+    return np.concatenate(points), np.concatenate(colors)
+
+
+def _at_random(views, count, random):
+    """Pixels of the views at depths about that of what they look at, each coloured as its pixel is."""
+    extent = extent_of(np.stack([view.viewmat for view in views]))
+    points, colors = np.zeros((count, 3)), np.zeros((count, 3))
+    chosen: Int[np.ndarray, "count"] = random.integers(len(views), size=count)
+    for v in np.unique(chosen):
+        view, rows = views[v], np.flatnonzero(chosen == v)
+        height, width = view.image.shape[:2]
+        row, column = random.integers(height, size=len(rows)), random.integers(width, size=len(rows))
+        rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
+        middle = max(float((rotation @ extent.focus + shift)[2]), 0.3 * extent.radius)
+        depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))  # even in disparity, 0.4 to 4 times as far
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1) @ np.linalg.inv(view.K).T
+        points[rows] = (rays * depth[:, None] - shift) @ rotation
+        colors[rows] = view.image[row, column] / 255
+    return points, colors
+
+
+def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, opacity: float, seed: int) -> Gaussians:
+    """Spheres on the points (some of them, where there are more than slots), and empty slots behind them."""
+    if len(points) > slots:
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:slots])
+        points, colors = points[chosen], colors[chosen]
+    started = gaussians_from_points(points, colors, opacity=opacity, scale_factor=1.0)
+    rest = slots - started.num
+    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], rest, axis=0)]), started)
+    logits = np.asarray(padded.logit_opacities).copy()
+    logits[started.num :] = EMPTY_LOGIT
+    fields = {name: jnp.asarray(getattr(padded, name)) for name in ("means", "quats", "log_scales", "sh0")}
+    return Gaussians(**fields, logit_opacities=jnp.asarray(logits))

@@ -1,0 +1,168 @@
+"""`gsjax fit` from a folder of photographs to a report; stopped in the middle it goes on to the same bits."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import pytest
+
+import gsjax.cli.fit
+from gsjax.cli import main
+from gsjax.cli.fit import Budget, split
+from gsjax.cli.fit_results import Curve
+from gsjax.data import open_photographs
+from gsjax.io.ply import read_ply
+
+QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
+QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")
+
+
+@pytest.fixture
+def gsjax_fit(photographs, tmp_path, capfd):
+    """Runs `gsjax fit` in this process, into tmp_path/NAME; returns the exit code and what was said."""
+
+    def call(*options: str, name: str = "run", dataset=photographs) -> tuple[int, str]:
+        code = main(["fit", str(dataset), "--out", str(tmp_path / name), *options])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err
+
+    return call
+
+
+def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, tmp_path, monkeypatch):
+    code, said = gsjax_fit(*QUICK)
+    assert code == 0, said
+    assert "of 10 listed photographs 1 that have no file (images/lost.png)" in said
+    assert "held out" in said
+    run = tmp_path / "run"
+    found = json.loads((run / "metrics.json").read_text())
+    assert found["complete"]
+    assert found["photographs"] == {"fitted": 6, "held_out": 3}
+    assert found["steps"] == 24
+    assert found["test"]["psnr"] > 8
+    assert -1 < found["test"]["ssim"] < 1
+    assert found["test"]["depth_mm"] is None
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [8, 16, 24]
+    assert all(line["test_psnr"] > 5 for line in lines)
+    gaussians, _ = read_ply(run / "scene.ply")
+    assert gaussians.num == found["num_gaussians"] <= 150
+    assert gaussians.sh_degree == found["sh_degree"] == 1
+    pictures = sorted((run / "renders" / "held_out").iterdir())
+    assert len(pictures) == 3
+    assert cv2.imread(str(pictures[0])).shape[1] == 3 * 48
+    assert "data:image/png" in (run / "report.html").read_text()
+    assert not (run / "resume").exists()
+
+    shown = Curve.took
+
+    def stopped(self, seconds, compile_seconds):
+        shown(self, seconds, compile_seconds)
+        if calls.append(1) or len(calls) == 14:  # after the degree has changed
+            raise KeyboardInterrupt
+
+    calls: list[int] = []
+    with monkeypatch.context() as context:
+        context.setattr(Curve, "took", stopped)
+        code, said = gsjax_fit(*QUICK, name="stopped")
+    assert code == 130
+    assert "partial run" in said
+    part = json.loads((tmp_path / "stopped" / "metrics.json").read_text())
+    assert (part["complete"], part["steps"]) == (False, 14)
+    assert (tmp_path / "stopped" / "scene.ply").exists()
+
+    code, said = gsjax_fit(*QUICK, "--resume", "--fit.seed", "5", name="stopped")
+    assert code == 2
+    assert "--resume: the run in" in said
+    code, said = gsjax_fit(*QUICK, "--resume", name="stopped")
+    assert code == 0, said
+    assert "Resumed after 14 steps" in json.dumps(
+        json.loads((tmp_path / "stopped" / "metrics.json").read_text())
+    )
+    assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (run / "scene.ply").read_bytes()
+
+    assert gsjax_fit(*QUICK)[0] == 2  # a finished run is kept unless asked
+
+
+def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):
+    monkeypatch.setattr(gsjax.cli.fit_resume, "EVERY_S", 0.0)
+    shown, calls = Curve.took, []
+
+    def stopped(self, seconds, compile_seconds):
+        shown(self, seconds, compile_seconds)
+        if calls.append(1) or len(calls) == 6:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(Curve, "took", stopped)
+        assert gsjax_fit(*QUICK)[0] == 130
+    *_, before, newest = sorted((tmp_path / "run" / "resume").iterdir())
+    newest.write_bytes(newest.read_bytes()[:1000])
+    code, said = gsjax_fit(*QUICK, "--resume")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert f"Resumed after {int(before.stem.split('-')[1])} steps" in json.dumps(found["notes"])
+
+
+def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_path):
+    code, said = gsjax_fit(*QUICK, "--until-psnr", "1")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (found["complete"], found["steps"]) == (True, 8)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--scale", "0"), "--scale: expected above 0"),
+        (("--test-every", "1"), "--test-every: expected 0"),
+        (("--minutes", "-1"), "--minutes: expected more than 0"),
+        (("--until-psnr", "20", "--test-every", "0"), "--until-psnr: nothing is held out"),
+        (("--fit.start.source", "cloud"), "start.source: the data has no points"),
+        (("--fit.start.source", "depth"), "start.source: the data has no depth"),
+    ],
+)
+def test_wishes_that_cannot_be_met(gsjax_fit, options, says):
+    code, said = gsjax_fit(*options)
+    assert code == 2
+    assert says in said
+
+
+def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path):
+    copy = tmp_path / "copy"
+    (copy / "images").mkdir(parents=True)
+    for file in photographs.glob("**/*.*"):
+        (copy / file.relative_to(photographs)).write_bytes(file.read_bytes())
+    broken = copy / "images" / "11.png"
+    broken.write_bytes(broken.read_bytes()[:-40])
+    code, said = gsjax_fit(*QUICK, dataset=copy)
+    assert code == 2
+    assert "11.png" in said
+    assert "cut off" in said
+
+
+def test_what_is_held_out_is_as_the_data_says_or_every_so_manieth(photographs):
+    with pytest.warns(UserWarning, match="have no file"):
+        nine = open_photographs(photographs)
+    chosen, held_out = split(nine, 4)
+    assert held_out.tolist() == [0, 4, 8]
+    assert sorted([*chosen, *held_out]) == list(range(9))
+    assert split(nine, 0)[1].tolist() == []
+    alone = nine.select([3])
+    assert [part.tolist() for part in split(alone, 8)] == [[0], []]
+    said = replace(nine, splits=("train",) * 6 + ("val",) + ("test",) * 2)
+    assert [part.tolist() for part in split(said, 4)] == [[0, 1, 2, 3, 4, 5], [7, 8]]
+    with pytest.raises(ValueError, match="none is left to fit"):
+        split(replace(nine, splits=("test",) * 9), 4)
+
+
+def test_a_budget_of_minutes_is_as_many_steps_as_fit():
+    curve = Curve()
+    budget = Budget(10_000, 1.0, curve)
+    for step in range(100):
+        assert budget(step) == (10_000 if step < 50 else 550)
+        curve.took(0.1, 5.0 if step == 0 else 0.0)
+        budget.took(0.1)
+    assert budget(100) == 100 + int((60 - 5 - 10) / 0.1) == 550
+    assert Budget(10_000, None, curve)(5000) == 10_000

@@ -1,0 +1,201 @@
+"""A scene is found again from its photographs; a fit that is resumed goes on to the same bits."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.methods.reconstruction import (
+    Batch,
+    FitConfig,
+    FitState,
+    Observation,
+    StartConfig,
+    View,
+    begin,
+    extent_of,
+    fit,
+    fit_loss,
+)
+from gsjax.methods.reconstruction.fit import with_degree
+from gsjax.methods.reconstruction.start import start_points
+from gsjax.optim.densification import is_alive
+from gsjax.scene.gaussians import gaussians_from_activated
+from gsjax.scene.render import plan_render, render
+
+WIDTH, HEIGHT = 40, 30
+QUICK = FitConfig(
+    steps=60, cap=120, sh_degree=1, sh_every=40, coarse_until=0.3, start=StartConfig(count=100), seed=1
+)
+
+
+def cameras(count: int) -> Camera:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    eyes = np.stack([3 * np.cos(angles), 3 * np.sin(angles), 1 + 0.5 * np.sin(3 * angles)], axis=-1)
+    viewmats = jnp.asarray(np.stack([look_at(eye, np.zeros(3)) for eye in eyes]), jnp.float32)
+    Ks = jnp.broadcast_to(jnp.asarray(intrinsics(40.0, WIDTH, HEIGHT), jnp.float32), (count, 3, 3))
+    return Camera(viewmats, Ks, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Eight views of thirty blobs before black, with depth."""
+    random, count = np.random.default_rng(0), 30
+    means, colors = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(size=(count, 3))
+    quats, scales = random.normal(size=(count, 4)), random.uniform(0.08, 0.25, (count, 3))
+    scene = gaussians_from_activated(means, quats, scales, np.full(count, 0.9), colors)
+    eight = cameras(8)
+    drawn = render(scene, eight, plan_render(scene, eight))
+    images = np.round(255 * np.clip(np.asarray(drawn.colors), 0, 1)).astype(np.uint8)
+    depths = np.where(np.asarray(drawn.alphas) > 0.9, np.asarray(drawn.depths), 0)
+    viewmats, Ks = np.asarray(eight.viewmat, np.float64), np.asarray(eight.K, np.float64)
+    return [View(images[i], None, depths[i], viewmats[i], Ks[i]) for i in range(8)]
+
+
+def without_depth(views: list[View]) -> list[View]:
+    return [view._replace(depth=None) for view in views]
+
+
+def copied(tree):
+    """What a step would give away."""
+    return jax.tree.map(lambda leaf: np.array(leaf) if hasattr(leaf, "shape") else leaf, tree)
+
+
+def picture(gaussians, view: View) -> np.ndarray:
+    camera = Camera(
+        jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(view.K, jnp.float32)[None], WIDTH, HEIGHT
+    )
+    return np.asarray(render(gaussians, camera).colors[0])
+
+
+def psnr(gaussians, view: View) -> float:
+    return -10 * np.log10(np.mean((picture(gaussians, view) - view.image / 255) ** 2))
+
+
+@pytest.mark.parametrize(("source", "steps"), [("depth", 60), ("random", 400)])
+def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps):
+    config = replace(QUICK, steps=steps, start=replace(QUICK.start, source=source))
+    problem, state = begin(views[1:], config)
+    assert problem.start == source
+    before = psnr(state.gaussians, views[0])
+    shrinks = []
+    for fitted in fit(problem, state):
+        shrinks.append(fitted.shrink)
+        assert not bool(fitted.info["skipped"])
+    assert fitted.state.step == config.steps
+    assert sorted(set(shrinks), reverse=True) == [4, 2, 1] == list(dict.fromkeys(shrinks))
+    assert fitted.state.gaussians.sh_degree == 1
+    assert psnr(fitted.state.gaussians, views[0]) > before + 1.5
+
+
+def test_a_resumed_fit_is_equal_to_the_bit(views):
+    problem, state = begin(without_depth(views), QUICK)
+    for fitted in fit(problem, state):
+        if fitted.state.step == 37:
+            halfway = copied(fitted.state)  # before the degree changes at 40
+    problem, _ = begin(without_depth(views), QUICK)
+    arrays = jax.tree.map(jnp.asarray, (halfway.gaussians, halfway.optimizer))
+    *_, again = fit(problem, FitState(*arrays, halfway.step, halfway.capacity))
+    jax.tree.map(np.testing.assert_array_equal, copied(again.state), copied(fitted.state))
+
+
+def test_slots_fill_up_to_the_cap_and_no_further(views):
+    growth = replace(QUICK.growth, every=5, begin=5, factor=1.5, opacity_cost=0.0)
+    config = replace(QUICK, growth=growth, start=StartConfig(source="depth", count=40, opacity=0.5))
+    problem, state = begin(views, config)
+    first = int(is_alive(state.gaussians).sum())
+    counts = [
+        int(is_alive(fitted.state.gaussians).sum()) for fitted in fit(problem, state, steps=lambda i: 40)
+    ]
+    assert first == 40
+    assert max(counts) == config.cap
+
+
+def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
+    view = views[0]
+    _, state = begin([view], QUICK)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, : WIDTH // 2] = True
+    camera = Camera(
+        jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(view.K, jnp.float32)[None], WIDTH, HEIGHT
+    )
+    plan = plan_render(state.gaussians, camera)
+    loss = fit_loss(replace(QUICK, growth=replace(QUICK.growth, opacity_cost=0.0, scale_cost=0.0)), 1.0)
+
+    def of(image):
+        seen = Observation(jnp.asarray(image)[None], jnp.asarray(mask)[None], None, camera)
+        batch = Batch(seen, jnp.zeros((1, 3)), plan)
+        return jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0])(state.gaussians)
+
+    garbled = view.image.copy()
+    garbled[:, WIDTH // 2 + 12 :] = (
+        255 - garbled[:, WIDTH // 2 + 12 :]
+    )  # further off than SSIM's windows reach
+    value, slope = of(view.image)
+    other, other_slope = of(garbled)
+    np.testing.assert_allclose(other, value, rtol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other_slope, slope)
+
+
+def test_a_higher_degree_draws_the_same_and_keeps_what_adam_knows(views):
+    problem, state = begin(views, QUICK)
+    *_, fitted = fit(problem, state, steps=lambda i: 3)
+    gaussians, optimizer = fitted.state.gaussians, fitted.state.optimizer
+    wider, known = with_degree(problem, gaussians, optimizer, 2)
+    assert wider.sh_degree == 2
+    np.testing.assert_allclose(picture(wider, views[0]), picture(gaussians, views[0]), atol=1e-6)
+    before = {jax.tree_util.keystr(p): leaf for p, leaf in jax.tree_util.tree_leaves_with_path(optimizer)}
+    after = {jax.tree_util.keystr(p): leaf for p, leaf in jax.tree_util.tree_leaves_with_path(known)}
+    assert before.keys() < after.keys()
+    for path, leaf in before.items():
+        np.testing.assert_array_equal(after[path], leaf)
+    assert with_degree(problem, wider, known, 1)[0] is wider  # never back
+
+
+def test_poison_in_a_photograph_cannot_be_and_in_a_gaussian_skips_the_step(views):
+    problem, state = begin(views, QUICK)
+    sick = eqx.tree_at(lambda s: s.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
+    (fitted, *_) = fit(problem, sick, steps=lambda i: 1)
+    assert bool(fitted.info["skipped"])
+    assert np.isfinite(np.asarray(fitted.state.gaussians.means)).all()
+
+
+def test_an_extent_is_that_of_the_cameras_and_where_they_look():
+    eight = np.asarray(cameras(8).viewmat, np.float64)
+    found = extent_of(eight)
+    np.testing.assert_allclose(found.focus, 0, atol=0.02)
+    assert 3.0 < found.radius < 3.6
+    alone = extent_of(eight[:1])
+    assert np.isfinite(alone.focus).all()
+    assert alone.radius > 0
+    ahead = np.tile(np.eye(4), (5, 1, 1))
+    ahead[:, 0, 3] = np.linspace(-1, 1, 5)  # side by side, along parallel axes
+    found = extent_of(ahead)
+    assert np.isfinite(found.focus).all()
+    assert found.focus[2] > 0
+    turning = np.tile(np.eye(4), (4, 1, 1))
+    assert extent_of(turning).radius > 0  # all at one place, looking one way
+
+
+def test_starts_that_the_data_does_not_have_are_refused(views):
+    for source in ("cloud", "depth"):
+        config = StartConfig(source=source, count=10)
+        with pytest.raises(ValueError, match=r"start.source: the data has no .*; use"):
+            start_points(without_depth(views), None, config, 0)
+    with pytest.raises(ValueError, match="at least one photograph"):
+        begin([], QUICK)
+    cloud = (np.zeros((3, 3)), np.full((3, 3), 0.5))
+    assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [({"steps": 0}, "steps"), ({"sh_degree": 4}, "sh_degree"), ({"dssim_weight": 1.5}, "dssim_weight")],
+)
+def test_settings_without_meaning_are_refused(changes, says):
+    with pytest.raises(ValueError, match=f"{says} must be"):
+        FitConfig(**changes)
