@@ -162,27 +162,23 @@ class Photographs:
         sizes = np.maximum(1, np.round(self.sizes * scale).astype(int))
         factors = np.concatenate([sizes / self.sizes, np.ones((self.num, 1))], axis=1)
 
-        def resized(load: Callable | None, how: int) -> Callable | None:
+        def resized(load: Callable, how: int) -> Callable:
             def smaller(i: int) -> np.ndarray | None:
                 full = load(i)
                 if full is None:
                     return None
-                small = cv2.resize(
-                    np.asarray(full, full.dtype if full.dtype != bool else np.uint8),
-                    sizes[i],
-                    interpolation=how,
-                )
-                return small.astype(full.dtype)
+                picture = full.astype(np.uint8) if full.dtype == bool else full
+                return cv2.resize(picture, sizes[i], interpolation=how).astype(full.dtype)
 
-            return load and smaller
+            return smaller
 
         return replace(
             self,
             sizes=sizes,
             Ks=self.Ks * factors[:, :, None],
             load_image=resized(self.image, cv2.INTER_AREA),
-            load_mask=resized(self.load_mask and self.mask, cv2.INTER_NEAREST_EXACT),
-            load_depth=resized(self.load_depth and self.depth, cv2.INTER_NEAREST_EXACT),
+            load_mask=self.load_mask and resized(self.mask, cv2.INTER_NEAREST_EXACT),
+            load_depth=self.load_depth and resized(self.depth, cv2.INTER_NEAREST_EXACT),
         )
 
     def where(self, kind: str, i: int) -> str:

@@ -205,9 +205,9 @@ class _Entry(NamedTuple):
         """The camera, for a photograph of this size."""
         said_width, said_height = self.numeral("w") or width, self.numeral("h") or height
         fx, angle = self.numeral("fl_x"), self.numeral("camera_angle_x")
-        if fx is None and angle is None:
-            raise self.wrong("fl_x or camera_angle_x", "neither", "Add one, of the frame or of all.")
         if fx is None:
+            if angle is None:
+                raise self.wrong("fl_x or camera_angle_x", "neither", "Add one, of the frame or of all.")
             fx = said_width / (2 * np.tan(angle / 2))
         fy, angle_y = self.numeral("fl_y"), self.numeral("camera_angle_y")
         if fy is None:
