@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
+from gsjax.cli.interrupts import undisturbed
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
@@ -219,11 +220,12 @@ def follow(
         TextColumn("{task.fields[told]}"),
         TimeRemainingColumn(),
     )
-    drawn, fitted = 0.0, None
+    drawn = 0.0
     with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task("fitting", total=options.fit.steps, completed=state.step, told="compiling")
         try:
-            for fitted in fit(problem, state, steps=budget):
+            steps = fit(problem, state, steps=budget)
+            while (fitted := undisturbed(next, steps, None)) is not None:
                 state, step = fitted.state, fitted.state.step
                 budget.took(fitted.seconds)
                 curve.took(fitted.seconds, fitted.compile_seconds)
@@ -243,8 +245,10 @@ def follow(
                     if options.until_psnr is not None and psnr is not None and psnr >= options.until_psnr:
                         break
                 saver(state, curve, last=False)
+            saver(state, curve, last=True)
         except (KeyboardInterrupt, Exception) as stopped:
-            if fitted is not None:
-                saver(state, curve, last=True)
-            return jax.block_until_ready(state), stopped
+            if any(leaf.is_deleted() for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array)):
+                raise  # a step that failed took it along: what --resume needs was saved before
+            saver(state, curve, last=True)
+            return state, stopped
     return state, None

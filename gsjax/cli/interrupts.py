@@ -7,14 +7,21 @@ one) or in a finalizer the exception is printed and dropped, and the program goe
 import signal
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
-DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__", "called_by_xla"})
-"""Functions in which exceptions are dropped: callbacks of the garbage collector and of XLA, and finalizers.
-Callbacks of weak references are a fourth kind, known by their file."""
+DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__", "called_by_xla", "undisturbed"})
+"""Functions in which exceptions are dropped: callbacks of the garbage collector and of XLA, and finalizers
+(callbacks of weak references are a fourth kind, known by their file); and one that is not to be disturbed."""
 RETRY_S = 0.01
+
+
+def undisturbed(call: Callable[..., Any], *arguments: Any) -> Any:
+    """What `call` gives; Ctrl-C is heard after it. It is for steps that give away the buffers they replace:
+    to stop in the middle of one would lose both the old and the new."""
+    return call(*arguments)
 
 
 def is_deaf(frame: FrameType | None) -> bool:

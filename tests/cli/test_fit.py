@@ -1,6 +1,11 @@
 """`gsjax fit` from a folder of photographs to a report; stopped in the middle it goes on to the same bits."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import cv2
@@ -83,6 +88,27 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (run / "scene.ply").read_bytes()
 
     assert gsjax_fit(*QUICK)[0] == 2  # a finished run is kept unless asked
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, gsjax_fit, tmp_path):
+    """A step gives away the buffers that it replaces, and most of the time one is being made."""
+    run = tmp_path / "run"
+    long = (*QUICK, "--fit.steps", "100000", "--judge-every", "50")
+    command = [sys.executable, "-m", "gsjax.cli", "fit", str(photographs), "--out", str(run), *long]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    while not (run / "metrics.jsonl").exists():
+        time.sleep(0.05)
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    found = json.loads((run / "metrics.json").read_text())
+    assert not found["complete"]
+    assert found["steps"] >= 50
+    newest = sorted((run / "resume").iterdir())[-1]
+    assert newest.name == f"step-{found['steps']:08d}.npz"
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):

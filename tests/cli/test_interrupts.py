@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gsjax.cli.interrupts import heard_interrupts
+from gsjax.cli.interrupts import heard_interrupts, undisturbed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -41,6 +41,24 @@ def test_an_interrupt_in_a_callback_that_drops_exceptions_is_raised_after_it():
 def collect_and_wait() -> None:
     gc.collect()
     time.sleep(5)
+
+
+def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
+    done = []
+
+    def step(amount):
+        interrupt()
+        time.sleep(0.05)
+        done.append(amount)
+        return amount
+
+    def step_and_wait():
+        done.append(undisturbed(step, 3))
+        time.sleep(5)
+
+    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+        step_and_wait()
+    assert done[0] == 3
 
 
 def test_somebody_elses_handler_stays():
