@@ -13,7 +13,7 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.data.errors import DataWarning
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.reconstruction import FitState, Problem
-from gsjax.methods.reconstruction.fit import with_degree
+from gsjax.methods.reconstruction.fit import enlarged
 
 EVERY_S = 30.0
 """Seconds of fitting that a run may lose when it is killed."""
@@ -33,6 +33,7 @@ class Saver:
             return
         metadata = {
             "degree": state.gaussians.sh_degree,
+            "slots": state.gaussians.num,
             "sizes": len(state.capacity),
             "step": state.step,
             "curve": curve.metadata(),
@@ -58,8 +59,9 @@ def load(folder: Path, problem: Problem, start: FitState) -> tuple[FitState, Cur
     for path in reversed(_saved(folder)):
         try:
             metadata = load_metadata(path)
-            gaussians, optimizer = with_degree(problem, start.gaussians, start.optimizer, metadata["degree"])
-            like = FitState(gaussians, optimizer, 0, np.zeros((metadata["sizes"], 4), int))
+            size = metadata["degree"], metadata["slots"]
+            model, optimizer = enlarged(problem, start.model, start.optimizer, *size)
+            like = FitState(model, optimizer, 0, np.zeros((metadata["sizes"], 4), int))
             state, _ = load_checkpoint(path, like)
             return state, Curve.of(metadata["curve"])
         except CheckpointError as error:

@@ -7,9 +7,11 @@
 carries along. `info` has the losses by name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -63,25 +65,42 @@ def keep_if(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def per_field_adam(rates: dict[str, Any], default: float = 0.0) -> optax.GradientTransformation:
-    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module; the others stand still.
+def per_field_adam(
+    rates: dict[str, Any],
+    default: float = 0.0,
+    others: Mapping[str, optax.GradientTransformation] = MappingProxyType({}),
+) -> optax.GradientTransformation:
+    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module, or of the modules within it; the
+    others stand still.
+
+    Args:
+        rates: by the names of fields.
+        default: rate of fields that are not named.
+        others: what is done with fields that Adam does not change.
 
     Raises:
         ValueError: from the optimizer's init, where a rate is for a field that the module lacks.
     """
+    transforms = {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()} | dict(others)
 
     def label(params):
-        fields = params._fields if isinstance(params, tuple) else tuple(vars(params))
-        unknown = [name for name in rates if name not in fields]
+        fields = _fields(params)
+        unknown = [name for name in transforms if name not in fields]
         if unknown:
             raise ValueError(f"rates: {type(params).__name__} has no field {unknown[0]!r}; it has {fields}")
 
         def of(path, _):
-            name = getattr(path[0], "name", str(path[0]))
-            return name if name in rates else "rest"
+            names = [getattr(key, "name", str(key)) for key in path]
+            return next((name for name in reversed(names) if name in transforms), "rest")
 
         return jax.tree_util.tree_map_with_path(of, params)
 
-    transforms = {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()}
-    transforms["rest"] = optax.adam(default) if default else optax.set_to_zero()
-    return optax.multi_transform(transforms, label)
+    rest = optax.adam(default) if default else optax.set_to_zero()
+    return optax.multi_transform(transforms | {"rest": rest}, label)
+
+
+def _fields(module: Any) -> tuple[str, ...]:
+    """Names of the fields of a module, and of the modules within it."""
+    if not isinstance(module, eqx.Module):
+        return getattr(module, "_fields", ())
+    return tuple(name for field, value in vars(module).items() for name in (field, *_fields(value)))

@@ -47,6 +47,7 @@ def render(
     backgrounds: Float[Array, "c 3"] | None = None,
     roi: Bool[Array, "c height width"] | None = None,
     visibility: Float[Array, "c n"] | None = None,
+    means2d_offset: Float[Array, "c n 2"] | None = None,
 ) -> Rendered:
     """Colour, expected depth and alpha of a scene in C cameras, differentiable in all of them.
 
@@ -55,7 +56,7 @@ def render(
         cameras: C cameras, viewmat [C,4,4] and K [C,3,3].
         plan: from `plan_render`; needed under jit.
         features: values composited beside the colours; the scene's own unless given.
-        backgrounds, roi: as for `gsjax.rasterization`.
+        backgrounds, roi, means2d_offset: as for `gsjax.rasterization`.
         visibility: factor on each opacity in each camera, 0 to 1; 1 unless given.
 
     Raises:
@@ -63,14 +64,14 @@ def render(
     """
     features = gaussians.features if features is None else features
     scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, features)
-    per_camera = (cameras.viewmat, cameras.K, backgrounds, roi)
+    per_camera = (cameras.viewmat, cameras.K, backgrounds, roi, means2d_offset)
     if visibility is not None:
         # Opacities that differ from camera to camera make each camera a scene of its own.
         scene = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(visibility), *a.shape)), scene)
         scene = (*scene[:3], scene[3] * visibility, *scene[4:])
         per_camera = jax.tree.map(lambda a: a[:, None], per_camera)
     *scene, features = scene
-    viewmats, Ks, backgrounds, roi = per_camera
+    viewmats, Ks, backgrounds, roi, means2d_offset = per_camera
     images, alphas, meta = rasterization(
         *scene,
         viewmats,
@@ -83,6 +84,7 @@ def render(
         features=features,
         backgrounds=backgrounds,
         roi=roi,
+        means2d_offset=means2d_offset,
     )
     if visibility is not None:
         images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.geometry.cameras import Camera, camera_centers, intrinsics, look_at, project
 from gsjax.methods.reconstruction import (
     Batch,
     FitConfig,
     FitState,
+    Model,
     Observation,
+    RatesConfig,
+    SplitConfig,
     StartConfig,
     View,
     begin,
@@ -21,9 +24,11 @@ from gsjax.methods.reconstruction import (
     fit,
     fit_loss,
 )
-from gsjax.methods.reconstruction.fit import with_degree
+from gsjax.methods.reconstruction.fit import enlarged
+from gsjax.methods.reconstruction.model import exposed, refined
 from gsjax.methods.reconstruction.start import start_points
 from gsjax.optim.densification import is_alive
+from gsjax.rasterize.plan import rung
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 
@@ -92,15 +97,110 @@ def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps
     assert psnr(fitted.state.gaussians, views[0]) > before + 1.5
 
 
-def test_a_resumed_fit_is_equal_to_the_bit(views):
-    problem, state = begin(without_depth(views), QUICK)
+SPLITTING = replace(
+    QUICK,
+    steps=45,
+    strategy="split",
+    cap=9000,
+    sh_degree=0,
+    coarse_until=0.0,
+    start=StartConfig(count=3000),
+    split=SplitConfig(every=10, begin=30, end=1.0, pull=-1.0, reset_every=35),
+    exposure=True,
+    refine_poses=True,
+)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(QUICK, id="relocate"),
+        pytest.param(SPLITTING, id="split, exposure, poses", marks=pytest.mark.slow),
+    ],
+)
+def test_a_resumed_fit_is_equal_to_the_bit(views, config):
+    problem, state = begin(without_depth(views), config)
     for fitted in fit(problem, state):
         if fitted.state.step == 37:
-            halfway = copied(fitted.state)  # before the degree changes at 40
-    problem, _ = begin(without_depth(views), QUICK)
-    arrays = jax.tree.map(jnp.asarray, (halfway.gaussians, halfway.optimizer))
+            halfway = copied(fitted.state)  # before the degree changes, or more slots are taken, at 40
+    problem, _ = begin(without_depth(views), config)
+    arrays = jax.tree.map(jnp.asarray, (halfway.model, halfway.optimizer))
     *_, again = fit(problem, FitState(*arrays, halfway.step, halfway.capacity))
     jax.tree.map(np.testing.assert_array_equal, copied(again.state), copied(fitted.state))
+
+
+def test_splitting_takes_more_slots_as_it_needs_them_up_to_the_cap(views):
+    problem, state = begin(without_depth(views), SPLITTING)
+    slots = [state.gaussians.num] + [fitted.state.gaussians.num for fitted in fit(problem, state)]
+    assert sorted(set(slots)) == [rung(4500), rung(6000), 9000]
+    assert slots == sorted(slots)
+
+
+def test_exposure_is_learned_where_photographs_differ_in_it(views):
+    gains = np.linspace(0.6, 1.0, len(views))
+    dimmed = [
+        v._replace(image=np.round(g * v.image).astype(np.uint8)) for g, v in zip(gains, views, strict=True)
+    ]
+    config = replace(QUICK, steps=300, sh_degree=0, coarse_until=0.0, rates=RatesConfig(exposures=3e-3))
+    told = {}
+    for exposure in (False, True):
+        problem, state = begin(dimmed, replace(config, exposure=exposure))
+        *_, fitted = fit(problem, state)
+        told[exposure] = np.mean(
+            [
+                float(np.abs(seen_as(fitted.state.model, v, i) - v.image / 255).mean())
+                for i, v in enumerate(dimmed)
+            ]
+        )
+    assert told[True] < 0.85 * told[False]
+    maps = fitted.state.model.exposures
+    found = np.asarray(1 + (maps - maps.mean(0))[:, np.arange(3), np.arange(3)].mean(-1))
+    assert np.corrcoef(found, gains)[0, 1] > 0.9
+
+
+def seen_as(model: Model, view: View, number: int) -> np.ndarray:
+    drawn = jnp.asarray(picture(model.gaussians, view))[None]
+    return np.asarray(
+        drawn if model.exposures is None else exposed(drawn, model.exposures, jnp.int32(number))
+    )[0]
+
+
+def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
+    random = np.random.default_rng(3)
+    twists = np.concatenate([random.normal(size=(8, 3)) * 0.02, random.normal(size=(8, 3)) * 0.01], axis=1)
+    off = [v._replace(viewmat=moved(v, twists.mean(0) - twists, i, 3.3)) for i, v in enumerate(views)]
+    config = replace(QUICK, steps=250, sh_degree=0, coarse_until=0.0, refine_poses=True)
+    problem, state = begin(off, replace(config, rates=RatesConfig(twists=2e-3)))
+    *_, fitted = fit(problem, state)
+    found = [
+        v._replace(viewmat=moved(v, fitted.state.model.twists, i, problem.extent.radius))
+        for i, v in enumerate(off)
+    ]
+
+    def pixels_off(others):
+        points = random.uniform(-0.6, 0.6, (50, 3))
+        seen = [
+            [project(points, v.viewmat, v.K)[0] for v in pair] for pair in zip(others, views, strict=True)
+        ]
+        return np.mean([np.abs(a - b).mean() for a, b in seen])
+
+    # Turns and shifts of a camera look much alike; where the scene is seen is what can be known.
+    assert pixels_off(found) < 0.4 * pixels_off(off)
+
+
+def moved(view: View, twists, number: int, radius: float) -> np.ndarray:
+    viewmat, twists = jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(twists, jnp.float32)
+    return np.asarray(refined(viewmat, twists, jnp.int32(number), radius)[0])
+
+
+def test_a_turned_camera_stays_where_it_is_and_twists_of_all_move_none(views):
+    viewmats = jnp.asarray(np.stack([v.viewmat for v in views[:2]]))
+    twists = jnp.array([[0.1, -0.2, 0.3, 0, 0, 0], [-0.1, 0.2, -0.3, 0, 0, 0.0]])
+    turned = refined(viewmats, twists, jnp.int32(0), 2.0)
+    np.testing.assert_allclose(camera_centers(turned), camera_centers(viewmats), atol=1e-6)
+    assert float(jnp.abs(turned - viewmats).max()) > 0.05
+    alike = jnp.broadcast_to(twists[:1], (2, 6))
+    np.testing.assert_allclose(refined(viewmats, alike, jnp.int32(1), 2.0), viewmats, atol=1e-6)
 
 
 def test_slots_fill_up_to_the_cap_and_no_further(views):
@@ -127,9 +227,9 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
     loss = fit_loss(replace(QUICK, growth=replace(QUICK.growth, opacity_cost=0.0, scale_cost=0.0)), 1.0)
 
     def of(image):
-        seen = Observation(jnp.asarray(image)[None], jnp.asarray(mask)[None], None, camera)
+        seen = Observation(jnp.asarray(image)[None], jnp.asarray(mask)[None], None, camera, jnp.int32(0))
         batch = Batch(seen, jnp.zeros((1, 3)), plan)
-        return jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0])(state.gaussians)
+        return jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0])(state.model)
 
     garbled = view.image.copy()
     garbled[:, WIDTH // 2 + 12 :] = (
@@ -141,24 +241,27 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other_slope, slope)
 
 
-def test_a_higher_degree_draws_the_same_and_keeps_what_adam_knows(views):
+def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(views):
     problem, state = begin(views, QUICK)
     *_, fitted = fit(problem, state, steps=lambda i: 3)
-    gaussians, optimizer = fitted.state.gaussians, fitted.state.optimizer
-    wider, known = with_degree(problem, gaussians, optimizer, 2)
-    assert wider.sh_degree == 2
-    np.testing.assert_allclose(picture(wider, views[0]), picture(gaussians, views[0]), atol=1e-6)
+    model, optimizer = fitted.state.model, fitted.state.optimizer
+    wider, known = enlarged(problem, model, optimizer, 2, QUICK.cap + 30)
+    assert wider.gaussians.sh_degree == 2
+    assert wider.gaussians.num == QUICK.cap + 30
+    np.testing.assert_allclose(
+        picture(wider.gaussians, views[0]), picture(model.gaussians, views[0]), atol=1e-6
+    )
     before = {jax.tree_util.keystr(p): leaf for p, leaf in jax.tree_util.tree_leaves_with_path(optimizer)}
     after = {jax.tree_util.keystr(p): leaf for p, leaf in jax.tree_util.tree_leaves_with_path(known)}
     assert before.keys() < after.keys()
     for path, leaf in before.items():
-        np.testing.assert_array_equal(after[path], leaf)
-    assert with_degree(problem, wider, known, 1)[0] is wider  # never back
+        np.testing.assert_array_equal(after[path][tuple(slice(0, size) for size in leaf.shape)], leaf)
+    assert enlarged(problem, wider, known, 1, 10)[0] is wider  # never back
 
 
 def test_poison_in_a_photograph_cannot_be_and_in_a_gaussian_skips_the_step(views):
     problem, state = begin(views, QUICK)
-    sick = eqx.tree_at(lambda s: s.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
+    sick = eqx.tree_at(lambda s: s.model.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
     (fitted, *_) = fit(problem, sick, steps=lambda i: 1)
     assert bool(fitted.info["skipped"])
     assert np.isfinite(np.asarray(fitted.state.gaussians.means)).all()

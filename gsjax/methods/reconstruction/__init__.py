@@ -5,11 +5,13 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     for fitted in fit(problem, state): ...
 
 config.py  what can be set            start.py  the first Gaussians
-step.py    the loss, and one step     fit.py    the loop on the host
+model.py   what a fit may change      step.py   the loss, and one step
+fit.py     the loop on the host
 """
 
-from gsjax.methods.reconstruction.config import FitConfig, GrowthConfig, RatesConfig, StartConfig
+from gsjax.methods.reconstruction.config import FitConfig, GrowthConfig, RatesConfig, SplitConfig, StartConfig
 from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, begin, fit
+from gsjax.methods.reconstruction.model import Model
 from gsjax.methods.reconstruction.start import Extent, View, extent_of
 from gsjax.methods.reconstruction.step import Batch, Observation, fit_loss, grow, reconstruction_step
 
@@ -20,9 +22,11 @@ __all__ = [
     "FitState",
     "Fitted",
     "GrowthConfig",
+    "Model",
     "Observation",
     "Problem",
     "RatesConfig",
+    "SplitConfig",
     "StartConfig",
     "View",
     "begin",

@@ -27,6 +27,10 @@ class RatesConfig:
     logit_opacities: float = 5e-2
     sh0: float = 2.5e-3
     shN: float = 1.25e-4
+    exposures: float = 1e-3
+    """Of each photograph's map of colours, where exposure is learned."""
+    twists: float = 2e-4
+    """Of the cameras' turns, radians, and shifts, radii of the scene; it falls to a hundredth by the end."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,26 @@ class GrowthConfig:
 
 
 @dataclass(frozen=True)
+class SplitConfig:
+    """Cloning, splitting and pruning (adaptive density control of 3DGS)."""
+
+    every: int = 100
+    """Steps between them."""
+    begin: int = 500
+    """The first of them."""
+    end: float = 0.5
+    """Share of all steps after which nothing is cloned or split."""
+    pull: float = 2e-4
+    """Mean gradient of a projected mean, by half a picture, above which there are too few Gaussians."""
+    large: float = 0.01
+    """Scale above which one is split and not cloned, in radii of the scene."""
+    too_large: float = 0.1
+    """Scale above which one is pruned."""
+    reset_every: int = 3_000
+    """Steps after which all opacities are lowered to 0.01: what is not needed stays there."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """How a scene is fitted."""
 
@@ -57,6 +81,9 @@ class FitConfig:
     """How many photographs are looked at, one a step."""
     cap: int = 60_000
     """How many Gaussians there may be."""
+    strategy: Literal["relocate", "split"] = "relocate"
+    """Where more Gaussians come from: those that became transparent move to where opacity is (3DGS-MCMC), or
+    those whose projections are pulled hard are cloned and split (3DGS)."""
     sh_degree: int = 1
     """The highest degree of the spherical harmonics, 0 to 3: how colour depends on the direction."""
     sh_every: int = 1_500
@@ -71,10 +98,15 @@ class FitConfig:
     """Draw with Mip-Splatting's compensation, for views from other distances."""
     background: Literal["data", "black", "white", "random"] = "data"
     """Colour behind the scene; data: what the photographs were composited on, else black."""
+    exposure: bool = False
+    """Learn an affine map of colours for each photograph, where exposure or white balance differ."""
+    refine_poses: bool = False
+    """Learn how far each camera stands from where the data says."""
     seed: int = 0
     start: StartConfig = field(default_factory=StartConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
 
     def __post_init__(self):
         positive = ("steps", "cap", "sh_every")

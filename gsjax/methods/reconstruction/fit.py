@@ -1,7 +1,7 @@
 """The host loop of a fit: which photograph is next, at what size, with which capacity."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -13,12 +13,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.methods.reconstruction.config import FitConfig
+from gsjax.methods.reconstruction.model import Model, carried_over, model_of, with_degree, with_slots
 from gsjax.methods.reconstruction.start import Extent, View, extent_of, in_slots, start_points
-from gsjax.methods.reconstruction.step import Batch, Observation, grow, reconstruction_step
+from gsjax.methods.reconstruction.step import (
+    Batch,
+    Observation,
+    grow,
+    reconstruction_step,
+    slots_wanted,
+    split,
+)
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
@@ -48,16 +55,21 @@ class FitState(eqx.Module):
     """What a fit goes on from, to the same bits.
 
     Attributes:
-        gaussians: of all slots; those that are not alive are empty.
-        optimizer: state of Adam.
+        model: what is fitted. Of the Gaussians' slots, those that are not alive are empty.
+        optimizer: what the step carries along.
         step: how many steps were made.
         capacity: of the plan for each size of photographs, a row (shrink, width, height, capacity) each.
     """
 
-    gaussians: Gaussians
+    model: Model
     optimizer: Any
     step: int
     capacity: Int[np.ndarray, "sizes 4"]
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Of all slots."""
+        return self.model.gaussians
 
 
 class Fitted(NamedTuple):
@@ -99,12 +111,14 @@ def begin(
         raise ValueError("views: expected at least one photograph to fit, found none")
     extent = extent_of(np.stack([view.viewmat for view in views]))
     points, colors, source = start_points(views, cloud, config.start, config.seed)
-    gaussians = in_slots(points, colors, config.cap, config.start.opacity, config.seed)
+    slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
+    gaussians = in_slots(points, colors, slots, config.start.opacity, config.seed)
     behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
     behind["data"] = background or behind["black"]
     problem = Problem(views, config, extent, behind[config.background], source)
-    state = reconstruction_step(config, extent.radius).init(gaussians)
-    return problem, FitState(gaussians, state, 0, np.zeros((0, 4), int))
+    model = model_of(gaussians, config, len(views))
+    state = reconstruction_step(config, extent.radius).init(model)
+    return problem, FitState(model, state, 0, np.zeros((0, 4), int))
 
 
 def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None = None) -> Iterator[Fitted]:
@@ -120,31 +134,31 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
     config, views = problem.config, problem.views
     key = jax.random.key(config.seed)
     plans = {tuple(row[:3].tolist()): int(row[3]) for row in state.capacity}
-    advance, regrow = _compiled(config, problem.extent.radius)
+    advance, densify = _compiled(config, problem.extent.radius)
     seen: dict[tuple[int, int], Observation] = {}
-    gaussians, optimizer = state.gaussians, state.optimizer
+    model, optimizer = state.model, state.optimizer
     compiled: set[Any] = set()
     i = state.step
     while i < (total := config.steps if steps is None else steps(i)):
         share = i / total
         degree = min(config.sh_degree, i // config.sh_every)
-        gaussians, optimizer = with_degree(problem, gaussians, optimizer, degree)
+        model, optimizer = enlarged(problem, model, optimizer, degree, 0)
         v, shrink = _turn(config.seed, i, len(views)), _shrink(config, share)
         if (v, shrink) not in seen:
-            seen[v, shrink] = _observe(views[v], shrink)
+            seen[v, shrink] = _observe(views[v], v, shrink)
         observed = seen[v, shrink]
         size = (shrink, observed.camera.width, observed.camera.height)
         begun, compiling = perf_counter(), 0.0
         while True:
             if size not in plans:
-                plans[size] = _plan(problem, gaussians, observed.camera, 0).capacity
-            plan = _plan(problem, gaussians, observed.camera, plans[size])
+                plans[size] = _plan(problem, model.gaussians, observed.camera, 0).capacity
+            plan = _plan(problem, model.gaussians, observed.camera, plans[size])
             batch = Batch(observed, _background(problem, key, i), plan)
-            new = (plan, gaussians.sh_degree)
+            new = (plan, model.gaussians.num)
             if new not in compiled:  # the first call of a program is not the time of a step
                 started = perf_counter()
             walk = jax.random.fold_in(jax.random.fold_in(key, _WALK), i)
-            gaussians, optimizer, info = advance(gaussians, optimizer, batch, share, walk)
+            model, optimizer, info = advance(model, optimizer, batch, share, walk)
             overflow = bool(info["overflow"])
             if new not in compiled:
                 compiling += perf_counter() - started
@@ -152,28 +166,36 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
             if not overflow:
                 break
             plans[size] = plan.grown(int(info["needed"]), _HEADROOM).capacity
-        if _grows(config, i, share):
+        if _densifies(config, i, share):
             turn = jax.random.fold_in(jax.random.fold_in(key, _GROWTH), i)
-            gaussians, optimizer = regrow(gaussians, optimizer, turn, config.cap)
+            if config.strategy == "split":
+                room = min(config.cap, rung(int(slots_wanted(model, optimizer, config))))
+                model, optimizer = enlarged(problem, model, optimizer, 0, room)
+            model, optimizer = densify(model, optimizer, turn, i)
         i += 1
         capacity = np.array([[*of, room] for of, room in plans.items()], int)
-        now = FitState(gaussians, optimizer, i, capacity)
+        now = FitState(model, optimizer, i, capacity)
         yield Fitted(now, info, perf_counter() - begun - compiling, compiling, shrink)
 
 
+@lru_cache(maxsize=2)
 def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
-    """The jitted step and growth; buffers that they replace are given away."""
+    """The jitted step and what makes more Gaussians; buffers that they replace are given away."""
     step, options = reconstruction_step(config, radius), host_options()
 
     @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
-    def advance(gaussians, optimizer, batch, share, key):
-        return step.update(gaussians, optimizer, batch, step=share, key=key)
+    def advance(model, optimizer, batch, share, key):
+        return step.update(model, optimizer, batch, step=share, key=key)
 
     @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
-    def regrow(gaussians, optimizer, key, cap):
-        return grow(gaussians, optimizer, key, cap, config.growth.factor)
+    def densify(model, optimizer, key, i):
+        if config.strategy == "relocate":
+            return grow(model, optimizer, key, config.cap, config.growth.factor)
+        every, between = config.split.reset_every, config.split.every
+        reset = i // every > jnp.maximum(i - between, 0) // every
+        return split(model, optimizer, key, config, radius, reset)
 
-    return advance, regrow
+    return advance, densify
 
 
 def _turn(seed: int, step: int, count: int) -> int:
@@ -189,12 +211,12 @@ def _shrink(config: FitConfig, share: float) -> int:
     return 4 if share < config.coarse_until / 3 else 2
 
 
-def _grows(config: FitConfig, step: int, share: float) -> bool:
-    growth = config.growth
-    return step >= growth.begin and step % growth.every == 0 and share < growth.end
+def _densifies(config: FitConfig, step: int, share: float) -> bool:
+    when = config.growth if config.strategy == "relocate" else config.split
+    return step >= when.begin and step % when.every == 0 and share < when.end
 
 
-def _observe(view: View, shrink: int) -> Observation:
+def _observe(view: View, number: int, shrink: int) -> Observation:
     """A view on the device, in a picture of another size."""
     image, mask, depth = view.image, view.mask, view.depth
     height, width = (max(1, side // shrink) for side in image.shape[:2])
@@ -208,7 +230,8 @@ def _observe(view: View, shrink: int) -> Observation:
     viewmat, K = (jnp.asarray(a, dtype)[None] for a in (view.viewmat, factors[:, None] * view.K))
     known = None if depth is None else jnp.asarray(depth, dtype)[None]
     counts = None if mask is None or mask.all() else jnp.asarray(mask)[None]
-    return Observation(jnp.asarray(image)[None], counts, known, Camera(viewmat, K, width, height))
+    camera = Camera(viewmat, K, width, height)
+    return Observation(jnp.asarray(image)[None], counts, known, camera, jnp.asarray(number, jnp.int32))
 
 
 def _plan(problem: Problem, gaussians: Gaussians, cameras: Camera, capacity: int) -> Plan:
@@ -226,23 +249,10 @@ def _background(problem: Problem, key: Array, step: int) -> Float[Array, "1 3"]:
     return jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, _RANDOM_BACKGROUND), step), (1, 3))
 
 
-def with_degree(problem: Problem, gaussians: Gaussians, optimizer: Any, degree: int) -> tuple[Gaussians, Any]:
-    """With the coefficients of a degree, of zero where they are new; what Adam knows of others is kept."""
-    missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
-    if missing <= 0:
-        return gaussians, optimizer
-    zeros = jnp.zeros((gaussians.num, missing, 3), gaussians.sh0.dtype)
-    shN = zeros if gaussians.shN is None else jnp.concatenate([gaussians.shN, zeros], axis=1)
-    wider = eqx.tree_at(lambda g: g.shN, gaussians, shN, is_leaf=lambda leaf: leaf is None)
-    begun = reconstruction_step(problem.config, problem.extent.radius).init(wider)
-    known = {
-        jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(optimizer)
-    }
-
-    def kept(path, leaf):
-        old = known.get(jax.tree_util.keystr(path))
-        if old is None:
-            return leaf
-        return old if old.shape == leaf.shape else leaf.at[:, : old.shape[1]].set(old)
-
-    return wider, jax.tree_util.tree_map_with_path(kept, begun)
+def enlarged(problem: Problem, model: Model, optimizer: Any, degree: int, slots: int) -> tuple[Model, Any]:
+    """With the coefficients of a degree, and with so many slots; what the optimizer knew is kept."""
+    larger = with_slots(with_degree(model, degree), slots)
+    if larger is model:
+        return model, optimizer
+    fresh = reconstruction_step(problem.config, problem.extent.radius).init(larger)
+    return larger, carried_over(optimizer, fresh)

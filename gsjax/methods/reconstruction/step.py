@@ -1,4 +1,6 @@
-"""One step of the fit: draw a view, compare, descend, and let what is transparent walk (3DGS-MCMC)."""
+"""One step of the fit: draw a view, compare, descend. From time to time Gaussians go where they are needed,
+as in 3DGS-MCMC (relocation and noise) or as in 3DGS (cloning, splitting, pruning).
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,18 +8,21 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.reconstruction.config import FitConfig
+from gsjax.methods.reconstruction.model import Model, exposed, refined
 from gsjax.optim.densification import exploration, forgotten, is_alive, relocate
+from gsjax.optim.splitting import Pull, divide, wanted, watch_pull, with_low_opacities
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
-_FINAL_RATE = 0.01  # of the means, over the first
+_FINAL_RATE = 0.01  # of means and twists, over the first
 
 
 class Observation(NamedTuple):
@@ -28,12 +33,14 @@ class Observation(NamedTuple):
         mask: which pixels count; None where all do.
         depth: 0 where unknown; None without depth.
         camera: one camera, viewmat [1,4,4] and K [1,3,3].
+        view: which photograph it is.
     """
 
     image: UInt8[Array, "1 height width 3"]
     mask: Bool[Array, "1 height width"] | None
     depth: Float[Array, "1 height width"] | None
     camera: Camera
+    view: Int[Array, ""]
 
 
 class Batch(NamedTuple):
@@ -45,14 +52,23 @@ class Batch(NamedTuple):
 
 
 def fit_loss(config: FitConfig, radius: float) -> Callable:
-    """`loss(gaussians, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and what opacity and
-    size cost (3DGS-MCMC, eq. 10), of one photograph."""
+    """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and under relocation what
+    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph."""
 
-    def loss(gaussians: Gaussians, batch: Batch, *, step: Any, key: Any):
+    def loss(model: Model, batch: Batch, *, step: Any, key: Any):
         seen, background, plan = batch
-        drawn = render(gaussians, seen.camera, plan, backgrounds=background)
-        target = seen.image.astype(drawn.colors.dtype) / 255
+        gaussians, camera = model.gaussians, seen.camera
+        if model.twists is not None:
+            viewmat = refined(camera.viewmat, model.twists, seen.view, radius)
+            camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
+        nudges = model.nudges
+        if nudges is not None:  # by half a picture, so that one threshold serves pictures of any size
+            nudges = nudges * jnp.array([camera.width / 2, camera.height / 2], nudges.dtype)
+        drawn = render(gaussians, camera, plan, backgrounds=background, means2d_offset=nudges)
         image = drawn.colors
+        if model.exposures is not None:
+            image = exposed(image, model.exposures, seen.view)
+        target = seen.image.astype(image.dtype) / 255
         if seen.mask is not None:  # what does not count is as it was photographed: no slope, no edge
             image = jnp.where(seen.mask[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
@@ -64,9 +80,10 @@ def fit_loss(config: FitConfig, radius: float) -> Callable:
                 known &= seen.mask
             off = weighted_mean(jnp.abs(drawn.depths - seen.depth), known.astype(value.dtype))
             value += config.depth_weight * off / radius
-        alive = jax.lax.stop_gradient(is_alive(gaussians).astype(value.dtype))
-        value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
-        value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / radius
+        if config.strategy == "relocate":
+            alive = jax.lax.stop_gradient(is_alive(gaussians).astype(value.dtype))
+            value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
+            value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / radius
         return value, {
             "psnr": -10 * jnp.log10(mse),
             "overflow": drawn.meta.overflow.any(),
@@ -77,7 +94,7 @@ def fit_loss(config: FitConfig, radius: float) -> Callable:
 
 
 def reconstruction_step(config: FitConfig, radius: float) -> Step:
-    """Adam on Gaussians, and the walk of 3DGS-MCMC.
+    """Adam on a `Model`, and under relocation the walk of 3DGS-MCMC.
 
     `batch` is a `Batch`, `step` the share of the fit that is done, 0 to 1, and `key` is needed. `info` has
     `alive` beside what the loss says.
@@ -89,30 +106,102 @@ def reconstruction_step(config: FitConfig, radius: float) -> Step:
     rates = vars(config.rates)
     loss = fit_loss(config, radius)
 
-    def of(gaussians: Gaussians) -> Step:
-        there = [name for name in rates if getattr(gaussians, name) is not None]
-        # Means go as far as Adam's rate of 1 says, and then only a share of it, which falls with time.
-        return gradient_step(loss, per_field_adam({name: rates[name] for name in there} | {"means": 1.0}))
+    def of(model: Model) -> Step:
+        there = [name for name in rates if getattr(model.gaussians, name, None) is not None]
+        there += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
+        # Means and twists go as far as Adam's rate of 1 says, and then only a share of it, which falls.
+        ours = {name: 1.0 if name in ("means", "twists") else rates[name] for name in there}
+        return gradient_step(
+            loss, per_field_adam(ours, others={} if model.nudges is None else {"nudges": watch_pull()})
+        )
 
-    def update(params: Gaussians, state, batch: Batch, *, step, key: PRNGKeyArray):
+    def update(params: Model, state, batch: Batch, *, step, key: PRNGKeyArray):
         moved, new_state, info = of(params).update(params, state, batch, step=step, key=key)
-        rate = rates["means"] * radius * _FINAL_RATE**step
-        walk = exploration(moved, key, config.growth.noise * rate)
-        walk = jnp.where(is_alive(moved)[:, None] & ~info["skipped"], walk, 0.0)
-        means = params.means + rate * (moved.means - params.means) + walk
-        moved = eqx.tree_at(lambda g: g.means, moved, means)
+        fall = _FINAL_RATE**step
+        rate = rates["means"] * radius * fall
+        before, after = params.gaussians, moved.gaussians
+        means = before.means + rate * (after.means - before.means)
+        if config.strategy == "relocate":
+            walk = exploration(after, key, config.growth.noise * rate)
+            means += jnp.where(is_alive(after)[:, None] & ~info["skipped"], walk, 0.0)
+        moved = eqx.tree_at(lambda m: m.gaussians.means, moved, means)
+        if moved.twists is not None:
+            twists = params.twists + rates["twists"] * fall * (moved.twists - params.twists)
+            moved = eqx.tree_at(lambda m: m.twists, moved, twists)
         sound = all_finite(moved)
         params, state = keep_if(sound, (moved, new_state), (params, state))
-        return params, state, info | {"alive": is_alive(params).sum(), "skipped": info["skipped"] | ~sound}
+        alive = is_alive(params.gaussians).sum()
+        return params, state, info | {"alive": alive, "skipped": info["skipped"] | ~sound}
 
     return Step(lambda params: of(params).init(params), update)
 
 
 def grow(
-    gaussians: Gaussians, state: Any, key: PRNGKeyArray, cap: Int[Array, ""] | int, factor: float
-) -> tuple[Gaussians, Any]:
+    model: Model, state: Any, key: PRNGKeyArray, cap: Int[Array, ""] | int, factor: float
+) -> tuple[Model, Any]:
     """Dead Gaussians move to where more are needed, and there may be `factor` times as many, up to `cap`."""
+    gaussians = model.gaussians
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
     slots = jnp.clip((used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
-    return moved, forgotten(state, touched)
+    state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
+    return eqx.tree_at(lambda m: m.gaussians, model, moved), state
+
+
+def slots_wanted(model: Model, state: Any, config: FitConfig) -> Int[Array, ""]:
+    """How many slots `split` would fill if there were enough."""
+    asks = wanted(model.gaussians, _pull_of(state), config.split.pull)
+    return is_alive(model.gaussians).sum() + asks.sum()
+
+
+def split(
+    model: Model,
+    state: Any,
+    key: PRNGKeyArray,
+    config: FitConfig,
+    radius: float,
+    reset: Bool[Array, ""] | bool,
+) -> tuple[Model, Any]:
+    """Gaussians that are pulled hard are cloned or split, others pruned, and what was known of pulls is
+    forgotten; with `reset`, opacities are lowered."""
+    options, pull = config.split, _pull_of(state)
+    moved, touched = divide(
+        model.gaussians,
+        pull,
+        key,
+        config.cap,
+        threshold=options.pull,
+        large=options.large * radius,
+        too_large=options.too_large * radius,
+    )
+    moved = keep_if(jnp.asarray(reset), with_low_opacities(moved), moved)
+    every = jnp.full_like(touched, True)
+    state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
+    state = _map_nodes(Gaussians, lambda known: _forget_opacities(known, every & reset), state)
+    state = _map_nodes(Pull, lambda known: forgotten(known, every), state)
+    return eqx.tree_at(lambda m: m.gaussians, model, moved), state
+
+
+def _map_nodes(kind: type, function: Callable, tree: Any) -> Any:
+    """`function` of all nodes of a kind; everything else as it was."""
+
+    def is_it(node):
+        return isinstance(node, kind)
+
+    return jax.tree.map(lambda node: function(node) if is_it(node) else node, tree, is_leaf=is_it)
+
+
+def _forget_opacities(known: Gaussians, rows: Bool[Array, "n"]) -> Gaussians:
+    return eqx.tree_at(
+        lambda g: g.logit_opacities, known, forgotten(known.logit_opacities, rows), is_leaf=_is_masked
+    )
+
+
+def _is_masked(node: Any) -> bool:
+    """Whether it stands for a field that another part of the optimizer looks after."""
+    return isinstance(node, optax.MaskedNode)
+
+
+def _pull_of(state: Any) -> Pull:
+    leaves = jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, Pull))
+    return next(leaf for leaf in leaves if isinstance(leaf, Pull))
