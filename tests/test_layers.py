@@ -15,7 +15,7 @@ BESIDE = {
     "metrics": {"geometry"},
     "data": {"geometry", "scene", "io"},
     "io": {"scene"},
-    "viz": {"scene"},
+    "viz": {"geometry", "scene"},
 }
 ALLOWED = {layer: set(STACK[:i]) for i, layer in enumerate(STACK)} | BESIDE
 ALLOWED["cli"] = {*STACK, *BESIDE}

@@ -15,14 +15,19 @@ COMMANDS = {
     "track": ("gsjax.cli.track", "follow the objects of a recording, and report on it"),
     "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
     "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs, and report on it"),
+    "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),
+    "compare": ("gsjax.cli.compare", "set runs side by side: scores, curves, pictures, settings"),
+    "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for gsjax fit"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
+    "view": ("gsjax.cli.view", "look at a run or a PLY file in a browser"),
     "query": ("gsjax.cli.query", "find the object of a run that a text means, and show it over time"),
     "grasp": ("gsjax.cli.grasp", "find the best grasp of the object that a text means, in every frame"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
 """Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
-which returns the exit code, and perhaps `options_for(arguments)`, where defaults depend on what is given."""
+which returns the exit code, perhaps `HELP`, more to say of it, and perhaps `options_for(arguments)`: the
+options where defaults depend on what is given, and the arguments that are left to parse."""
 
 
 def entry() -> None:

@@ -1,7 +1,7 @@
 """`gsjax fit`: a static scene from posed photographs."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -13,6 +13,7 @@ from jaxtyping import Int
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 
+from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import undisturbed
@@ -20,15 +21,23 @@ from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.tensorboard import TensorBoard
 from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import write_ply
-from gsjax.methods.reconstruction import FitConfig, Problem, View, begin, fit
+from gsjax.methods.reconstruction import PRESETS, FitConfig, Problem, View, begin, fit, light_of
+from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _MEASURED = 50  # steps whose time says how many are left in a budget
+
+HELP = (
+    " Settings have names, to be said before the dataset, as in `gsjax fit quick DATASET --out RUN`: quick "
+    "(a first look), classic (cloning and splitting, as in 3DGS), depth (for RGB-D), published (those of "
+    "3DGS-MCMC, for a GPU or a night). What else is given counts more."
+)
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,8 @@ class Options:
     """Stop when held-out photographs are seen with so many dB."""
     judge_every: int = 500
     """Steps between looks at held-out photographs."""
+    tensorboard: bool = False
+    """Write the curve for TensorBoard too, into RUN/tensorboard."""
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
     overwrite: bool = False
@@ -59,6 +70,15 @@ class Options:
     """What the layout of the data leaves open."""
     fit: FitConfig = field(default_factory=FitConfig)
     """How the scene is fitted."""
+
+
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
+    """The options where the first word is that of a preset: how the scene is fitted is then that preset's
+    unless given."""
+    if not arguments or arguments[0] not in PRESETS:
+        return Options, arguments
+    fitted = ("fit", FitConfig, field(default=PRESETS[arguments[0]]))
+    return make_dataclass("Options", [fitted], bases=(Options,), frozen=True), arguments[1:]
 
 
 def run(options: Options) -> int:
@@ -74,7 +94,7 @@ def run(options: Options) -> int:
         chosen, held_out = split(photographs, options.test_every)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         if options.resume:
-            folder.check_config(options, but=("resume", "overwrite", "debug", "out"))
+            folder.check_config(options, but=("resume", "overwrite", "debug", "out", "tensorboard"))
         folder.write_config(options)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
@@ -84,16 +104,17 @@ def run(options: Options) -> int:
         if options.resume:
             state, curve = load(folder.resume, problem, state)
             notes.add(f"Resumed after {state.step} steps of an earlier run.")
+        board = TensorBoard(folder.path, curve.rows) if options.tensorboard else None
         judged = [(photographs.names[i], views[i]) for i in held_out]
-        state, stopped = follow(options, problem, state, curve, judged, folder, console)
-        gaussians, removed = living(state.gaussians)
-        if removed:
-            notes.add(f"{removed} slots held no Gaussian at the end.")
+        state, stopped = follow(options, problem, state, curve, judged, folder, console, board)
+        gaussians, finished = living(state.gaussians)[0], stopped is None
+        if finished:  # who pressed Ctrl-C does not wait for these
+            gaussians = without_needless(problem, gaussians, notes)
+            write_orbit(folder, problem, gaussians)
         write_ply(folder.scene, gaussians)
         scores = judge(
             problem, gaussians, judged or [(photographs.names[i], views[i]) for i in chosen[:1]], folder
         )
-        finished = stopped is None
         found = {
             "kind": "fit",
             "dataset": photographs.name,
@@ -117,6 +138,8 @@ def run(options: Options) -> int:
             "curve": curve.rows,
             "notes": notes.all,
         }
+        if board is not None:
+            board.close({f"held_out/{row['view']}": folder.path / row["picture"] for row in scores.rows})
         folder.write_metrics(found)
         write_results(folder, found, curve)
         if finished:
@@ -182,6 +205,19 @@ def read_views(photographs: Photographs, console: Console) -> list[View]:
             raise
 
 
+def without_needless(problem: Problem, gaussians: Gaussians, notes: Notes) -> Gaussians:
+    """Those that some photograph needs."""
+    config = problem.config
+    if not config.prune or not gaussians.num:
+        return gaussians
+    mode = "antialiased" if config.antialiased else "classic"
+    needed = light_of(gaussians, problem.views, mode) >= config.prune
+    if not needed.all():
+        some = f"{(~needed).sum():,} of {gaussians.num:,} Gaussians"
+        notes.add(f"{some} sent less than {config.prune:g} pixels of light into every photograph: left out.")
+    return take(gaussians, needed)
+
+
 class Budget:
     """How many steps there will be: those of the config, or as many as fit into so many minutes."""
 
@@ -208,6 +244,7 @@ def follow(
     judged: list[tuple[str, View]],
     folder: RunFolder,
     console: Console,
+    board: TensorBoard | None = None,
 ) -> tuple[Any, BaseException | None]:
     """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
     state, and what stopped it early."""
@@ -242,6 +279,8 @@ def follow(
                         judge(problem, fitted.state.gaussians, some).mean()["psnr"] if look and some else None
                     )
                     curve.add(fitted, psnr, folder)
+                    if board is not None:
+                        board.add(curve.rows[-1])
                     if options.until_psnr is not None and psnr is not None and psnr >= options.until_psnr:
                         break
                 saver(state, curve, last=False)

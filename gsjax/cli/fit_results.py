@@ -2,15 +2,17 @@
 
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table as Grid
 
+from gsjax.cli.fit_orbit import NAME as ORBIT
 from gsjax.cli.machine import in_words
+from gsjax.cli.outputs import write_png
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
 from gsjax.geometry.cameras import Camera
@@ -18,6 +20,7 @@ from gsjax.io.atomic import atomic_write
 from gsjax.methods.reconstruction import Fitted, Problem, View
 from gsjax.metrics.image import depth_error, psnr, ssim
 from gsjax.optim.densification import is_alive
+from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians, cull_invalid, take
 from gsjax.scene.render import plan_render, render
 from gsjax.viz.colors import side_by_side
@@ -25,6 +28,9 @@ from gsjax.viz.plots import fit_curve, save
 
 _SHOWN = 8  # views in the report
 _LEAST_SIDE = 11  # of SSIM's window
+_PANEL_HEIGHT = 240  # pixels, at least, so that captions hide little
+PANELS = ("photograph", "rendered", "difference")
+"""What a picture of a view shows, from left to right."""
 
 
 @dataclass
@@ -116,54 +122,93 @@ def judge(
     """Draw views and compare them with their photographs; with a folder, write them side by side there."""
     rows, plans = [], {}
     for name, view in views:
-        height, width = view.image.shape[:2]
-        camera = Camera(
-            jnp.asarray(view.viewmat, jnp.float32)[None],
-            jnp.asarray(view.K, jnp.float32)[None],
-            width,
-            height,
+        size = view.image.shape
+        seen, plans[size] = look(
+            gaussians, view, problem.background, problem.config.antialiased, plans.get(size)
         )
-        drawn, plans[width, height] = _drawn(problem, gaussians, camera, plans.get((width, height)))
-        image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), view.image / 255
-        if view.mask is not None:
-            image = np.where(view.mask[..., None], image, truth)
-        row: dict[str, Any] = {
-            "view": name,
-            "psnr": psnr(image, truth, view.mask),
-            "ssim": None,
-            "depth_mm": None,
-        }
+        row: dict[str, Any] = {"view": name, "psnr": seen.psnr(), "ssim": None, "depth_mm": None}
         if folder is not None:
-            if min(width, height) >= _LEAST_SIDE:
-                row["ssim"] = ssim(image, truth, view.mask)
-            if view.depth is not None:
-                covered = np.asarray(drawn.alphas[0]) > 0.5
-                row["depth_mm"] = depth_error(np.asarray(drawn.depths[0]), view.depth, covered).mean_abs_mm
-            row["picture"] = _write_picture(folder, len(rows), image, truth)
+            row |= {"ssim": seen.ssim(), "depth_mm": seen.depth_mm()}
+            path = folder.render("held_out", len(rows))
+            write_panel(path, seen)
+            row["picture"] = str(path.relative_to(folder.path))
         rows.append(row)
     return Scores(rows)
 
 
-def _drawn(problem, gaussians, camera, plan):
-    """The view, and a plan that held it."""
-    background = jnp.array([problem.background or (0.0, 0.0, 0.0)])
-    mode = "antialiased" if problem.config.antialiased else "classic"
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A view as it is drawn, and as it was photographed.
+
+    Attributes:
+        view: the photograph, its mask and its depth.
+        image: drawn, [H,W,3], 0 to 1; where the photograph does not count, it stands here too.
+        truth: the photograph, 0 to 1.
+        depth: drawn, [H,W], metres; 0 where nothing is drawn.
+        covered: where more than half of the light comes from Gaussians, [H,W].
+    """
+
+    view: View
+    image: np.ndarray
+    truth: np.ndarray
+    depth: np.ndarray
+    covered: np.ndarray
+
+    def psnr(self) -> float:
+        """Where the photograph counts, dB."""
+        return psnr(self.image, self.truth, self.view.mask)
+
+    def ssim(self) -> float | None:
+        """Where the photograph counts; None where it is smaller than the window."""
+        return (
+            ssim(self.image, self.truth, self.view.mask) if min(self.covered.shape) >= _LEAST_SIDE else None
+        )
+
+    def depth_mm(self) -> float | None:
+        """How far depth is off, where something is drawn; None where none was measured."""
+        if self.view.depth is None:
+            return None
+        return depth_error(self.depth, self.view.depth, self.covered).mean_abs_mm
+
+
+def look(
+    gaussians: Gaussians,
+    view: View,
+    background: tuple[float, float, float] | None,
+    antialiased: bool,
+    plan: Plan | None = None,
+) -> tuple[Seen, Plan]:
+    """A view as it is drawn, and a plan that held it, for the next of its size.
+
+    Args:
+        gaussians: the scene.
+        view: what is looked at.
+        background: RGB behind the scene; black where None.
+        antialiased: as the scene was fitted.
+        plan: of an earlier view of the same size.
+    """
+    height, width = view.image.shape[:2]
+    viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (view.viewmat, view.K))
+    camera, mode = Camera(viewmat, K, width, height), "antialiased" if antialiased else "classic"
+    behind = jnp.array([background or (0.0, 0.0, 0.0)])
     while True:
         if plan is None or plan.sh_degree != gaussians.sh_degree:
             plan = plan_render(gaussians, camera, headroom=1.3, rasterize_mode=mode)
-        drawn = render(gaussians, camera, plan, backgrounds=background)
+        drawn = render(gaussians, camera, plan, backgrounds=behind)
         if not bool(drawn.meta.overflow.any()):
-            return drawn, plan
+            break
         plan = plan.grown(int(drawn.meta.needed.max()), 1.3)
+    image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), view.image / 255
+    if view.mask is not None:
+        image = np.where(view.mask[..., None], image, truth)
+    return Seen(view, image, truth, np.asarray(drawn.depths[0]), np.asarray(drawn.alphas[0]) > 0.5), plan
 
 
-def _write_picture(folder: RunFolder, number: int, image: np.ndarray, truth: np.ndarray) -> str:
-    path = folder.render("held_out", number)
-    both = side_by_side(truth, image, captions=("photograph", "rendered", "difference"))
-    with atomic_write(path) as temporary:
-        if not cv2.imwrite(str(temporary), both[..., ::-1]):
-            raise OSError(f"{path}: could not be written")
-    return str(path.relative_to(folder.path))
+def write_panel(path: Path, seen: Seen) -> None:
+    """Writes the photograph, what is drawn, and how they differ, side by side; small ones enlarged."""
+    times = -(-_PANEL_HEIGHT // len(seen.image))
+    pair = [picture.repeat(times, 0).repeat(times, 1) for picture in (seen.truth, seen.image)]
+    write_png(path, side_by_side(*pair, captions=PANELS))
 
 
 def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> None:
@@ -186,7 +231,8 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
         title=found["dataset"] + ("" if found["complete"] else " (partial run)"),
         subtitle=f"{photographs['fitted']} photographs fitted, {photographs['held_out']} held out",
         summary=cards,
-        images=[Media(folder.path / row["picture"], row["view"]) for row in shown],
+        strips=[Media(folder.path / row["picture"], row["view"]) for row in shown],
+        videos=[Media(folder.video(ORBIT), "About the scene")] if found["complete"] else (),
         plots=[Media(plot, "Held-out PSNR, and the number of Gaussians, over minutes")],
         tables=[
             Table(

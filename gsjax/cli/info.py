@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -9,11 +10,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from gsjax.cli.info_picture import by_camera, by_split, write_picture
 from gsjax.cli.messages import Notes
-from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence
+from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.open import is_of_photographs
 from gsjax.methods.reconstruction import extent_of
 
+PICTURES = (".png", ".svg", ".pdf")
 MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
 
 
@@ -25,6 +28,8 @@ class Options:
     """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
     read: ReadOptions = field(default_factory=ReadOptions)
     """What the layout of the data leaves open."""
+    picture: Path | None = None
+    """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -33,8 +38,12 @@ def run(options: Options) -> int:
     """Print what a recording holds.
 
     Raises:
-        DataError, ValueError: it cannot be read.
+        DataError, ValueError: it cannot be read, or a picture cannot be of that kind.
     """
+    if options.picture is not None and options.picture.suffix not in PICTURES:
+        raise ValueError(
+            f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
+        )
     if is_of_photographs(options.dataset):
         return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):
@@ -42,11 +51,14 @@ def run(options: Options) -> int:
         for c in range(sequence.num_cameras):
             sequence.image(0, c)  # says what is wrong with it
         masks = first_masks(sequence)
+        if options.picture is not None:
+            write_picture(options.picture, photographs_of(sequence), by_camera(sequence))
     console = _print(sequence.name, describe_sequence(sequence, masks))
     pixels = mask_table(masks, sequence)
     if pixels is not None:
         console.print()
         console.print(pixels)
+    _say_picture(console, options)
     return 0
 
 
@@ -54,8 +66,15 @@ def _print_photographs(options: Options) -> int:
     with Notes(Console(stderr=True, highlight=False)):
         photographs = open_photographs(options.dataset, options.read)
         photographs.image(0)  # says what is wrong with it
-    _print(photographs.name, describe_photographs(photographs))
+        if options.picture is not None:
+            write_picture(options.picture, photographs, by_split(photographs))
+    _say_picture(_print(photographs.name, describe_photographs(photographs)), options)
     return 0
+
+
+def _say_picture(console: Console, options: Options) -> None:
+    if options.picture is not None:
+        console.print(f"\nwrote {options.picture}", soft_wrap=True)
 
 
 def _print(name: str, described: dict[str, str]) -> Console:

@@ -40,10 +40,12 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
     debug = False
     try:
         chosen = import_module(module)
+        options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
+        kind, arguments = options_for(arguments)
         options = tyro.cli(
-            chosen.options_for(arguments) if hasattr(chosen, "options_for") else chosen.Options,
+            kind,
             prog=f"gsjax {command}",
-            description=f"{does[0].upper()}{does[1:]}.",
+            description=f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", ""),
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),
         )

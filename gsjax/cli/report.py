@@ -3,7 +3,7 @@
 import base64
 import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -34,6 +34,7 @@ class Table:
         units: one a column, "" for none; shown small below the heads.
         decimals: one a column: digits behind the point of its fractions, None for three digits in all.
         note: a line below the table.
+        best: (row, column) of cells that stand out.
     """
 
     title: str
@@ -42,6 +43,7 @@ class Table:
     units: Sequence[str] = ()
     note: str = ""
     decimals: Sequence[int | None] = ()
+    best: Collection[tuple[int, int]] = ()
 
     def __post_init__(self):
         width = len(self.columns)
@@ -72,6 +74,7 @@ def write_report(
     images: Sequence[Media | str | Path] = (),
     videos: Sequence[Media | str | Path] = (),
     plots: Sequence[Media | str | Path] = (),
+    strips: Sequence[Media | str | Path] = (),
     notes: Sequence[str] = (),
 ) -> None:
     """Writes a standalone page.
@@ -82,6 +85,7 @@ def write_report(
         summary: headline figures, name to value or (value, unit); each becomes a card.
         subtitle: a line below the heading: what ran on what.
         tables, images, videos, plots: what to show; media are embedded, a plain path has no caption.
+        strips: images of several pictures side by side, one below the other.
         notes: what was not scored and why, warnings, the machine.
             A medium whose file is missing is left out and added here.
 
@@ -95,6 +99,7 @@ def write_report(
         _gallery("Plots", plots, _image, notes),
         "".join(map(_table, tables)),
         _gallery("Images", images, _image, notes),
+        _gallery("Pictures", strips, _image, notes),
         _notes(notes),
     ]
     below = f"<p>{_text(subtitle)}</p>" if subtitle else ""
@@ -154,9 +159,13 @@ def _table(table: Table) -> str:
         for i in range(len(table.columns))
     ]
 
-    def cells(values: Sequence[str], tag: str) -> str:
-        kind = [' class="number"' if is_number else "" for is_number in numeric]
-        return "".join(f"<{tag}{k}>{v}</{tag}>" for k, v in zip(kind, values, strict=True))
+    def cells(values: Sequence[str], tag: str, row: int | None = None) -> str:
+        kinds = [
+            " ".join(name for name, holds in (("number", n), ("best", (row, i) in table.best)) if holds)
+            for i, n in enumerate(numeric)
+        ]
+        kinds = [f' class="{kind}"' if kind else "" for kind in kinds]
+        return "".join(f"<{tag}{k}>{v}</{tag}>" for k, v in zip(kinds, values, strict=True))
 
     units = table.units or [""] * len(table.columns)
     heads = [
@@ -165,7 +174,7 @@ def _table(table: Table) -> str:
     ]
     decimals = table.decimals or [None] * len(table.columns)
     texts = [[_text(format_number(v, d)) for v, d in zip(row, decimals, strict=True)] for row in table.rows]
-    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in texts)
+    body = "".join(f"<tr>{cells(row, 'td', i)}</tr>" for i, row in enumerate(texts))
     note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
     return (
         f'<section><h2>{_text(table.title)}</h2><div class="scroll"><table>'

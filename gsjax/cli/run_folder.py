@@ -13,7 +13,7 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "trajectory.npz", "scene.ply", "report.html")
-_FOLDERS = ("renders", "plots", "query", "grasp", "resume")
+_FOLDERS = ("renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
@@ -35,11 +35,13 @@ class RunFolder:
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
           scene.ply               the Gaussians: of a fit, or of the first frame with their labels
           renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
-          video_CAM.mp4           input, render, error and labels side by side
+          video_CAM.mp4           input, render, error and labels side by side; of a fit video_orbit.mp4
           plots/NAME.svg|png      update time, error over frames, ...
           report.html             all of it on one page, written last
+          screenshots/            what was saved from `gsjax view`; --overwrite keeps it
           resume/                 what an unfinished run goes on from; a finished one has none
-          query/, grasp/          what `gsjax query` and `gsjax grasp` found afterwards
+          query/, grasp/, eval/   what `gsjax query`, `gsjax grasp` and `gsjax eval` found afterwards
+          tensorboard/            of a fit with --tensorboard: its event files
 
     A run is finished when it has its report, and metrics.json does not say that it was stopped.
 

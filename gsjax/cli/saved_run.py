@@ -71,7 +71,7 @@ def open_run(path: Path) -> SavedRun:
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
     if missing:
         raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
-    tracking = _read_tracking(path)
+    tracking = read_tracking(path)
     recording = _reopen(path / "config.yml")
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
@@ -82,7 +82,7 @@ def open_run(path: Path) -> SavedRun:
     return SavedRun(path, tracking, recording, camera, names)
 
 
-def _read_tracking(path: Path) -> Tracking:
+def read_tracking(path: Path) -> Tracking:
     """The scene of scene.ply with the poses of trajectory.npz."""
     file = path / "trajectory.npz"
     try:

@@ -79,7 +79,7 @@ class Options:
     """The tracker's own settings."""
 
 
-def options_for(arguments: list[str]) -> type[Options]:
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
     """The options where a preset is named: the tracker's are those of the preset unless given. A budget names
     `fast`, for a scene of fewer Gaussians to start from."""
     named = [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
@@ -87,9 +87,9 @@ def options_for(arguments: list[str]) -> type[Options]:
     if not named and any(a.split("=")[0].replace("_", "-") == "--budget-ms" for a in arguments):
         named = ["fast"]
     if not named or named[-1] not in PRESETS:
-        return Options
+        return Options, arguments
     tracker = ("tracker", TrackerConfig, field(default=PRESETS[named[-1]]))
-    return dataclasses.make_dataclass("Options", [tracker], bases=(Options,), frozen=True)
+    return dataclasses.make_dataclass("Options", [tracker], bases=(Options,), frozen=True), arguments
 
 
 def run(options: Options) -> int:

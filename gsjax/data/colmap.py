@@ -43,6 +43,7 @@ _MODELS = {
     14: ("SIMPLE_FISHEYE", 3),
     15: ("FISHEYE", 4),
 }
+_UNIT_TOLERANCE = 0.01  # of a quaternion's length: text is often written with few digits
 _COUNTS = dict(_MODELS.values())
 _UNDISTORT = "Run COLMAP's image_undistorter, and give its folder."
 _AGAIN = "It may be cut off: fetch or export it again."
@@ -83,6 +84,13 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     suffix = find(model)
     cameras = _READERS[suffix]["cameras"](model / f"cameras{suffix}")
     registered = sorted(_READERS[suffix]["images"](model / f"images{suffix}"), key=lambda image: image.name)
+    for what, read in (("cameras", cameras), ("images", registered)):
+        if not read:
+            expected, advice = (
+                f"at least one of its {what}",
+                "Did it fail? Give another model, or reconstruct again.",
+            )
+            raise DataError(model / f"{what}{suffix}", expected, "none", advice)
     cloud = (
         _READERS[suffix]["points3D"](model / f"points3D{suffix}")
         if (model / f"points3D{suffix}").exists()
@@ -90,10 +98,13 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     )
     usable = [image for image in registered if np.isfinite(image.viewmat).all()]
     kept = [image for image in usable if os.path.isfile(root / images / image.name)]
-    said = [f"{len(usable) - len(kept)} that are not in {root / images}"] * (len(kept) < len(usable))
-    said += [f"{len(registered) - len(usable)} without a finite pose"] * (len(usable) < len(registered))
+    said = []
+    if missing := [image.name for image in usable if not os.path.isfile(root / images / image.name)]:
+        said.append(f"{len(missing)} that are not in {root / images} ({_first(missing)})")
+    if lost := [image.name for image in registered if not np.isfinite(image.viewmat).all()]:
+        said.append(f"{len(lost)} without a finite pose in images{suffix} ({_first(lost)})")
     if not kept:
-        found = f"{len(registered)} registered, " + (" and ".join(said) or "none")
+        found = f"{len(registered)} registered, {' and '.join(said)}"
         raise DataError(model, "registered photographs", found, f"Name their folder, if it is not {images}.")
     if said:
         message = f"{root}: of {len(registered)} registered photographs {' and '.join(said)} are left out"
@@ -110,6 +121,10 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     return _photographs(root, root / images, kept, cameras, cloud)
 
 
+def _first(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
 def find(folder: Path) -> str | None:
     """ ".bin" or ".txt" where a folder holds a reconstruction in that form, the newer form first; or None."""
     there = (
@@ -118,6 +133,17 @@ def find(folder: Path) -> str | None:
         if all((folder / f"{n}{suffix}").is_file() for n in ("cameras", "images"))
     )
     return next(there, None)
+
+
+def find_lacking(root: Path) -> Path | None:
+    """The file that half of a reconstruction lacks, where there is such a half; or None."""
+    for place in PLACES:
+        for suffix in (".bin", ".txt"):
+            files = [root / place / f"{name}{suffix}" for name in ("cameras", "images")]
+            there = [file.is_file() for file in files]
+            if any(there) and not all(there):
+                return files[there.index(False)]
+    return None
 
 
 def _photographs(root, folder, images, cameras, cloud) -> Photographs:
@@ -176,10 +202,20 @@ def _lens(path: Path, name: str, p: tuple[float, ...]) -> Lens:
     return Lens(K, coeffs, fisheye)
 
 
-def _viewmat(quat: tuple[float, ...], translation: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
-    """From w x y z; NaN throughout where the numbers name no pose."""
-    if not np.isfinite([*quat, *translation]).all() or np.linalg.norm(quat) < 1e-9:
+def _viewmat(
+    where: object, name: str, quat: tuple[float, ...], translation: tuple[float, ...]
+) -> Float[np.ndarray, "4 4"]:
+    """From w x y z; NaN throughout where the numbers name no pose.
+
+    Raises:
+        DataError: the quaternion's length is neither about 1 nor 0.
+    """
+    if not np.isfinite([*quat, *translation]).all() or (length := np.hypot.reduce(quat)) < 1e-9:
         return np.full((4, 4), np.nan)
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        raise DataError(
+            where, f"a unit quaternion for {name}", f"{list(quat)} of length {length:.3g}", _AGAIN
+        )
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
     viewmat[:3, 3] = translation
@@ -252,7 +288,7 @@ def _images_bin(path: Path) -> list[_Image]:
         _, *pose, camera = file.take("i7di")
         name = file.text()
         file.skip(24 * file.count(24))
-        images.append(_Image(name, camera, _viewmat(tuple(pose[:4]), tuple(pose[4:]))))
+        images.append(_Image(name, camera, _viewmat(path, name, tuple(pose[:4]), tuple(pose[4:]))))
     return images
 
 
@@ -310,12 +346,16 @@ def _images_txt(path: Path) -> list[_Image]:
     while lines and not lines[0][1].strip():
         lines.pop(0)
 
-    def parse(words: list[str]) -> _Image:
+    def parse(words: list[str]) -> tuple[str, int, tuple[float, ...], tuple[float, ...]]:
         quat, translation = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
-        return _Image(" ".join(words[9:]) or words[9], int(words[8]), _viewmat(quat, translation))
+        return " ".join(words[9:]) or words[9], int(words[8]), quat, translation
 
-    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    return [_parsed(path, number, line, expected, parse) for number, line in lines[::2] if line.strip()]
+    expected, images = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", []
+    for number, line in lines[::2]:
+        if line.strip():
+            name, camera, *pose = _parsed(path, number, line, expected, parse)
+            images.append(_Image(name, camera, _viewmat(f"{path}, line {number}", name, *pose)))
+    return images
 
 
 def _points_txt(path: Path) -> Cloud:

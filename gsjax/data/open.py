@@ -14,6 +14,7 @@ from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import tabletop
+from gsjax.data.structure_from_motion import SUFFIXES
 from gsjax.data.tum import read_tum
 
 SIMULATED_PREFIX = "simulated:"
@@ -25,6 +26,7 @@ _LAYOUTS = {
     "sample_demos": ("push-T", read_push_t),
     "rgb.txt": ("TUM RGB-D", read_tum),
     "frame-*.pose.txt": ("7-Scenes", read_seven_scenes),
+    "frame-*.color.*": ("7-Scenes", read_seven_scenes),
     "seq-*": ("7-Scenes", read_seven_scenes),
 }
 
@@ -69,7 +71,7 @@ def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Seque
     if photographs:
         found = f"photographs ({photographs} layout), which have no order in time"
         raise DataError(root, "a recording over time", found, "gsjax fit takes them.")
-    raise _unknown(root, {mark: layout for mark, (layout, _) in _LAYOUTS.items()})
+    raise _unknown(root, {mark: layout for mark, (layout, _) in _LAYOUTS.items()}, options)
 
 
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
@@ -101,7 +103,7 @@ def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Ph
     if known or next(root.glob("cam*.mp4"), None):
         return photographs_of(open_sequence(root, options))
     marks = {mark: layout for mark, (layout, _) in _LAYOUTS.items()}
-    raise _unknown(root, _PHOTOGRAPHS | marks)
+    raise _unknown(root, _PHOTOGRAPHS | marks, options)
 
 
 def is_of_photographs(path: str | Path) -> bool:
@@ -114,6 +116,7 @@ def is_of_photographs(path: str | Path) -> bool:
     )
 
 
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 _PHOTOGRAPHS = {"transforms.json": "nerfstudio", "sparse/0/cameras.bin": "COLMAP", "poses_bounds.npy": "LLFF"}
 
 
@@ -146,13 +149,25 @@ def _folder(path: str | Path) -> Path:
     if not root.is_dir():
         known = ", ".join(SIMULATED_PREFIX + name for name in SIMULATED_SCENES)
         found = "a file" if root.exists() else "nothing there"
-        raise DataError(
-            root, "a folder with a recording", found, f"Give its folder, or a built-in scene: {known}."
-        )
+        advice = f"Give its folder, or a built-in scene: {known}."
+        if root.suffix.lower() in _VIDEOS and root.is_file():
+            found, advice = "a video, which has no poses", _find_poses(root)
+        raise DataError(root, "a folder with a recording", found, advice)
     return root
 
 
-def _unknown(root: Path, marks: dict[str, str]) -> DataError:
+def _find_poses(images: Path) -> str:
+    return f"Find them first: gsjax poses {images} --out DATASET, then give DATASET."
+
+
+def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
+    if (lacking := colmap.find_lacking(root)) is not None:
+        return DataError(lacking, "a part of the reconstruction", "no such file", "Was it copied whole?")
+    for folder in (root, root / options.images):
+        count = sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
+        if count:
+            expected = f"poses of the photographs ({', '.join(_PHOTOGRAPHS)})"
+            return DataError(root, expected, f"{count} photographs without poses", _find_poses(folder))
     expected = ", ".join(f"{mark} ({layout} layout)" for mark, layout in marks.items())
     names = sorted(entry.name for entry in root.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "an empty folder"

@@ -85,9 +85,10 @@ def read_open3d(
             f"{len(images)} images, {len(depths)} depths and {len(poses)} poses without one number in common"
         )
         raise DataError(root, "frames with image, depth and pose", found, "Name files by the frame's number.")
-    left_out = len(images) - len(numbers)
-    if left_out:
-        message = f"{root}: {left_out} of {len(images)} frames are left out, without depth or a pose"
+    if left_out := sorted(images.keys() - set(numbers)):
+        some = ", ".join(images[n].name for n in left_out[:3]) + (", ..." if len(left_out) > 3 else "")
+        said = f"{len(left_out)} of {len(images)} frames are left out, without depth or a pose"
+        message = f"{root}: {said} ({some})"
         warnings.warn(message, DataWarning, stacklevel=2)
     to_world = np.stack([poses[n] for n in numbers])[:, None]
     advice = "Poses are camera to world in OpenCV axes."

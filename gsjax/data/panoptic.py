@@ -21,6 +21,7 @@ import numpy as np
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
 from gsjax.data.sequence import Sequence, Truth
+from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 DEFAULT_RATE_HZ = 30.0
@@ -44,6 +45,7 @@ def read_panoptic(path: str | Path) -> Sequence:
     meta = _read_metas(root)
     present = _present_frames(root, meta["fn"])
     names = [meta["fn"][t] for t in present]
+    _check_cameras(meta, present)
     frames, width, height = len(meta["fn"]), meta["w"], meta["h"]
     times = np.asarray(meta.get("time", np.arange(frames) / DEFAULT_RATE_HZ), np.float64)
     if times.shape != (frames,):
@@ -135,7 +137,7 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
 
 
 def _read_metas(root: Path) -> dict[str, Any]:
-    """Both metas as one: k and w2c as arrays [T,C,...], fn [T][C], cam_id [C]."""
+    """Both metas as one: k and w2c as arrays [T,C,...], fn [T][C], cam_id [C], and each camera's file."""
     merged = _read_meta(root / META_NAMES[0])
     extra_path = root / META_NAMES[1]
     if not extra_path.exists():
@@ -150,7 +152,8 @@ def _read_metas(root: Path) -> dict[str, Any]:
         found = f"cameras {sorted(shared)} in both"
         raise DataError(extra_path, f"other cameras than in {META_NAMES[0]}", found, "Take them out of one.")
     merged["fn"] = [a + b for a, b in zip(merged["fn"], extra["fn"], strict=True)]
-    merged["cam_id"] = merged["cam_id"] + extra["cam_id"]
+    for key in ("cam_id", "file"):
+        merged[key] = merged[key] + extra[key]
     for key in ("k", "w2c"):
         merged[key] = np.concatenate([merged[key], extra[key]], axis=1)
     return merged
@@ -189,7 +192,22 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
             expected = f"cameras {meta['cam_id'][0]} as in frame 0"
             raise DataError(path, expected, f"{ids} in frame {t}", _ADVICE_META)
     arrays = {key: _stack(path, key, meta[key], side) for key, side in (("k", 3), ("w2c", 4))}
-    return meta | arrays | {"cam_id": [int(i) for i in meta["cam_id"][0]]}
+    return meta | arrays | {"cam_id": [int(i) for i in meta["cam_id"][0]], "file": [path] * cameras}
+
+
+def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
+    """Raises ValueError where a camera is none, in frames that have images; the message names its file."""
+    for c, (path, camera) in enumerate(zip(meta["file"], meta["cam_id"], strict=True)):
+
+        def where(t: int, _: int, camera: int = camera) -> str:
+            number = _frame_number(meta["fn"][present[t]][0], present[t])
+            return f"camera {camera} in frame {number}"
+
+        try:
+            check_intrinsics(meta["k"][present, c, None], where)
+            check_poses("viewmat", meta["w2c"][present, c, None], where, _ADVICE_META)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def _stack(path: Path, key: str, values: list, side: int) -> np.ndarray:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_depth, read_image
 from gsjax.data.sequence import Sequence
+from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics
 
 RATE_HZ = 30.0
@@ -109,29 +110,38 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
         found = f"the sequences {', '.join(parts)}" if parts else "no frame-NUMBER.pose.txt"
         advice = f"Give one of them, as in {root / parts[0]}, unpacked." if parts else "Give its folder."
         raise DataError(root, "the frames of one sequence", found, advice)
-    numbers, poses, images, depths, lost, missing = [], [], [], [], 0, 0
+    numbers, poses, images, depths = [], [], [], []
+    lost: list[str] = []
+    missing: list[str] = []
     for match in sorted(names, key=lambda match: int(match[1])):
         pose, stem = _read_matrix(root / match[0], 4), match[0].removesuffix(".pose.txt")
         image = next((p for end in ("png", "jpg") if (p := root / f"{stem}.color.{end}").is_file()), None)
         depth = root / f"{stem}.depth.png"
         if not np.isfinite(pose).all():
-            lost += 1
+            lost.append(stem)
         elif image is None or not depth.is_file():
-            missing += 1
+            missing.append(stem)
         else:
             numbers.append(int(match[1]))
             poses.append(pose)
             images.append(image)
             depths.append(depth)
-    said = [f"{lost} without a finite pose"] * bool(lost) + [f"{missing} without an image"] * bool(missing)
+    said = [
+        f"{len(stems)} {what} ({', '.join(stems[:3])}{', ...' if len(stems) > 3 else ''})"
+        for stems, what in ((lost, "without a finite pose"), (missing, "without an image"))
+        if stems
+    ]
     if not numbers:
         found = f"none of {len(names)}: {', '.join(said)}"
         advice = "Check the folder; was it copied whole?"
         raise DataError(root, "a frame with pose, colour and depth", found, advice)
     if said:
-        message = f"{root}: {lost + missing} of {len(names)} frames are left out, {', '.join(said)}"
+        message = f"{root}: {len(lost) + len(missing)} of {len(names)} frames are left out, {', '.join(said)}"
         warnings.warn(message, DataWarning, stacklevel=3)
-    return numbers, np.stack(poses), images, depths
+    to_world, advice = np.stack(poses), "Poses are camera to world; correct that frame, or remove it."
+    files = [root / f"frame-{number:06d}.pose.txt" for number in numbers]
+    check_poses("pose", to_world[:, None], lambda i, _: str(files[i]), advice)
+    return numbers, to_world, images, depths
 
 
 def _read_matrix(path: Path, side: int) -> Float[np.ndarray, "side side"]:

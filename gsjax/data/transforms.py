@@ -5,7 +5,8 @@ camera_angle_x, camera_angle_y radians, where there are no focal lengths
 k1 .. k4, p1, p2               OpenCV's lens distortion; camera_model (or is_fisheye) says of which model
 frames[]                       file_path (Blender leaves out the extension), transform_matrix [4,4], perhaps
                                mask_path (0 = does not count), depth_file_path (16 bit), time
-train_filenames, ...           nerfstudio's splits; Blender has a file for each: transforms_train.json, ...
+train_filenames, ...           nerfstudio's splits: what no list names is left out, as there; Blender has a
+                               file for each: transforms_train.json, ...
 ply_file_path                  nerfstudio's sparse points
 """
 
@@ -23,6 +24,7 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_depth, read_json, read_mask, read_rgba
 from gsjax.data.lens import Lens, shrunk, straighten
 from gsjax.data.photographs import Photographs
+from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
 
 SPLITS = ("train", "val", "test")
@@ -54,8 +56,9 @@ def read_transforms(
     """The photographs that a transforms.json lists, or a transforms_train.json and its siblings.
 
     Listed files that do not exist are left out with a DataWarning that counts them, as are frames without a
-    finite pose. Distorted photographs are straightened (see `gsjax.data.lens`). A photograph of another size
-    than is said is taken for one that was made smaller.
+    finite pose and those that no list of a split names, where there are such lists. What two lists name is of
+    the later one of train, val, test: it is not fitted. Distorted photographs are straightened (see
+    `gsjax.data.lens`). A photograph of another size than is said is taken for one that was made smaller.
 
     Args:
         path: the folder, or one such file.
@@ -69,7 +72,8 @@ def read_transforms(
     root, files = _files(Path(path))
     frames: list[_Frame] = []
     missing: list[str] = []
-    listed, lost, cloud = 0, 0, None
+    lost: list[str] = []
+    listed, unnamed, cloud = 0, 0, None
     for file, split in files.items():
         meta = read_json(file)
         if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
@@ -79,17 +83,21 @@ def read_transforms(
         for number, entry in enumerate(meta["frames"]):
             what = _Entry(file, number, meta, entry)
             image = what.image(root)
+            own = split or named.get(Path(entry["file_path"]))
+            if named and own is None:
+                unnamed += 1
+                continue
             if image is None:
                 missing.append(str(entry["file_path"]))
                 continue
             pose = what.pose()
             if pose is None:
-                lost += 1
+                lost.append(str(entry["file_path"]))
                 continue
-            frames.append(what.read(root, image, pose, split or named.get(Path(entry["file_path"]))))
+            frames.append(what.read(root, image, pose, own))
         if cloud is None and meta.get("ply_file_path") is not None:
             cloud = read_cloud(root / str(meta["ply_file_path"]))
-    _say_left_out(root, listed, missing, lost, len(frames))
+    _say_left_out(root, listed, missing, lost, unnamed, len(frames))
     return _photographs(root, frames, cloud, background, depth_unit_m)
 
 
@@ -117,11 +125,21 @@ def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
     """Which split each photograph is of, where the file says so."""
     named = {}
     for split in SPLITS:
-        names = meta.get(f"{split}_filenames", [])
+        names = meta.get(f"{split}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             expected = f"{split}_filenames, a list of names"
             raise DataError(file, expected, repr(names)[:80], "Correct or remove it.")
         named |= {Path(name): split for name in names}
+    if named and not meta.get("train_filenames"):
+        found = (
+            f"only {' and '.join(key for key in (f'{split}_filenames' for split in SPLITS) if meta.get(key))}"
+        )
+        raise DataError(file, "train_filenames beside other lists", found, "Add it, or remove the others.")
+    known = {Path(str(entry.get("file_path"))) for entry in meta["frames"] if isinstance(entry, dict)}
+    if strange := [str(name) for name in named if name not in known]:
+        expected = "names of frames in train_filenames, val_filenames and test_filenames"
+        found = f"{len(strange)} that no frame has, as {strange[0]}"
+        raise DataError(file, expected, found, "Correct or remove them.")
     return named
 
 
@@ -174,10 +192,9 @@ class _Entry(NamedTuple):
             )
         if not np.isfinite(matrix).all():
             return None
-        if abs(np.linalg.det(matrix)) < 1e-9:
-            raise self.wrong(
-                "transform_matrix, a rigid motion", matrix.tolist(), "Correct or remove that frame."
-            )
+        where = f"{self.file}, frame {self.number} ({self.entry['file_path']})"
+        advice = "It must be a rotation and a shift; correct or remove that frame."
+        check_poses("transform_matrix", matrix[None, None], lambda i, _: where, advice)
         return viewmat_from_opengl(matrix)
 
     def read(self, root: Path, image: Path, pose: np.ndarray, split: str | None) -> _Frame:
@@ -205,6 +222,11 @@ class _Entry(NamedTuple):
         """The camera, for a photograph of this size."""
         said_width, said_height = self.numeral("w") or width, self.numeral("h") or height
         fx, angle = self.numeral("fl_x"), self.numeral("camera_angle_x")
+        for name in ("camera_angle_x", "camera_angle_y"):
+            if (width_of_view := self.numeral(name)) is not None and not 0 < width_of_view < np.pi:
+                raise self.wrong(
+                    f"{name} between 0 and pi", f"{width_of_view:g}", "It is in radians; correct it."
+                )
         if fx is None:
             if angle is None:
                 raise self.wrong("fl_x or camera_angle_x", "neither", "Add one, of the frame or of all.")
@@ -234,13 +256,16 @@ class _Entry(NamedTuple):
         return Lens(K, coeffs, fisheye)
 
 
-def _say_left_out(root: Path, listed: int, missing: list[str], lost: int, left: int) -> None:
+def _say_left_out(
+    root: Path, listed: int, missing: list[str], lost: list[str], unnamed: int, left: int
+) -> None:
     said = []
-    if missing:
-        names = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        said.append(f"{len(missing)} that have no file ({names})")
-    if lost:
-        said.append(f"{lost} without a finite pose")
+    for names, what in ((missing, "that have no file"), (lost, "without a finite pose")):
+        if names:
+            some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+            said.append(f"{len(names)} {what} ({some})")
+    if unnamed:
+        said.append(f"{unnamed} that no list of train, val or test names")
     if not left:
         raise DataError(
             root, "a photograph with a pose", f"of {listed} listed {' and '.join(said)}", "Check the folder."

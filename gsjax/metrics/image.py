@@ -4,9 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 
 _SSIM_WINDOW = 11  # 3.5 sigma on either side of a Gaussian of sigma 1.5, as Wang et al. (2004)
+_MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of scales, the finest first: Wang et al. (2003)
+MS_SSIM_LEAST_SIDE = (_SSIM_WINDOW - 1) * 2 ** (len(_MS_SSIM_WEIGHTS) - 1) + 1
+"""Pixels a side below which the coarsest of MS-SSIM's scales is smaller than its window."""
 
 
 def psnr(
@@ -81,6 +85,83 @@ def ssim(
     if mask.shape != image.shape[:2]:
         raise ValueError(f"mask: got shape {mask.shape}, want {image.shape[:2]} to match image")
     return float(np.mean(similarity[mask])) if mask.any() else float("nan")
+
+
+def ms_ssim(
+    image: Num[np.ndarray, "..."],
+    reference: Num[np.ndarray, "..."],
+    mask: Bool[np.ndarray, "..."] | None = None,
+) -> float:
+    """Multi-scale structural similarity (Wang, Simoncelli, Bovik 2003), of each channel, and then the mean.
+
+        cs_1^0.0448 cs_2^0.2856 cs_3^0.3001 cs_4^0.2363 (l_5 cs_5)^0.1333
+
+    l compares luminance, cs contrast and structure, each in the window of `ssim`; every scale is the mean of
+    squares of 2x2 pixels of the one before, where a side is odd with its last row or column twice. A scale
+    on which the pictures are anticorrelated counts as 0, for a negative number has no such power.
+
+    With a mask, means over a scale's pixels, by the share of each that the mask covers; their windows do
+    reach beyond it.
+
+    Args:
+        image, reference: [H, W] or [H, W, channels], 0 to 1, at least 161 pixels on each side.
+        mask: [H, W], True where to compare.
+
+    Returns:
+        NaN where the mask holds no pixel.
+
+    Raises:
+        ValueError: the shapes do not agree, or the picture is too small for five scales.
+    """
+    image, reference = _same_shape(image, reference)
+    weights = None
+    if mask is not None:
+        mask = np.asarray(mask)
+        if mask.shape != image.shape[:2]:
+            raise ValueError(f"mask: got shape {mask.shape}, want {image.shape[:2]} to match image")
+        weights = mask.astype(np.float64)
+    if min(image.shape[:2]) < MS_SSIM_LEAST_SIDE:
+        raise ValueError(
+            f"image: got {image.shape[:2]} pixels, want at least {MS_SSIM_LEAST_SIDE} on each side for the "
+            "five scales of MS-SSIM"
+        )
+    if weights is not None and not weights.any():
+        return float("nan")
+    x, y = (a.reshape(*a.shape[:2], -1) for a in (image, reference))
+    score, last = np.ones(x.shape[-1]), len(_MS_SSIM_WEIGHTS) - 1
+    for scale, power in enumerate(_MS_SSIM_WEIGHTS):
+        luminance, contrast = _similarity(x, y)
+        similar = luminance * contrast if scale == last else contrast
+        score *= np.maximum(_mean(similar, weights), 0) ** power
+        x, y = _halved(x), _halved(y)
+        weights = None if weights is None else _halved(weights)
+    return float(score.mean())
+
+
+def _similarity(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each pixel: how alike luminance is, and contrast with structure (Wang et al. 2004, eq. 6, 9, 10)."""
+    c1, c2 = 0.01**2, 0.03**2
+
+    def blurred(a: np.ndarray) -> np.ndarray:
+        return gaussian_filter(a, 1.5, truncate=3.5, axes=(0, 1))
+
+    mx, my = blurred(x), blurred(y)
+    xx, yy, xy = blurred(x * x) - mx**2, blurred(y * y) - my**2, blurred(x * y) - mx * my
+    return (2 * mx * my + c1) / (mx**2 + my**2 + c1), (2 * xy + c2) / (xx + yy + c2)
+
+
+def _mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Of each channel: over the pixels whose window lies in the picture, or under weights over all."""
+    if weights is not None:
+        return np.tensordot(weights, values, axes=2) / weights.sum()
+    half = _SSIM_WINDOW // 2
+    return values[half:-half, half:-half].mean(axis=(0, 1))
+
+
+def _halved(a: np.ndarray) -> np.ndarray:
+    """Means of 2x2 pixels."""
+    even = np.pad(a, [(0, side % 2) for side in a.shape[:2]] + [(0, 0)] * (a.ndim - 2), mode="edge")
+    return (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
 
 
 class DepthError(NamedTuple):

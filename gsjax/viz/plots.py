@@ -92,6 +92,26 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out
     return figure
 
 
+def fit_curves(
+    runs: Mapping[str, Sequence[Mapping[str, float | None]]], title: str = "Held-out PSNR"
+) -> Figure:
+    """PSNR of held-out views over minutes, one line a run, a ring where it ended.
+
+    Args:
+        runs: of each name, its rows: `seconds` and `test_psnr` (None where nobody looked).
+    """
+    figure, axes = _new(title, "minutes", "dB")
+    for i, (name, rows) in enumerate(runs.items()):
+        judged = [row for row in rows if row["test_psnr"] is not None]
+        minutes = np.array([row["seconds"] for row in judged], float) / 60
+        psnr = np.array([row["test_psnr"] for row in judged], float)
+        axes.plot(minutes, psnr, color=_rgb(i + 1), lw=1.6, marker="o", ms=2.6, mew=0, label=name)
+        axes.plot(minutes[-1:], psnr[-1:], color=_rgb(i + 1), marker="o", ms=7, mfc="white", mew=1.6)
+    axes.set_xlim(left=0)
+    _legend(figure, axes)
+    return figure
+
+
 def psnr_over_frames(
     tracked: Mapping[str, Float[np.ndarray, "frames"]],
     held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,

@@ -10,13 +10,16 @@ from dataclasses import replace
 
 import cv2
 import pytest
+import yaml
 
 import gsjax.cli.fit
 from gsjax.cli import main
 from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve
 from gsjax.data import open_photographs
+from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
+from gsjax.methods.reconstruction import PRESETS
 
 QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
 QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")
@@ -56,8 +59,10 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert gaussians.sh_degree == found["sh_degree"] == 1
     pictures = sorted((run / "renders" / "held_out").iterdir())
     assert len(pictures) == 3
-    assert cv2.imread(str(pictures[0])).shape[1] == 3 * 48
+    assert cv2.imread(str(pictures[0])).shape[:2] == (7 * 36, 3 * 7 * 48)  # enlarged, for its captions
     assert "data:image/png" in (run / "report.html").read_text()
+    assert "data:video/mp4" in (run / "report.html").read_text()
+    assert describe_video(run / "video_orbit.mp4").frames == 90
     assert not (run / "resume").exists()
 
     shown = Curve.took
@@ -109,6 +114,19 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, 
     assert found["steps"] >= 50
     newest = sorted((run / "resume").iterdir())[-1]
     assert newest.name == f"step-{found['steps']:08d}.npz"
+
+
+def test_a_preset_is_named_before_the_dataset_and_what_is_given_counts_more(photographs, tmp_path, capfd):
+    run = tmp_path / "run"
+    code = main(["fit", "classic", str(photographs), "--out", str(run), *QUICK, "--fit.split.begin", "4"])
+    said = capfd.readouterr()
+    assert code == 0, said
+    config = yaml.safe_load((run / "config.yml").read_text())["fit"]
+    assert (config["strategy"], config["cap"], config["split"]["begin"]) == ("split", 150, 4)
+    with pytest.raises(SystemExit):
+        main(["fit", "--help"])
+    said = capfd.readouterr().out
+    assert all(name in said for name in PRESETS)
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):

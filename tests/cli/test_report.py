@@ -78,6 +78,17 @@ def test_text_is_escaped(write):
     assert "a < b & c" in page.text
 
 
+def test_cells_may_stand_out_and_strips_lie_below_each_other(write, tmp_path):
+    (tmp_path / "a.png").write_bytes(b"a")
+    table = Table("Runs", ("run", "PSNR"), [("a", 20.0), ("b", 21.0)], best={(1, 1), (0, 0)})
+    page = write(tables=[table], strips=[Media(tmp_path / "a.png", "view 7")])
+    assert "view 7" in page.text
+    html = (tmp_path / "report.html").read_text()
+    assert '<td class="best">a</td><td class="number">20.0</td>' in html
+    assert '<td>b</td><td class="number best">21.0</td>' in html
+    assert '<div class="gallery pictures">' in html
+
+
 def test_missing_media_become_a_note(write, tmp_path):
     page = write(videos=[tmp_path / "video_7.mp4"])
     assert "Videos: video_7.mp4 was not written." in page.text

@@ -1,4 +1,5 @@
 import random
+import re
 import shutil
 
 import numpy as np
@@ -137,7 +138,7 @@ def test_photographs_without_file_or_pose_are_counted(tmp_path):
     images.write_text("\n".join(lines))
     (tmp_path / "images/a.png").unlink()
     with pytest.warns(
-        DataWarning, match="of 3 registered photographs 1 that are not in .*images and 1 without"
+        DataWarning, match=r"of 3 .* 1 that are not in .* and 1 without a finite pose in images.txt \(c.png\)"
     ):
         assert read_colmap(tmp_path).names == ("day/b 2.png",)
     start = next(i for i, line in enumerate(lines) if line.endswith(" c.png"))
@@ -237,10 +238,15 @@ def swap(old, new, count=1):
             swap("3 PINHOLE", "4 PINHOLE"),
             r"images.txt: expected one of the cameras \[4\], found 3 for a.png",
         ),
-        ("cameras", lambda text: "", r"images.txt: expected one of the cameras \[\], found 3 for a.png"),
-        ("images", lambda text: "# none\n", r"expected registered photographs, found 0 registered, none"),
+        ("cameras", lambda text: "", r"cameras.txt: expected at least one of its cameras, found none"),
+        ("images", lambda text: "# none\n", r"images.txt: expected at least one of its images, found none. Did it fail"),
         ("images", swap(" a.png", ""), r"images.txt, line 7: expected IMAGE_ID QW .*NAME, found '8 "),
         ("images", swap(" 3 a.png", " x a.png"), r"images.txt, line 7: expected IMAGE_ID"),
+        (
+            "images",
+            lambda text: re.sub(r"\n8 .* 3 a.png", "\n8 2 0 0 0 1 2 3 3 a.png", text),
+            r"images.txt, line 7: expected a unit quaternion for a.png, found \[2.0, 0.0, 0.0, 0.0\] of le",
+        ),
         (
             "points3D",
             lambda text: text + "5 1 2 3\n",
@@ -269,7 +275,7 @@ def test_what_is_wrong_with_text(tmp_path, name, change, says):
         ("cameras", 0, b"\xff" * 8, r"cameras.bin: .*found 18446744073709551615 items announced in 64 bytes"),
         ("cameras", 16, b"\0" * 8, r"a.png: expected a width and a height above 0, found 0x72"),
         ("images", 0, b"\xff" * 7, r"images.bin: .*items announced in \d+ bytes"),
-        ("images", 0, b"\0", r"expected registered photographs, found 0 registered"),
+        ("images", 0, b"\0", r"images.bin: expected at least one of its images, found none"),
         ("points3D", 6, b"\x01", r"points3D.bin: .*items announced"),
     ],
 )

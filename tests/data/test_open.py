@@ -131,3 +131,21 @@ def test_folders_without_photographs(tmp_path):
     (tmp_path / "transforms_train.json").write_text('{"frames": [{"file_path": "gone.png"}]}')
     with pytest.raises(DataError, match=r"of 1 listed 1 that have no file \(gone.png\)"):
         open_photographs(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["", "images", "photos"])
+def test_photographs_without_poses_are_told_how_to_get_them(tmp_path, place):
+    (tmp_path / place).mkdir(exist_ok=True)
+    for name in ("a.png", "b.JPG"):
+        (tmp_path / place / name).write_bytes(ONE_PIXEL)
+    folder = tmp_path / place
+    says = rf"found 2 photographs without poses. Find them first: gsjax poses {folder} --out DATASET"
+    for opened in (open_photographs, open_sequence):
+        with pytest.raises(DataError, match=says):
+            opened(tmp_path, ReadOptions(images=place or "images"))
+
+
+def test_a_video_is_told_how_to_get_poses(tmp_path):
+    (tmp_path / "walk.MOV").write_bytes(b"any")
+    with pytest.raises(DataError, match=r"found a video, which has no poses. .*gsjax poses .*walk.MOV --out"):
+        open_photographs(tmp_path / "walk.MOV")

@@ -156,6 +156,18 @@ def test_masks_depths_splits_and_points(folder):
         scene.mask(0)
 
 
+def test_photographs_that_no_list_of_a_split_names_are_left_out_as_in_nerfstudio(folder):
+    folder.meta["frames"] += [folder.add(f"images/{i}.png", (0.1 * i, 0, 4)) for i in (2, 3)]
+    folder.meta |= {"train_filenames": ["images/1.png"], "test_filenames": ["./images/2.png"]}
+    with pytest.warns(DataWarning, match="of 4 listed photographs 2 that no list of train, val or test"):
+        scene = folder.read()
+    assert (scene.names, scene.splits) == (("images/1.png", "images/2.png"), ("train", "test"))
+    folder.meta["train_filenames"] = [f"images/{i}.png" for i in range(4)]
+    assert folder.read().splits == ("train", "train", "test", "train")  # what is judged is not fitted
+    folder.meta |= {"train_filenames": [], "test_filenames": []}
+    assert folder.read().splits is None
+
+
 def test_blender_leaves_out_extensions_and_has_times_and_transparency(tmp_path):
     folder = Folder(tmp_path / "lego")
     clear = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
@@ -227,9 +239,12 @@ def with_all(**changes):
         (with_frame(transform_matrix=None), r"frame 1: expected transform_matrix, 4 lines of 4 numbers"),
         (with_frame(transform_matrix=[[1, 0], [0]]), r"4 lines of 4 numbers"),
         (with_frame(transform_matrix="eye"), r"4 lines of 4 numbers"),
-        (with_frame(transform_matrix=np.zeros((4, 4)).tolist()), r"frame 1: .*a rigid motion"),
-        (with_frame(transform_matrix=(2 * np.eye(4)).tolist()), r"viewmat of images/1.png: its last row"),
-        (with_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), r"images/1.png: R is no rotation"),
+        (
+            with_frame(transform_matrix=np.zeros((4, 4)).tolist()),
+            r"transforms.json, frame 1 \(images/1.png\): its last row is \[0. 0. 0. 0.\]. It must be a",
+        ),
+        (with_frame(transform_matrix=(2 * np.eye(4)).tolist()), r"frame 1 \(images/1.png\): its last row"),
+        (with_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), r"1 \(images/1.png\): R is no rot"),
         (with_frame(fl_x=float("nan")), r"frame 1: expected fl_x, a number, found nan"),
         (with_frame(k1=float("inf")), r"frame 1: expected k1, a number, found inf"),
         (with_frame(cx="mid"), r"frame 1: expected cx, a number, found 'mid'"),
@@ -249,6 +264,14 @@ def with_all(**changes):
         (with_all(k4=0.1), r"frame 0: expected a k4 of 0 but for a fisheye, found 0.1. Undistort"),
         (with_all(train_filenames=3), r"transforms.json: expected train_filenames, a list of names, found 3"),
         (with_all(test_filenames=[["a"]]), r"expected test_filenames, a list of names"),
+        (
+            with_all(val_filenames=["images/0.png"], test_filenames=["images/1.png"]),
+            r"transforms.json: expected train_filenames beside other lists, found only val_filenames and te",
+        ),
+        (
+            with_all(train_filenames=["images/0.png", "images/7.png"]),
+            r"transforms.json: expected names of frames in train_filenames, .*found 1 that no frame has",
+        ),
         (with_all(ply_file_path="gone.ply"), r"gone.ply: expected a point cloud, found no such file"),
         (with_all(ply_file_path=5), r"garden/5: expected a point cloud, found no such file"),
     ],

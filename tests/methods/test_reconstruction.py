@@ -178,9 +178,10 @@ def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
     ]
 
     def pixels_off(others):
-        points = random.uniform(-0.6, 0.6, (50, 3))
+        points = jnp.asarray(random.uniform(-0.6, 0.6, (50, 3)))
         seen = [
-            [project(points, v.viewmat, v.K)[0] for v in pair] for pair in zip(others, views, strict=True)
+            [project(points, jnp.asarray(v.viewmat), jnp.asarray(v.K))[0] for v in pair]
+            for pair in zip(others, views, strict=True)
         ]
         return np.mean([np.abs(a - b).mean() for a, b in seen])
 

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from gsjax.metrics.image import depth_error, psnr, ssim
+from gsjax.metrics.image import depth_error, ms_ssim, psnr, ssim
 
 
 def pair(seed=0, shape=(40, 30, 3)):
@@ -51,13 +52,75 @@ def test_an_empty_mask_scores_nothing():
 
 def test_shapes_that_do_not_agree_are_named():
     image, reference = pair()
-    for metric in (psnr, ssim):
+    for metric in (psnr, ssim, ms_ssim):
         with pytest.raises(ValueError, match=r"reference: got shape \(39, 30, 3\), want \(40, 30, 3\)"):
             metric(image, reference[1:])
         with pytest.raises(ValueError, match=r"mask: got shape \(3, 3\), want \(40, 30\)"):
             metric(image, reference, np.ones((3, 3), bool))
     with pytest.raises(ValueError, match="at least 11"):
         ssim(image[:10], reference[:10])
+
+
+def waves(shape=(176, 208, 3), seed=0):
+    """Pictures with something to see on every scale."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    sight = 0.5 + 0.3 * np.sin(x / 9) * np.cos(y / 13) + 0.1 * np.sin((x + y) / 40)
+    image = np.clip(sight[..., None] * np.array([1.0, 0.8, 0.5]) + rng.normal(0, 0.05, shape), 0, 1)
+    return image, np.clip(0.9 * image + 0.06 + rng.normal(0, 0.1, shape), 0, 1)
+
+
+def plain_ms_ssim(x, y):
+    """Of one channel, window by window."""
+    line = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.outer(line, line) / np.outer(line, line).sum()
+    score = 1.0
+    for scale, power in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+        mx, my, xx, yy, xy = (convolve2d(a, window, "valid") for a in (x, y, x * x, y * y, x * y))
+        similar = (2 * (xy - mx * my) + 9e-4) / (xx - mx * mx + yy - my * my + 9e-4)
+        if scale == 4:
+            similar = similar * (2 * mx * my + 1e-4) / (mx * mx + my * my + 1e-4)
+        score *= similar.mean() ** power
+        rows, columns = (np.minimum(np.arange(side + side % 2), side - 1) for side in x.shape)
+        x, y = (
+            a[rows][:, columns].reshape(len(rows) // 2, 2, len(columns) // 2, 2).mean((1, 3)) for a in (x, y)
+        )
+    return score
+
+
+@pytest.mark.parametrize("shape", [(176, 208, 3), (161, 175, 3)])
+def test_ms_ssim_agrees_with_a_plain_one(shape):
+    image, reference = waves(shape)
+    expected = [plain_ms_ssim(image[..., c], reference[..., c]) for c in range(3)]
+    assert ms_ssim(image, reference) == pytest.approx(np.mean(expected), abs=1e-12)
+    assert ms_ssim(image[..., 1], reference[..., 1]) == pytest.approx(expected[1], abs=1e-12)
+    assert 0.5 < np.mean(expected) < 0.99
+    assert ms_ssim(image, image) == pytest.approx(1.0)
+
+
+def test_ms_ssim_under_a_mask():
+    image, reference = waves()
+    reference[:, 104:] = image[:, 104:]
+    left = np.zeros(image.shape[:2], bool)
+    left[:, :90] = True
+    right = np.zeros(image.shape[:2], bool)
+    right[:, 200:] = True
+    everywhere = np.ones(image.shape[:2], bool)
+    assert ms_ssim(image, reference, left) < ms_ssim(image, reference, everywhere) < 1
+    assert ms_ssim(image, reference, right) == pytest.approx(1.0, abs=1e-3)
+    assert ms_ssim(image, reference, everywhere) == pytest.approx(ms_ssim(image, reference), abs=0.02)
+    assert math.isnan(ms_ssim(image, reference, ~everywhere))
+    spoiled = image.copy()
+    spoiled[:40, 200:] = 0.5  # a share of a place on the coarsest scale, outside
+    assert ms_ssim(spoiled, reference, left) == pytest.approx(ms_ssim(image, reference, left), abs=1e-9)
+
+
+def test_ms_ssim_of_opposite_pictures_is_zero_and_small_ones_are_refused():
+    image, _ = waves()
+    assert ms_ssim(image, 1 - image) == 0
+    for shape in ((160, 300), (300, 160, 3)):
+        with pytest.raises(ValueError, match=r"want at least 161 on each side"):
+            ms_ssim(np.zeros(shape), np.zeros(shape))
 
 
 def test_depth_error_counts_valid_pixels_only():

@@ -41,6 +41,17 @@ def test_psnr_tells_tracked_from_held_out():
     assert figure.axes[0].get_lines()[1].get_linestyle() == "--"
 
 
+def test_curves_of_fits_leave_out_where_nobody_looked():
+    rows = [{"seconds": 60.0 * i, "test_psnr": 20.0 + i if i % 2 else None} for i in range(6)]
+    figure = plots.fit_curves({"a": rows, "never judged": rows[:1]})
+    curve, end, *never = figure.axes[0].get_lines()
+    assert curve.get_label() == "a"
+    np.testing.assert_allclose(np.transpose(curve.get_data()), [[1, 21], [3, 23], [5, 25]])
+    np.testing.assert_allclose(np.transpose(end.get_data()), [[5, 25]])
+    assert end.get_color() == curve.get_color() != never[0].get_color()
+    assert all(len(line.get_xdata()) == 0 for line in never)
+
+
 @pytest.mark.parametrize("view", ["top", "3d"])
 def test_trajectories_survive_gaps_and_absent_objects(view, tmp_path):
     path = np.cumsum(np.ones((10, 3)) * 0.01, axis=0)

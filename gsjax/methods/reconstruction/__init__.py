@@ -6,16 +6,25 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
 
 config.py  what can be set            start.py  the first Gaussians
 model.py   what a fit may change      step.py   the loss, and one step
-fit.py     the loop on the host
+fit.py     the loop on the host       pruning.py  what no photograph needs
 """
 
-from gsjax.methods.reconstruction.config import FitConfig, GrowthConfig, RatesConfig, SplitConfig, StartConfig
+from gsjax.methods.reconstruction.config import (
+    PRESETS,
+    FitConfig,
+    GrowthConfig,
+    RatesConfig,
+    SplitConfig,
+    StartConfig,
+)
 from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, begin, fit
 from gsjax.methods.reconstruction.model import Model
+from gsjax.methods.reconstruction.pruning import light_of
 from gsjax.methods.reconstruction.start import Extent, View, extent_of
 from gsjax.methods.reconstruction.step import Batch, Observation, fit_loss, grow, reconstruction_step
 
 __all__ = [
+    "PRESETS",
     "Batch",
     "Extent",
     "FitConfig",
@@ -34,5 +43,6 @@ __all__ = [
     "fit",
     "fit_loss",
     "grow",
+    "light_of",
     "reconstruction_step",
 ]

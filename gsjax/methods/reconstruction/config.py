@@ -98,6 +98,8 @@ class FitConfig:
     """Draw with Mip-Splatting's compensation, for views from other distances."""
     background: Literal["data", "black", "white", "random"] = "data"
     """Colour behind the scene; data: what the photographs were composited on, else black."""
+    prune: float = 0.5
+    """In the end, Gaussians that send less light than this into every photograph, in pixels, are left out."""
     exposure: bool = False
     """Learn an affine map of colours for each photograph, where exposure or white balance differ."""
     refine_poses: bool = False
@@ -118,3 +120,23 @@ class FitConfig:
         for name in ("dssim_weight", "coarse_until"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+
+
+PRESETS = {
+    "quick": FitConfig(
+        steps=1_500, cap=20_000, sh_degree=0, coarse_until=0.5, start=StartConfig(count=10_000)
+    ),
+    "classic": FitConfig(strategy="split", cap=200_000),
+    "depth": FitConfig(depth_weight=0.5, start=StartConfig(source="depth")),
+    "published": FitConfig(
+        steps=30_000,
+        cap=1_000_000,
+        sh_degree=3,
+        sh_every=1_000,
+        coarse_until=0.0,
+        start=StartConfig(count=100_000),
+        growth=GrowthConfig(begin=500, end=25 / 30),
+    ),
+}
+"""Settings by name: for a first look, with 3DGS's cloning and splitting, for RGB-D, and those of 3DGS-MCMC,
+which ask for a GPU or a night."""

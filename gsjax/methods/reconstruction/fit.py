@@ -171,7 +171,7 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
             if config.strategy == "split":
                 room = min(config.cap, rung(int(slots_wanted(model, optimizer, config))))
                 model, optimizer = enlarged(problem, model, optimizer, 0, room)
-            model, optimizer = densify(model, optimizer, turn, i)
+            model, optimizer = densify(model, optimizer, turn, i, _all_looked(config, i, len(views)))
         i += 1
         capacity = np.array([[*of, room] for of, room in plans.items()], int)
         now = FitState(model, optimizer, i, capacity)
@@ -188,12 +188,12 @@ def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
         return step.update(model, optimizer, batch, step=share, key=key)
 
     @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
-    def densify(model, optimizer, key, i):
+    def densify(model, optimizer, key, i, all_looked):
         if config.strategy == "relocate":
-            return grow(model, optimizer, key, config.cap, config.growth.factor)
+            return grow(model, optimizer, key, config.cap, config.growth.factor, all_looked)
         every, between = config.split.reset_every, config.split.every
         reset = i // every > jnp.maximum(i - between, 0) // every
-        return split(model, optimizer, key, config, radius, reset)
+        return split(model, optimizer, key, config, radius, reset, all_looked)
 
     return advance, densify
 
@@ -214,6 +214,14 @@ def _shrink(config: FitConfig, share: float) -> int:
 def _densifies(config: FitConfig, step: int, share: float) -> bool:
     when = config.growth if config.strategy == "relocate" else config.split
     return step >= when.begin and step % when.every == 0 and share < when.end
+
+
+def _all_looked(config: FitConfig, step: int, views: int) -> bool:
+    """Whether each photograph had a turn since this was last so; two rounds of turns hold a whole one."""
+    if config.strategy == "split":  # which forgets each time what was seen
+        return config.split.every >= 2 * views
+    period = -(-2 * views // config.growth.every) * config.growth.every
+    return step >= period and step % period == 0
 
 
 def _observe(view: View, number: int, shrink: int) -> Observation:

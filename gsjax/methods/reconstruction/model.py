@@ -21,13 +21,14 @@ class Model(eqx.Module):
         gaussians: of all slots.
         exposures: of each photograph, what is added to the affine map [I | 0] of its colours.
         twists: of each camera, a turn (radians) and a shift (radii of the scene), in the world's axes.
-        nudges: zeros added to the projected means, for their gradient says where Gaussians are too few.
+        nudges: zeros added to the projected means. Their gradient says which Gaussians are seen at all, and
+            where there are too few.
     """
 
     gaussians: Gaussians
+    nudges: Float[Array, "1 n 2"]
     exposures: Float[Array, "views 3 4"] | None = None
     twists: Float[Array, "views 6"] | None = None
-    nudges: Float[Array, "1 n 2"] | None = None
 
 
 def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
@@ -35,9 +36,9 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
     dtype = gaussians.means.dtype
     return Model(
         gaussians,
+        jnp.zeros((1, gaussians.num, 2), dtype),
         jnp.zeros((views, 3, 4), dtype) if config.exposure else None,
         jnp.zeros((views, 6), dtype) if config.refine_poses else None,
-        jnp.zeros((1, gaussians.num, 2), dtype) if config.strategy == "split" else None,
     )
 
 
@@ -84,8 +85,8 @@ def with_slots(model: Model, count: int) -> Model:
     )
     logits = padded.logit_opacities.at[-more:].set(EMPTY_LOGIT)
     padded = eqx.tree_at(lambda g: g.logit_opacities, padded, logits)
-    nudges = None if model.nudges is None else jnp.pad(model.nudges, [(0, 0), (0, more), (0, 0)])
-    return Model(padded, model.exposures, model.twists, nudges)
+    nudges = jnp.pad(model.nudges, [(0, 0), (0, more), (0, 0)])
+    return Model(padded, nudges, model.exposures, model.twists)
 
 
 State = TypeVar("State")

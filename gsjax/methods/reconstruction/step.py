@@ -15,7 +15,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.reconstruction.config import FitConfig
 from gsjax.methods.reconstruction.model import Model, exposed, refined
-from gsjax.optim.densification import exploration, forgotten, is_alive, relocate
+from gsjax.optim.densification import EMPTY_LOGIT, exploration, forgotten, is_alive, relocate
 from gsjax.optim.splitting import Pull, divide, wanted, watch_pull, with_low_opacities
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
@@ -61,9 +61,8 @@ def fit_loss(config: FitConfig, radius: float) -> Callable:
         if model.twists is not None:
             viewmat = refined(camera.viewmat, model.twists, seen.view, radius)
             camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
-        nudges = model.nudges
-        if nudges is not None:  # by half a picture, so that one threshold serves pictures of any size
-            nudges = nudges * jnp.array([camera.width / 2, camera.height / 2], nudges.dtype)
+        # By half a picture, so that one threshold of the pull serves pictures of any size.
+        nudges = model.nudges * jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
         drawn = render(gaussians, camera, plan, backgrounds=background, means2d_offset=nudges)
         image = drawn.colors
         if model.exposures is not None:
@@ -111,9 +110,7 @@ def reconstruction_step(config: FitConfig, radius: float) -> Step:
         there += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
         # Means and twists go as far as Adam's rate of 1 says, and then only a share of it, which falls.
         ours = {name: 1.0 if name in ("means", "twists") else rates[name] for name in there}
-        return gradient_step(
-            loss, per_field_adam(ours, others={} if model.nudges is None else {"nudges": watch_pull()})
-        )
+        return gradient_step(loss, per_field_adam(ours, others={"nudges": watch_pull()}))
 
     def update(params: Model, state, batch: Batch, *, step, key: PRNGKeyArray):
         moved, new_state, info = of(params).update(params, state, batch, step=step, key=key)
@@ -137,14 +134,22 @@ def reconstruction_step(config: FitConfig, radius: float) -> Step:
 
 
 def grow(
-    model: Model, state: Any, key: PRNGKeyArray, cap: Int[Array, ""] | int, factor: float
+    model: Model,
+    state: Any,
+    key: PRNGKeyArray,
+    cap: Int[Array, ""] | int,
+    factor: float,
+    all_looked: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
-    """Dead Gaussians move to where more are needed, and there may be `factor` times as many, up to `cap`."""
-    gaussians = model.gaussians
+    """Dead Gaussians move to where more are needed, and there may be `factor` times as many, up to `cap`.
+    Where all photographs looked since the last time, those that none has seen count as dead."""
+    gaussians, pull = _without_unseen(model.gaussians, state, all_looked), _pull_of(state)
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
     slots = jnp.clip((used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
     state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
+    seen = jnp.where(all_looked, 0.0, jnp.where(touched, 1.0, pull.seen))  # who is new cannot have been seen
+    state = _map_nodes(Pull, lambda pull: Pull(pull.total, seen), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
 
 
@@ -161,12 +166,14 @@ def split(
     config: FitConfig,
     radius: float,
     reset: Bool[Array, ""] | bool,
+    all_looked: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
     """Gaussians that are pulled hard are cloned or split, others pruned, and what was known of pulls is
-    forgotten; with `reset`, opacities are lowered."""
+    forgotten; with `reset`, opacities are lowered. Where all photographs looked since the last time, those
+    that none has seen are pruned too."""
     options, pull = config.split, _pull_of(state)
     moved, touched = divide(
-        model.gaussians,
+        _without_unseen(model.gaussians, state, all_looked),
         pull,
         key,
         config.cap,
@@ -180,6 +187,13 @@ def split(
     state = _map_nodes(Gaussians, lambda known: _forget_opacities(known, every & reset), state)
     state = _map_nodes(Pull, lambda known: forgotten(known, every), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
+
+
+def _without_unseen(gaussians: Gaussians, state: Any, all_looked: Any) -> Gaussians:
+    """What no photograph sees, because it is hidden or outside of all, becomes an empty slot."""
+    unseen = all_looked & (_pull_of(state).seen == 0)
+    logits = jnp.where(unseen, EMPTY_LOGIT, gaussians.logit_opacities)
+    return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 def _map_nodes(kind: type, function: Callable, tree: Any) -> Any:

@@ -1,0 +1,72 @@
+"""The curve of a fit as TensorBoard's event files, beside metrics.jsonl; an optional extra."""
+
+import importlib
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+TAGS = {"loss": "loss", "psnr": "psnr", "test_psnr": "psnr_held_out", "alive": "gaussians"}
+"""What the values of a curve's row are called there."""
+_FLUSHED_EVERY_S = 1
+
+
+class TensorBoard:
+    """Writes event files into RUN/tensorboard, a row of a fit's curve at a time.
+
+    Each row is on disk a second after `add`. Where a run was killed, there may be rows of after the
+    checkpoint from which it is resumed: they are marked as void, as TensorBoard understands it, so none is
+    shown twice.
+
+    Args:
+        folder: that of the run.
+        rows: those that a resumed run begins with; none begins anew, without what an earlier run left.
+
+    Raises:
+        ValueError: tensorboardX is not installed.
+    """
+
+    def __init__(self, folder: Path, rows: Sequence[Mapping[str, Any]] = ()):
+        writer = _writer_class()
+        path = folder / "tensorboard"
+        going_on = len(rows) > 0 and any(path.glob("events.*"))
+        if path.exists() and not going_on:
+            shutil.rmtree(path)
+        begun = rows[-1]["step"] + 1 if going_on else None
+        # Files are named by the second, and read in the order of their names.
+        self._writer = writer(
+            str(path), purge_step=begun, filename_suffix=f".{begun or 0:08d}", flush_secs=_FLUSHED_EVERY_S
+        )
+        self._step = 0
+        for row in rows:
+            self._step = row["step"]
+            if not going_on:  # the run began without event files
+                self.add(row)
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Writes what a row has: its loss, PSNR, PSNR of held-out views, number of Gaussians."""
+        self._step = row["step"]
+        for key, tag in TAGS.items():
+            if row[key] is not None and math.isfinite(row[key]):
+                self._writer.add_scalar(tag, row[key], self._step)
+
+    def close(self, pictures: Mapping[str, Path] | None = None) -> None:
+        """Ends the file, after pictures by their names, which stand at the last step; a missing one is left
+        out."""
+        for name, path in (pictures or {}).items():
+            picture = cv2.imread(str(path))
+            if picture is not None:
+                self._writer.add_image(name, picture[..., ::-1], self._step, dataformats="HWC")
+        self._writer.close()
+
+
+def _writer_class() -> Any:
+    try:
+        return importlib.import_module("tensorboardX").SummaryWriter
+    except ImportError as error:
+        raise ValueError(
+            '--tensorboard: expected tensorboardX, which is not installed: pip install "gsjax[tensorboard]"'
+        ) from error

@@ -1,0 +1,12 @@
+"""A scene in a web browser: `open_viewer(Viewable("name", gaussians))`. Needs viser, which is imported late.
+
+The browser draws splats in one colour; beside them stands our own rasterizer's picture from the same camera.
+Files in the order in which the data flows: viewable (what is shown), pick, cameras, splats (what the browser
+gets), drawing (our picture), newest (threads), words, splat_nodes and shot_nodes, page, server.
+"""
+
+from gsjax.viz.viewer.pick import Picked, pick
+from gsjax.viz.viewer.server import Viewer, open_viewer
+from gsjax.viz.viewer.viewable import Shots, Viewable
+
+__all__ = ["Picked", "Shots", "Viewable", "Viewer", "open_viewer", "pick"]

@@ -1,0 +1,104 @@
+"""Our rasterizer's picture of a scene from any camera: compiled once a size, however the camera moves."""
+
+import threading
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from gsjax.geometry.cameras import Camera
+from gsjax.geometry.spherical_harmonics import rgb_to_sh0
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render, render
+from gsjax.viz.colors import colorize_depth, to_uint8
+
+Shown = Literal["colour", "depth", "alpha", "label", "features"]
+
+_HEADROOM = 1.5  # what a plan holds more than its first camera needs: the next ones need about as much
+_OPAQUE = 0.5  # pixels with less alpha have no depth
+
+
+class Drawn(NamedTuple):
+    """One picture.
+
+    Attributes:
+        colors: RGB over the background, 0 to 1.
+        depths: expected depth, 0 where less than half of a pixel is covered.
+        alphas: 0 to 1.
+    """
+
+    colors: Float[np.ndarray, "height width 3"]
+    depths: Float[np.ndarray, "height width"]
+    alphas: Float[np.ndarray, "height width"]
+
+
+class Drawer:
+    """Draws scenes of one kind; any thread may call it.
+
+    Args:
+        background: RGB, 0 to 1.
+        antialiased: whether opacities are scaled by what the dilation spread out.
+        compiler_options: of the program that draws.
+    """
+
+    def __init__(
+        self,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        antialiased: bool = False,
+        compiler_options: dict[str, Any] | None = None,
+    ):
+        self._background = np.array([background], np.float32)
+        self._mode = "antialiased" if antialiased else "classic"
+        self._plans: dict[tuple[int, ...], Any] = {}
+        self._lock = threading.Lock()
+        self._program: Callable = jax.jit(_draw, compiler_options=compiler_options or {})
+
+    def __call__(self, gaussians: Gaussians, camera: Camera) -> Drawn:
+        """The picture of one camera [1]. A plan that is too small grows, and is kept.
+
+        Raises:
+            ValueError: no plan can hold what the camera sees.
+        """
+        kind = (camera.width, camera.height, gaussians.num, gaussians.sh_degree)
+        with self._lock:
+            plan = self._plans.get(kind)
+            if plan is None:
+                options = {"headroom": _HEADROOM, "rasterize_mode": self._mode}
+                plan = plan_render(gaussians, camera, **options)
+            while True:
+                *images, overflow, needed = jax.device_get(
+                    self._program(gaussians, camera, self._background, plan)
+                )
+                if not overflow:
+                    self._plans[kind] = plan
+                    return Drawn(*images)
+                plan = plan.grown(int(needed), _HEADROOM)
+
+
+def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any) -> tuple[jax.Array, ...]:
+    drawn = render(gaussians, camera, plan, backgrounds=background)
+    alphas = drawn.alphas[0]
+    depths = jnp.where(alphas > _OPAQUE, drawn.depths[0], 0.0)
+    return drawn.colors[0], depths, alphas, drawn.meta.overflow.any(), drawn.meta.needed.max()
+
+
+def recolored(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
+    """The same Gaussians in other colours (RGB, 0 to 1), the same from all sides."""
+    sh0 = rgb_to_sh0(jnp.asarray(colors, gaussians.sh0.dtype))[:, None, :]
+    return eqx.tree_at(lambda g: (g.sh0, g.shN), gaussians, (sh0, None), is_leaf=lambda leaf: leaf is None)
+
+
+def picture_of(
+    drawn: Drawn, shown: Shown, depths: tuple[float, float] | None
+) -> UInt8[np.ndarray, "height width 3"]:
+    """What a panel shows of it; depth between the ends of a scale, or between the picture's own."""
+    if shown == "depth":
+        return colorize_depth(drawn.depths, *(depths or (None, None)))
+    if shown == "alpha":
+        grey = np.round(255 * np.clip(drawn.alphas, 0, 1)).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1)
+    return to_uint8(drawn.colors)

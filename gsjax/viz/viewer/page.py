@@ -1,0 +1,359 @@
+"""The page of one browser: what stands on it, and what happens when it is touched."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from gsjax.scene.gaussians import Gaussians
+from gsjax.viz.viewer import words
+from gsjax.viz.viewer.cameras import (
+    Pose,
+    browser_camera,
+    distance_along,
+    first_pose,
+    frustum_size,
+    picture_size,
+    pose_of,
+)
+from gsjax.viz.viewer.drawing import Drawer, Shown, picture_of, recolored
+from gsjax.viz.viewer.newest import Newest
+from gsjax.viz.viewer.pick import Picked, pick
+from gsjax.viz.viewer.shot_nodes import ShotNodes, shrunk
+from gsjax.viz.viewer.splat_nodes import Look, SplatNodes
+from gsjax.viz.viewer.splats import Palette, depth_range
+from gsjax.viz.viewer.viewable import Shots, Viewable
+
+Save = Callable[[str, np.ndarray], Path]
+"""Keeps a picture [H,W,3] under a name of its kind; returns where."""
+
+WIDTHS = ("160", "240", "320", "480", "640", "960", "1280")
+_WIDTH = "320"
+_PHOTOGRAPH = 640  # pixels, the longer side of one that is shown beside the render
+_SETTLE_S, _PATIENCE_S = 0.12, 0.6  # of the render, while the camera moves
+_MOST_HZ = 12.0  # frames a second when playing
+_TIMEOUT_S = 30.0  # for the browser's own picture
+_NUMBERED = "A PNG with the next number; none is written over"
+_MARK = (255, 70, 160)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all pages of a viewer have in common.
+
+    Attributes:
+        scene: what is shown.
+        drawer: our rasterizer, with what it has compiled.
+        max_gaussians: that a browser gets.
+        save: keeps screenshots; None offers them for download only.
+    """
+
+    scene: Viewable
+    drawer: Drawer
+    max_gaussians: int
+    save: Save | None
+
+
+class Page:
+    """One browser. Callbacks note what is wanted; two threads bring splats and render up to it.
+
+    Args:
+        client: viser's handle of the browser, connected.
+        shared: what it shows.
+    """
+
+    def __init__(self, client: Any, shared: Shared):
+        self._client, self._shared, self._scene = client, shared, shared.scene
+        self._frame, self._picture, self._at = 0, None, (-1, self._scene.at(0))
+        self._picked: Picked | None = None
+        self._shot: int | None = None
+        self._photographed: tuple[int, int] | None = None
+        self._start = first_pose(self._scene)
+        self._playing = threading.Event()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._palette = Palette(self._scene)
+        self._splats = SplatNodes(client.scene, self._scene, shared.max_gaussians)
+        self._shots = None if self._scene.shots is None else self._frusta(self._scene.shots)
+        self._build()
+        self._send_splats()
+        self._sender = Newest(self._send_splats, 0.0, 0.0)
+        self._renderer = Newest(self._render, _SETTLE_S, _PATIENCE_S)
+        client.camera.on_update(lambda _: self._moved())
+        client.scene.on_click()(self._clicked)
+        self._renderer.ask()
+
+    def close(self) -> None:
+        """Stop what runs for this page."""
+        self._closed.set()
+        self._sender.close()
+        self._renderer.close()
+        if self._shots is not None:
+            self._shots.close()
+
+    # What stands on the page.
+
+    def _build(self) -> None:
+        gui, scene = self._client.gui, self._scene
+        gui.add_markdown(words.heading(scene, min(scene.gaussians.num, self._shared.max_gaussians)))
+        if scene.num_frames > 1:
+            with gui.add_folder("Time"):
+                last = scene.num_frames - 1
+                self._slider = gui.add_slider("Frame", min=0, max=last, step=1, initial_value=0)
+                self._moment = gui.add_markdown(words.moment(scene, 0))
+                self._play = gui.add_button("Play", color="gray")
+                self._slider.on_update(lambda _: self._to_frame(int(self._slider.value)))
+                self._play.on_click(lambda _: self._toggle_play())
+        with gui.add_folder("View (splats, drawn by the browser)"):
+            self._coloring = gui.add_dropdown("Colour by", scene.colorings)
+            self._legend = gui.add_html("", visible=False)
+            back = gui.add_button("Back to the start", color="gray", hint="The camera as it was at first")
+            self._coloring.on_update(lambda _: self._moved())
+            back.on_click(lambda _: self._go(self._start))
+        if self._shots is not None:
+            self._build_shots(self._shots)
+        with gui.add_folder("Picked"):
+            self._told = gui.add_markdown(words.HOW_TO_PICK)
+        with gui.add_folder("Screenshot"):
+            ours = gui.add_button("Save the render", color="gray", hint=_NUMBERED)
+            theirs = gui.add_button("Save the view", color="gray", hint="As the browser draws it")
+            ours.on_click(lambda _: self._keep("render", self._picture))
+            theirs.on_click(lambda _: self._keep("view", self._browser_picture()))
+        panel = gui.add_panel()
+        with panel.add_tab("Render by gsjax"):
+            self._image = gui.add_image(np.full((208, 320, 3), 40, np.uint8), format="png")
+            self._status = gui.add_markdown("compiling ...")
+            self._shown = gui.add_dropdown("Shows", self._shows())
+            self._width = gui.add_dropdown("Width", WIDTHS, initial_value=_WIDTH, hint="In pixels")
+            self._photograph = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
+            self._shown.on_update(lambda _: self._renderer.ask())
+            self._width.on_update(lambda _: self._renderer.ask())
+        panel.dock_left()
+        panel.set_width(350)
+
+    def _build_shots(self, nodes: ShotNodes) -> None:
+        gui = self._client.gui
+        with gui.add_folder("Photographs"):
+            frustums = gui.add_checkbox("Show where they were taken", False)
+            self._visited = gui.add_dropdown("Look from", ("...", *self._names))
+            frustums.on_update(lambda _: nodes.show(frustums.value, self._frame))
+            self._visited.on_update(lambda _: self._visit_named(self._visited.value))
+
+    def _frusta(self, shots: Shots) -> ShotNodes:
+        self._names = unique(shots.names)
+
+        def go(shot: int) -> None:
+            self._visited.value = self._names[shot]  # which goes there
+
+        return ShotNodes(self._client.scene, shots, frustum_size(self._scene), go)
+
+    def _shows(self) -> tuple[Shown, ...]:
+        extra = tuple(name for name in self._scene.colorings if name in ("label", "features"))
+        return ("colour", "depth", "alpha", *extra)
+
+    # What happens when it is touched.
+
+    def _moved(self) -> None:
+        """The camera, or what is wanted of it, changed."""
+        self._renderer.ask()
+        self._sender.ask()
+
+    def _to_frame(self, frame: int) -> None:
+        self._frame = frame
+        self._moment.content = words.moment(self._scene, frame)
+        if self._shots is not None:
+            self._shots.move(frame)
+        if self._picked is not None:  # it may have moved away from under the mark
+            self._mark(None)
+            self._told.content = words.HOW_TO_PICK
+        self._moved()
+
+    def _toggle_play(self) -> None:
+        if self._playing.is_set():
+            self._playing.clear()
+            return
+        self._playing.set()
+        self._play.label = "Stop"
+        threading.Thread(target=self._run, name="gsjax playing", daemon=True).start()
+
+    def _run(self) -> None:
+        """Frame after frame, from the first again after the last."""
+        pause = frame_pause(self._scene.times)
+        while self._playing.is_set() and not self._closed.wait(pause):
+            self._slider.value = (int(self._slider.value) + 1) % self._scene.num_frames
+        self._play.label = "Play"
+
+    def _visit_named(self, name: str) -> None:
+        if self._scene.shots is not None and name in self._names:
+            self._visit(self._scene.shots, self._names.index(name))
+
+    def _visit(self, shots: Shots, shot: int) -> None:
+        """Look from where a photograph was taken; what draws shows it beside."""
+        self._shot = shot
+        distance = distance_along(self._gaussians(), shots.viewmats[shots.at(self._frame), shot])
+        self._go(pose_of(shots, self._frame, shot, distance))
+        self._renderer.ask()
+
+    def _go(self, pose: Pose) -> None:
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.position = pose.position
+            camera.look_at = pose.target
+            camera.up_direction = pose.up
+            camera.fov = pose.fov
+
+    def _clicked(self, event: Any) -> None:
+        picked = pick(self._gaussians(), np.array(event.ray_origin), np.array(event.ray_direction))
+        self._mark(picked)
+        self._told.content = words.described(self._scene, picked, self._frame)
+
+    def _mark(self, picked: Picked | None) -> None:
+        """Show the shape of a picked Gaussian, or of none."""
+        for part in ("shape", "name"):
+            self._client.scene.remove_by_name(f"/picked/{part}")
+        self._picked = picked
+        if picked is None:
+            return
+        gaussians, row = self._gaussians(), picked.index
+        center = np.asarray(gaussians.means, np.float64)[row]
+        quat = np.asarray(gaussians.quats, np.float64)[row]
+        self._client.scene.add_icosphere(
+            "/picked/shape",
+            color=_MARK,
+            wireframe=True,
+            scale=tuple(2 * np.exp(np.asarray(gaussians.log_scales, np.float64)[row])),
+            wxyz=quat / np.linalg.norm(quat),
+            position=center,
+            cast_shadow=False,
+        )
+        name = self._scene.name_of(row)
+        text = f"{row}" if name is None else f"{name}, {row}"
+        self._client.scene.add_label("/picked/name", text, position=center, anchor="bottom-left")
+
+    # What two threads do.
+
+    def _gaussians(self) -> Gaussians:
+        """The scene in the present frame."""
+        with self._lock:
+            if self._at[0] != self._frame:
+                frame = self._frame
+                self._at = (frame, self._scene.at(frame))
+            return self._at[1]
+
+    def _view(self, width: int) -> tuple[Any, tuple[float, float] | None]:
+        """The browser's camera in a picture so wide, and the scale of depth in it."""
+        camera = self._client.camera
+        width, height = picture_size(width, (camera.image_width, camera.image_height))
+        seen = browser_camera(camera.wxyz, camera.position, camera.fov, width, height)
+        means = np.asarray(self._gaussians().means)
+        return seen, depth_range(means, np.asarray(seen.viewmat[0]), camera.fov, width / height)
+
+    def _send_splats(self) -> None:
+        coloring = self._coloring.value
+        look = Look(coloring)
+        if coloring == "depth":
+            seen, depths = self._view(int(_WIDTH))
+            look = Look(coloring, np.asarray(seen.viewmat[0], np.float64), depths)
+        self._splats.show(self._gaussians(), self._frame, look)
+        labels = [] if self._scene.labels is None else np.unique(self._scene.labels).tolist()
+        self._legend.content = words.legend(self._scene, coloring, look.depths, labels)
+        self._legend.visible = bool(self._legend.content)
+
+    def _render(self) -> None:
+        try:
+            camera, depths = self._view(int(self._width.value))
+            gaussians, shown = self._gaussians(), self._shown.value
+            if shown in ("label", "features"):
+                rows = np.arange(gaussians.num)
+                colors = self._palette(shown, np.asarray(gaussians.means), rows, None, None)
+                gaussians = recolored(gaussians, colors)
+            drawn = self._shared.drawer(gaussians, camera)
+            self._picture = picture_of(drawn, shown, depths)
+            self._image.image = self._picture
+            told = f"{camera.width} x {camera.height} pixels, all {gaussians.num:,} Gaussians"
+            if shown == "depth" and depths is not None:
+                near, far = (words.length(value, self._scene.unit) for value in depths)
+                told += f"; bright: {near} away, dark: {far}"
+            self._status.content = told
+            self._show_photograph()
+        except Exception as error:  # in a thread of its own nobody else would hear of it
+            self._status.content = f"This cannot be drawn: {error}"
+
+    def _show_photograph(self) -> None:
+        """The photograph that was last gone to, of the present frame."""
+        shots, shot = self._scene.shots, self._shot
+        if shots is None or shots.load_image is None or shot is None:
+            return
+        wanted = (shots.at(self._frame), shot)
+        if wanted == self._photographed:
+            return
+        self._photographed = wanted
+        try:
+            picture = shots.load_image(*wanted)
+        except (ValueError, OSError) as error:
+            self._photograph.visible = False
+            self._say("The photograph cannot be shown", str(error), color="red")
+            return
+        when = f", frame {wanted[0]}" if len(shots.viewmats) > 1 else ""
+        self._photograph.label = f"photograph {self._names[shot]}{when}"
+        self._photograph.image = shrunk(picture, _PHOTOGRAPH)
+        self._photograph.visible = True
+
+    # Screenshots.
+
+    def _browser_picture(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        camera = self._client.camera
+        try:
+            picture = self._client.get_render(
+                camera.image_height, camera.image_width, transport_format="png", timeout=_TIMEOUT_S
+            )
+        except (RuntimeError, TimeoutError):
+            return None
+        return over(picture, self._scene.background)
+
+    def _keep(self, kind: str, picture: np.ndarray | None) -> None:
+        if picture is None:
+            self._say("There is no picture yet", "Wait until it is drawn.", color="red")
+            return
+        name = f"{kind}.png"
+        if self._shared.save is not None:
+            try:
+                path = self._shared.save(kind, picture)
+            except OSError as error:
+                self._say("The screenshot could not be kept", str(error), color="red")
+            else:
+                name = path.name
+                self._say("Screenshot kept", str(path))
+        encoded, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+        self._client.send_file_download(name, data.tobytes() if encoded else b"")
+
+    def _say(self, title: str, body: str, color: str | None = None) -> None:
+        self._client.add_notification(title, body, color=color, auto_close_seconds=8.0)
+
+
+def unique(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The same names, numbered where two are alike."""
+    if len(set(names)) == len(names):
+        return names
+    return tuple(f"{number}: {name}" for number, name in enumerate(names))
+
+
+def frame_pause(times: np.ndarray | None) -> float:
+    """Seconds between frames when playing: as they were taken, but not faster than a browser follows."""
+    step = 0.0 if times is None or len(times) < 2 else float(np.median(np.diff(times)))
+    return float(np.clip(step, 1 / _MOST_HZ, 1.0))
+
+
+def over(
+    picture: UInt8[np.ndarray, "h w channels"], background: tuple[float, float, float]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture that may be transparent over a background (RGB, 0 to 1)."""
+    if picture.shape[2] == 3:
+        return picture
+    alpha = picture[..., 3:] / 255.0
+    return np.round(alpha * picture[..., :3] + (1 - alpha) * 255 * np.array(background)).astype(np.uint8)

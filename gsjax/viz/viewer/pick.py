@@ -1,0 +1,79 @@
+"""Which Gaussian a ray meets."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.scene.gaussians import Gaussians
+
+_FAINTEST, _FULL = 1 / 255, 0.99  # the rasterizer's alpha_min and alpha_max
+
+
+class Picked(NamedTuple):
+    """What a ray meets.
+
+    Attributes:
+        index: row of the Gaussian that gives most of the colour.
+        depth: how far along the ray it is densest.
+        point: where that is.
+        share: of the colour, 0 to 1.
+        alpha: how much of the ray all Gaussians together stop, 0 to 1.
+    """
+
+    index: int
+    depth: float
+    point: Float[np.ndarray, "3"]
+    share: float
+    alpha: float
+
+
+def pick(
+    gaussians: Gaussians,
+    origin: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+    *,
+    least: float = 0.5,
+    near: float = 0.01,
+) -> Picked | None:
+    """The Gaussian that gives most of the colour along a ray; None where the ray goes through.
+
+    Along a ray o + t d a Gaussian is densest at its least Mahalanobis distance q, where
+    alpha = opacity exp(-q^2 / 2). Composited in the order of these t, its share is alpha times what those
+    before it let through, as in a picture.
+
+    Args:
+        gaussians: N of them.
+        origin: where the ray begins, in the world.
+        direction: of any length but 0.
+        least: a ray of which less is stopped meets nothing.
+        near: Gaussians nearer than this are not met.
+
+    Raises:
+        ValueError: `direction` has no length.
+    """
+    origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
+    length = np.linalg.norm(direction)
+    if not length > 0:
+        raise ValueError(f"direction: got {direction}, want one of some length")
+    direction = direction / length
+    # In the axes of each Gaussian, in units of its standard deviations.
+    axes = np.asarray(quats_to_matrices(jnp.asarray(gaussians.quats)), np.float64)
+    scales = np.exp(np.asarray(gaussians.log_scales, np.float64))
+    start = np.einsum("nji,nj->ni", axes, origin - np.asarray(gaussians.means, np.float64)) / scales
+    along = np.einsum("nji,j->ni", axes, direction) / scales
+    depths = -np.sum(start * along, axis=1) / np.sum(along * along, axis=1)
+    squared = np.sum((start + depths[:, None] * along) ** 2, axis=1)
+    alphas = np.minimum(np.asarray(gaussians.opacities, np.float64) * np.exp(-squared / 2), _FULL)
+    met = np.flatnonzero((depths > near) & (alphas >= _FAINTEST))
+    met = met[np.argsort(depths[met], kind="stable")]
+    through = np.concatenate([[1.0], np.cumprod(1 - alphas[met])])
+    stopped = 1 - through[-1]
+    if stopped < least:
+        return None
+    shares = alphas[met] * through[:-1]
+    best = int(shares.argmax())
+    depth = float(depths[met[best]])
+    return Picked(int(met[best]), depth, origin + depth * direction, float(shares[best]), float(stopped))

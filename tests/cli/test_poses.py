@@ -1,0 +1,182 @@
+"""`gsjax poses`: from pictures without poses to a dataset that `gsjax fit` opens."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from gsjax.cli import main
+from gsjax.data import open_photographs
+from gsjax.data.alignment import align_cameras
+from gsjax.io.video import VideoWriter
+from tests.data import dots, room
+
+pytest.importorskip("pycolmap")
+
+COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Pictures of the room, and one of something else."""
+    folder = tmp_path_factory.mktemp("room") / "photos"
+    room.write(folder, COUNT)
+    dots.save(folder / "else.png", room.picture(room.viewmats(1)[0])[::-1, ::-1, ::-1] // 7)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(photographs, tmp_path_factory):
+    """The dataset that is made of them."""
+    out = tmp_path_factory.mktemp("found") / "dataset"
+    assert main(["poses", str(photographs), "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def say(capfd):
+    def call(*arguments) -> tuple[int, str]:
+        code = main(["poses", *map(str, arguments)])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err
+
+    return call
+
+
+def test_cameras_are_where_the_pictures_were_drawn_from(found):
+    scene = open_photographs(found)
+    assert scene.names == tuple(f"{i}.png" for i in range(COUNT))
+    aligned = align_cameras(scene.viewmats, room.viewmats(COUNT))
+    assert aligned.turned_deg.max() < 0.2
+    assert aligned.moved.max() < 0.005 * aligned.extent
+    np.testing.assert_allclose(scene.Ks[:, 0, 0], room.FOCAL, rtol=0.01)
+    assert len(scene.cloud.points) > 500
+    floor_and_walls = aligned.scale * scene.cloud.points @ aligned.rotation.T + aligned.translation
+    off = np.abs(floor_and_walls - [1, 1, 0]).min(axis=1)
+    assert np.quantile(off, 0.9) < 0.01
+    assert scene.image(0).shape == (room.HEIGHT, room.WIDTH, 3)
+
+
+def test_the_report_says_what_was_found_and_what_was_left(found):
+    report = json.loads((found / "poses.json").read_text())
+    assert (report["photographs"], report["registered"]) == (COUNT + 1, COUNT)
+    assert (report["left_out"], report["other_models"]) == (["else.png"], [])
+    assert 0 < report["error_px"] < 0.5
+    assert report["points"] > 500
+    assert report["pairs"] >= COUNT - 1
+    assert set(report["seconds"]) == {"features", "matching", "mapping", "total"}
+    assert sorted(path.name for path in found.iterdir()) == ["images", "poses.json", "sparse"]
+    assert len(list((found / "images").iterdir())) == COUNT + 1
+
+
+def test_again_gives_the_same_bits_and_compares(found, photographs, say, tmp_path):
+    """In place this time: the photographs stay where they are."""
+    folder = tmp_path / "mine/images"
+    shutil.copytree(photographs, folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    code, said = say(folder, "--out", folder.parent, "--compare", found)
+    assert code == 0, said
+    assert f"{COUNT} of {COUNT + 1} photographs" in said
+    assert "1: else.png" in said
+    assert f"with {COUNT} of dataset: turned by 0.000°" in " ".join(said.split())
+    for name in ("cameras", "images", "points3D"):
+        files = [root / f"sparse/0/{name}.bin" for root in (found, folder.parent)]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    compared = json.loads((folder.parent / "poses.json").read_text())["compared"]
+    assert compared["photographs"] == COUNT
+    assert compared["focal_ratio"] == 1
+
+
+@pytest.mark.slow
+def test_a_video(say, tmp_path):
+    with VideoWriter(tmp_path / "walk.mp4", 10, quality=8) as video:
+        for viewmat in room.viewmats(18):
+            video.write(room.picture(viewmat))
+    code, said = say(
+        tmp_path / "walk.mp4", "--out", tmp_path / "out", "--frames", "9", "--compare", "nothing"
+    )
+    assert code == 2, said
+    code, said = say(tmp_path / "walk.mp4", "--out", tmp_path / "out", "--frames", "9")
+    assert code == 0, said
+    assert "comparing neighbours" in said
+    scene = open_photographs(tmp_path / "out")
+    assert scene.num >= 8
+    truth = room.viewmats(18)[[int(name[6:12]) for name in scene.names]]
+    aligned = align_cameras(scene.viewmats, truth)
+    assert aligned.turned_deg.max() < 1
+    assert aligned.moved.max() < 0.02 * aligned.extent
+
+
+def test_folders_that_cannot_be_used(say, tmp_path):
+    (tmp_path / "empty").mkdir()
+    out = tmp_path / "new/out"
+    code, said = say(tmp_path / "empty", "--out", out)
+    assert code == 2
+    assert "empty: expected 3 photographs or more (.png, .jpg, " in said
+    assert "found none. Give the folder that holds them." in said
+    dots.save(tmp_path / "empty/a.png", np.zeros((20, 20, 3), np.uint8))
+    (tmp_path / "empty/b.jpg").write_bytes(b"no picture")
+    assert "found 1, and 1 that cannot be read" in say(tmp_path / "empty", "--out", out)[1]
+    assert (
+        "nowhere: expected a folder of photographs or a video" in say(tmp_path / "nowhere", "--out", out)[1]
+    )
+    assert "b.jpg: expected a video" in say(tmp_path / "empty/b.jpg", "--out", out)[1]
+    assert not (tmp_path / "new").exists()
+
+
+def test_pictures_without_texture_and_one_that_cannot_be_read(say, tmp_path):
+    room.write(tmp_path / "plain", 4, plain=True)
+    content = (tmp_path / "plain/3.png").read_bytes()
+    (tmp_path / "plain/3.png").write_bytes(content[: len(content) // 2])
+    code, said = say(tmp_path / "plain", "--out", tmp_path / "out")
+    assert code == 2
+    assert "1 of 4 photographs cannot be read and are left out: " in said
+    assert "3.png: expected an image, found a file that is cut off" in said
+    assert "expected photographs that fit together, found 0 pairs that show the same things" in said
+    assert "Take more of them with much overlap" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_stands_in_the_way_is_not_replaced(say, tmp_path, photographs):
+    (tmp_path / "theirs/sparse").mkdir(parents=True)
+    code, said = say(photographs, "--out", tmp_path / "theirs", "--overwrite")
+    assert code == 2
+    assert "expected a folder without images and sparse, found sparse that gsjax poses did not write" in said
+    (tmp_path / "theirs/poses.json").touch()
+    assert "--overwrite replaces it" in say(photographs, "--out", tmp_path / "theirs")[1]
+    assert "expected a folder, found a file" in say(photographs, "--out", tmp_path / "theirs/poses.json")[1]
+
+
+def test_names_that_are_not_in_the_other_dataset(say, tmp_path, photographs):
+    code, said = say(
+        photographs, "--out", tmp_path / "out", "--compare", "simulated:tabletop?frames=2&width=32&height=24"
+    )
+    assert code == 2
+    assert (
+        "--compare: expected poses of three of these photographs or more in tabletop_seed0, found 0" in said
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("max-size", "10", "max_size: expected 64 or more, found 10"),
+        ("overlap", "0", "overlap: expected 1 or more, found 0"),
+        ("mapping-threads", "0", "mapping_threads: expected 1 or more, or -1, found 0"),
+    ],
+)
+def test_settings_without_a_meaning(say, photographs, tmp_path, option, value, says):
+    code, said = say(photographs, "--out", tmp_path / "out", f"--{option}", value)
+    assert code == 2
+    assert says in said
+
+
+def test_without_pycolmap(say, tmp_path, photographs, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    code, said = say(photographs, "--out", tmp_path / "out")
+    assert code == 2
+    assert 'needs pycolmap, which is not installed: pip install "gsjax[poses]"' in said

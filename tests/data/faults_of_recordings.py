@@ -1,0 +1,163 @@
+"""Recordings with depth of every layout, scenes of Gaussians, and what may be wrong with them."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.data import open_sequence, read_open3d, write_panoptic
+from gsjax.data.simulated import tabletop
+from gsjax.io.ply import read_ply, write_ply
+from gsjax.scene.gaussians import Gaussians
+from tests.data import dots
+from tests.data.faults_of_photographs import build_transforms
+from tests.data.faulty import (
+    HEIGHT,
+    NAN,
+    SKEW,
+    WIDTH,
+    Damage,
+    Fault,
+    K,
+    Layout,
+    all_of,
+    change,
+    cut,
+    deep,
+    drawn,
+    gone,
+    holds,
+    moved,
+    picture,
+    swap,
+)
+
+
+def build_open3d(root: Path) -> None:
+    blocks = []
+    for i in range(3):
+        dots.save(root / f"image/{i:05d}.png", picture(i))
+        dots.save(root / f"depth/{i:05d}.png", deep())
+        blocks.append(f"{i} {i} {i + 1}\n" + "\n".join(" ".join(map(str, row)) for row in moved(i)))
+    (root / "trajectory.log").write_text("\n".join(blocks) + "\n")
+
+
+OPEN3D = (
+    Fault("the trajectory is cut off", cut("trajectory.log", 0.5), ("trajectory.log",)),
+    Fault("no numbers", holds("trajectory.log", "none\n"), ("trajectory.log",)),
+    Fault("no pose", holds("trajectory.log", ""), ("trajectory.log",)),
+    Fault("NaN in one pose", swap("trajectory.log", "1.0", "nan"), ("00000.png",)),
+    Fault("a pose that is no rotation", swap("trajectory.log", "1.0", "3.0"), ("frame 0", "trajectory.log")),
+    Fault("no image", gone(*(f"image/{i:05d}.png" for i in range(3))), ("DATA",)),
+    Fault("a depth image is missing", gone("depth/00001.png"), ("00001.png",)),
+    Fault("a depth image is cut off", cut("depth/00001.png"), ("depth/00001.png",)),
+    Fault("a depth image of 8 bits", drawn("depth/00001.png", picture(0)[..., 0]), ("depth/00001.png",)),
+    Fault("an image of another size", drawn("image/00001.png", picture(0, 16, 12)), ("image/00001.png",)),
+)
+
+
+def build_tum(root: Path) -> None:
+    for kind, image in (("rgb", np.full((480, 640, 3), 9, np.uint8)), ("depth", deep(640, 480))):
+        image[:240] += 1
+        for i in range(2):
+            dots.save(root / f"{kind}/{i}.png", image)
+        (root / f"{kind}.txt").write_text("".join(f"{i}.0 {kind}/{i}.png\n" for i in range(2)))
+    (root / "groundtruth.txt").write_text("0.0 0 0 0 0 0 0 1\n1.0 1 0 0 0 0 0 1\n")
+
+
+TUM = (
+    Fault("a list is missing", gone("depth.txt"), ("depth.txt",)),
+    Fault("a line is cut off", cut("rgb.txt", 0.65), ("rgb.txt", "line 2")),
+    Fault("no text", holds("groundtruth.txt", b"\xff\xfe\x80"), ("groundtruth.txt",)),
+    Fault("no pose", holds("groundtruth.txt", "# none\n"), ("groundtruth.txt",)),
+    Fault("NaN in one pose", swap("groundtruth.txt", "1.0 1", "1.0 nan"), ("groundtruth.txt",)),
+    Fault("a quaternion of length 2", swap("groundtruth.txt", " 1\n", " 2\n"), ("groundtruth.txt",)),
+    Fault("one stamp far from all others", swap("depth.txt", "0.0 ", "50.0 "), ("DATA",)),
+    Fault("clocks that never meet", holds("depth.txt", "50.0 depth/0.png\n51.0 depth/1.png\n"), ("DATA",)),
+    Fault("an image is missing", gone("rgb/1.png"), ("rgb.txt",)),
+    Fault("all images are missing", gone("rgb/0.png", "rgb/1.png"), ("rgb.txt",)),
+    Fault("an image is cut off", cut("rgb/1.png"), ("rgb/1.png",)),
+    Fault("an image of another size", drawn("rgb/0.png", picture(0)), ("rgb/0.png",)),
+)
+
+
+def build_seven_scenes(root: Path) -> None:
+    image = np.full((480, 640, 3), 9, np.uint8)
+    image[:240] += 1
+    for i in range(2):
+        dots.save(root / f"frame-{i:06d}.color.png", image)
+        dots.save(root / f"frame-{i:06d}.depth.png", deep(640, 480))
+        np.savetxt(root / f"frame-{i:06d}.pose.txt", moved(i))
+
+
+POSE = "frame-000001.pose.txt"
+SEVEN_SCENES = (
+    Fault("a pose is cut off", cut(POSE), (POSE,)),
+    Fault("a pose of words", holds(POSE, "one two\n"), (POSE,)),
+    Fault("NaN in one pose", lambda root: np.savetxt(root / POSE, NAN), ("frame-000001",)),
+    Fault("a pose that is no rotation", lambda root: np.savetxt(root / POSE, SKEW), (POSE,)),
+    Fault("an image is missing", gone("frame-000001.color.png"), ("frame-000001",)),
+    Fault("no pose", gone("frame-000000.pose.txt", POSE), ("DATA",)),
+    Fault("a depth image is cut off", cut("frame-000001.depth.png"), ("frame-000001.depth.png",)),
+    Fault(
+        "intrinsics of another camera",
+        lambda root: np.savetxt(root / "camera-intrinsics.txt", np.eye(3)),
+        ("camera-intrinsics.txt",),
+    ),
+)
+
+
+def build_panoptic(root: Path) -> None:
+    write_panoptic(tabletop(frames=2, width=WIDTH, height=HEIGHT, cameras=2), root)
+
+
+def entry(key: str, value: object) -> Damage:
+    def edit(meta: dict) -> None:
+        meta[key][1][1] = value
+
+    return change("train_meta.json", edit)
+
+
+PANOPTIC = (
+    Fault("not JSON", holds("train_meta.json", b"\x80\x04"), ("train_meta.json",)),
+    Fault("no camera", change("train_meta.json", lambda m: m.update(cam_id=[[], []])), ("train_meta.json",)),
+    Fault("NaN in one pose", entry("w2c", NAN), ("train_meta.json", "frame 1")),
+    Fault("a pose of another shape", entry("w2c", [1, 2]), ("train_meta.json",)),
+    Fault(
+        "K with a focal length of 0", entry("k", np.diag([0, 1, 1]).tolist()), ("train_meta.json", "frame 1")
+    ),
+    Fault("an image is missing", gone("ims/1/000001.png"), ("ims/1/000001.png",)),
+    Fault("an image is cut off", cut("ims/1/000001.png"), ("ims/1/000001.png",)),
+    Fault(
+        "a depth image of 8 bits", drawn("depth/1/000001.png", picture(0)[..., 0]), ("depth/1/000001.png",)
+    ),
+)
+
+
+def build_gaussians(root: Path) -> None:
+    random = np.random.default_rng(0)
+    shapes = ((3,), (4,), (3,), (), (1, 3))
+    values = (jnp.asarray(random.normal(size=(5, *shape)), jnp.float32) for shape in shapes)
+    write_ply(root / "scene.ply", Gaussians(*values))
+
+
+SCENE = "scene.ply"
+GAUSSIANS = (
+    Fault("missing", gone(SCENE), (SCENE,)),
+    Fault("something else", holds(SCENE, b"PK\3\4"), (SCENE,)),
+    Fault("cut off", cut(SCENE, 0.9), (SCENE,)),
+    Fault(
+        "a cloud of points",
+        lambda root: build_transforms(root) or (root / "points.ply").rename(root / SCENE),
+        (SCENE,),
+    ),
+    Fault("no vertices", holds(SCENE, "ply\nformat ascii 1.0\nelement face 0\nend_header\n"), (SCENE,)),
+)
+
+RECORDINGS = {
+    "Open3D RGB-D": Layout(build_open3d, lambda r: all_of(read_open3d(r, K)), OPEN3D),
+    "TUM RGB-D": Layout(build_tum, lambda r: all_of(open_sequence(r)), TUM),
+    "7-Scenes": Layout(build_seven_scenes, lambda r: all_of(open_sequence(r)), SEVEN_SCENES),
+    "Panoptic": Layout(build_panoptic, lambda r: all_of(open_sequence(r)), PANOPTIC),
+    "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
+}

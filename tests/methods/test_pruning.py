@@ -1,0 +1,55 @@
+"""What sends light into a photograph is what compositing says, and nothing else is needed."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.methods.reconstruction import View, light_of
+from gsjax.rasterize.reference import rasterization_reference
+from gsjax.scene.gaussians import gaussians_from_activated
+
+WIDTH, HEIGHT = 32, 24
+
+
+def view(eye) -> View:
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    return View(image, None, None, look_at(np.array(eye), np.zeros(3)), intrinsics(30.0, WIDTH, HEIGHT))
+
+
+def wall(count=60):
+    """An opaque wall at x = 0, one Gaussian behind it, and one that no camera faces."""
+    random = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 12)), -1).reshape(-1, 2)
+    means = np.concatenate([np.c_[np.zeros(len(grid)), grid], [[-0.5, 0, 0], [9.0, 0, 0]]])
+    n = len(means)
+    scales = np.full((n, 3), 0.12)
+    return gaussians_from_activated(
+        means, random.normal(size=(n, 4)), scales, np.full(n, 0.99), random.uniform(size=(n, 3))
+    )
+
+
+def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
+    gaussians, views = wall(), [view((3.0, 0.2, 0.5)), view((2.5, -0.8, 0.1))]
+    light = light_of(gaussians, views)
+    summed = []
+    for one in views:  # each Gaussian's own colour is a unit vector: the picture holds all weights
+        drawn = rasterization_reference(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            jnp.eye(gaussians.num),
+            jnp.asarray(one.viewmat),
+            jnp.asarray(one.K),
+            WIDTH,
+            HEIGHT,
+        )[0]
+        summed.append(np.asarray(drawn).sum((0, 1)))
+    np.testing.assert_allclose(light, np.max(summed, axis=0), rtol=1e-3, atol=1e-3)
+
+
+def test_what_is_hidden_or_behind_all_cameras_sends_none():
+    light = light_of(wall(), [view((3.0, 0.2, 0.5))])
+    assert light[-1] == 0.0
+    assert light[-2] < 0.05
+    assert np.median(light[:-2]) > 1.0
