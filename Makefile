@@ -22,8 +22,8 @@ demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 # of its tests compiled serves the next.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses=2 --dist=loadfile
 
-test: $(VENV)/installed-test ## the tests, with coverage; slow ones left out
-	$(PYTEST) --cov=gsjax --cov-report=term
+test: $(VENV)/installed-test ## the tests; slow ones left out
+	$(PYTEST)
 
 test-all: $(VENV)/installed-test ## every test, the slow ones too
 	$(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term

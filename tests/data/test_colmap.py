@@ -239,7 +239,11 @@ def swap(old, new, count=1):
             r"images.txt: expected one of the cameras \[4\], found 3 for a.png",
         ),
         ("cameras", lambda text: "", r"cameras.txt: expected at least one of its cameras, found none"),
-        ("images", lambda text: "# none\n", r"images.txt: expected at least one of its images, found none. Did it fail"),
+        (
+            "images",
+            lambda text: "# none\n",
+            r"images.txt: expected at least one of its images, found none. Did it fail",
+        ),
         ("images", swap(" a.png", ""), r"images.txt, line 7: expected IMAGE_ID QW .*NAME, found '8 "),
         ("images", swap(" 3 a.png", " x a.png"), r"images.txt, line 7: expected IMAGE_ID"),
         (

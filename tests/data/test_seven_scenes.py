@@ -142,7 +142,7 @@ def test_a_pose_that_is_no_rotation(folder):
     pose = pose_at(0)
     pose[0, 0] = 1.5
     write_pose(folder / "frame-000005.pose.txt", pose)
-    with pytest.raises(ValueError, match="frame-000005.pose.txt: R is no rotation"):
+    with pytest.raises(ValueError, match=r"frame-000005.pose.txt: R is no rotation"):
         read_seven_scenes(folder)
 
 
