@@ -32,6 +32,7 @@ _SHOWN_EVERY_S = 0.2
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _MEASURED = 50  # steps whose time says how many are left in a budget
+_OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
 
 HELP = (
     " Settings have names, to be said before the dataset, as in `gsjax fit quick DATASET --out RUN`: quick "
@@ -58,6 +59,8 @@ class Options:
     """Stop when held-out photographs are seen with so many dB."""
     judge_every: int = 500
     """Steps between looks at held-out photographs."""
+    save_every: float = 30.0
+    """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
     """Write the curve for TensorBoard too, into RUN/tensorboard."""
     resume: bool = False
@@ -94,7 +97,7 @@ def run(options: Options) -> int:
         chosen, held_out = split(photographs, options.test_every)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         if options.resume:
-            folder.check_config(options, but=("resume", "overwrite", "debug", "out", "tensorboard"))
+            folder.check_config(options, but=_OF_NO_BEARING)
         folder.write_config(options)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
@@ -107,6 +110,8 @@ def run(options: Options) -> int:
         board = TensorBoard(folder.path, curve.rows) if options.tensorboard else None
         judged = [(photographs.names[i], views[i]) for i in held_out]
         state, stopped = follow(options, problem, state, curve, judged, folder, console, board)
+        if curve.skipped:
+            notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
         gaussians, finished = living(state.gaussians)[0], stopped is None
         if finished:  # who pressed Ctrl-C does not wait for these
             gaussians = without_needless(problem, gaussians, notes)
@@ -122,6 +127,7 @@ def run(options: Options) -> int:
             "report": True,
             "stopped": None if finished else describe_error(stopped) or "Ctrl-C",
             "steps": state.step,
+            "skipped": curve.skipped,
             "num_gaussians": gaussians.num,
             "sh_degree": gaussians.sh_degree,
             "photographs": {"fitted": len(chosen), "held_out": len(held_out)},
@@ -153,7 +159,7 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    for name in ("minutes", "until_psnr", "judge_every"):
+    for name in ("minutes", "until_psnr", "judge_every", "save_every"):
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
@@ -248,7 +254,7 @@ def follow(
 ) -> tuple[Any, BaseException | None]:
     """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
     state, and what stopped it early."""
-    budget, saver = Budget(options.fit.steps, options.minutes, curve), Saver(folder)
+    budget, saver = Budget(options.fit.steps, options.minutes, curve), Saver(folder, options.save_every)
     some = judged[:: max(1, len(judged) // _JUDGED_AT_MOST)][:_JUDGED_AT_MOST]
     columns = (
         TextColumn("[bold]{task.description}"),
@@ -266,6 +272,7 @@ def follow(
                 state, step = fitted.state, fitted.state.step
                 budget.took(fitted.seconds)
                 curve.took(fitted.seconds, fitted.compile_seconds)
+                curve.skipped += bool(fitted.info["skipped"])
                 now = perf_counter()
                 if now - drawn > _SHOWN_EVERY_S or step == budget(step):
                     told = curve.in_words(fitted, len(judged) > 0)

@@ -41,21 +41,24 @@ class Curve:
         rows: step, seconds, loss, psnr (of the photograph of that step), alive, test_psnr or None.
         seconds: of all steps so far, without what compiled.
         compile_seconds: that compiling took.
+        skipped: steps that would have made a number that is not finite, and changed nothing.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     compile_seconds: float = 0.0
+    skipped: int = 0
     _rate: float = 0.0
 
     @staticmethod
     def of(metadata: dict[str, Any]) -> "Curve":
         """The inverse of `metadata`."""
-        return Curve(metadata["rows"], metadata["seconds"], metadata["compile_seconds"])
+        return Curve(**metadata)
 
     def metadata(self) -> dict[str, Any]:
         """What JSON can hold of it."""
-        return {"rows": self.rows, "seconds": self.seconds, "compile_seconds": self.compile_seconds}
+        names = ("rows", "seconds", "compile_seconds", "skipped")
+        return {name: getattr(self, name) for name in names}
 
     def took(self, seconds: float, compile_seconds: float) -> None:
         """One step more."""

@@ -15,21 +15,24 @@ from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata
 from gsjax.methods.reconstruction import FitState, Problem
 from gsjax.methods.reconstruction.fit import enlarged
 
-EVERY_S = 30.0
-"""Seconds of fitting that a run may lose when it is killed."""
 KEPT = 2
 """Checkpoints that are kept: one that is damaged leaves the one before."""
 
 
 class Saver:
-    """Writes the state of a fit into RUN/resume."""
+    """Writes the state of a fit into RUN/resume.
 
-    def __init__(self, folder: RunFolder):
-        self._folder, self._at = folder.resume, perf_counter()
+    Args:
+        folder: of the run.
+        every: seconds of fitting that a run may lose when it is killed.
+    """
+
+    def __init__(self, folder: RunFolder, every: float):
+        self._folder, self._every, self._at = folder.resume, every, perf_counter()
 
     def __call__(self, state: FitState, curve: Curve, *, last: bool) -> None:
-        """Save if the last time is `EVERY_S` ago, or this is the last; where the disk is full, say so."""
-        if not last and perf_counter() - self._at < EVERY_S:
+        """Save if the last time is long enough ago, or this is the last; where the disk is full, say so."""
+        if not last and perf_counter() - self._at < self._every:
             return
         metadata = {
             "degree": state.gaussians.sh_degree,

@@ -14,7 +14,7 @@ from rich.console import Console
 from gsjax.cli.messages import Notes, say_error, stage
 from gsjax.cli.outputs import write_png
 from gsjax.cli.run_folder import SIGNATURE, is_run
-from gsjax.cli.saved_run import SavedRun, read_tracking, open_run
+from gsjax.cli.saved_run import SavedRun, open_run, read_tracking
 from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import read_ply

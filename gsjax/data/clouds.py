@@ -1,17 +1,19 @@
 """Coloured points in PLY files."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
-from gsjax.data.errors import DataError
+from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.photographs import Cloud
 
 _GREY = 0.5  # points without a colour
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The points of a PLY file; those that are not finite are left out, and those without colour are grey.
+    """The points of a PLY file; those that are not finite are left out, with a DataWarning. Without colours
+    they are grey.
 
     Raises:
         DataError: the file is missing, cut off, or no PLY file with x, y and z.
@@ -33,4 +35,7 @@ def read_cloud(path: Path) -> Cloud:
             path, "a PLY file with x, y, z", f"something else ({error})", "Fetch it again."
         ) from None
     finite = np.isfinite(points).all(-1) & np.isfinite(colors).all(-1)
+    if not finite.all():
+        some = f"{(~finite).sum()} of {len(finite)} points"
+        warnings.warn(f"{path}: {some} are not finite and left out", DataWarning, stacklevel=2)
     return Cloud(points[finite], np.clip(colors[finite], 0, 1))

@@ -12,7 +12,6 @@ import cv2
 import pytest
 import yaml
 
-import gsjax.cli.fit
 from gsjax.cli import main
 from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve
@@ -130,8 +129,7 @@ def test_a_preset_is_named_before_the_dataset_and_what_is_given_counts_more(phot
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):
-    monkeypatch.setattr(gsjax.cli.fit_resume, "EVERY_S", 0.0)
-    shown, calls = Curve.took, []
+    shown, calls, often = Curve.took, [], ("--save-every", "1e-9")
 
     def stopped(self, seconds, compile_seconds):
         shown(self, seconds, compile_seconds)
@@ -140,10 +138,10 @@ def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeyp
 
     with monkeypatch.context() as context:
         context.setattr(Curve, "took", stopped)
-        assert gsjax_fit(*QUICK)[0] == 130
+        assert gsjax_fit(*QUICK, *often)[0] == 130
     *_, before, newest = sorted((tmp_path / "run" / "resume").iterdir())
     newest.write_bytes(newest.read_bytes()[:1000])
-    code, said = gsjax_fit(*QUICK, "--resume")
+    code, said = gsjax_fit(*QUICK, *often, "--resume")
     assert code == 0, said
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert f"Resumed after {int(before.stem.split('-')[1])} steps" in json.dumps(found["notes"])

@@ -260,6 +260,12 @@ def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(view
     assert enlarged(problem, wider, known, 1, 10)[0] is wider  # never back
 
 
+def test_masks_that_leave_nothing_are_refused(views):
+    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    with pytest.raises(ValueError, match="are they inverted"):
+        begin([view._replace(mask=nothing) for view in views], QUICK)
+
+
 def test_poison_in_a_photograph_cannot_be_and_in_a_gaussian_skips_the_step(views):
     problem, state = begin(views, QUICK)
     sick = eqx.tree_at(lambda s: s.model.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
@@ -281,8 +287,13 @@ def test_an_extent_is_that_of_the_cameras_and_where_they_look():
     found = extent_of(ahead)
     assert np.isfinite(found.focus).all()
     assert found.focus[2] > 0
-    turning = np.tile(np.eye(4), (4, 1, 1))
-    assert extent_of(turning).radius > 0  # all at one place, looking one way
+    turning = np.tile(np.eye(4), (4, 1, 1))  # all at one place, where their axes meet
+    angles = np.array([-0.3, -0.1, 0.1, 0.3])
+    turning[:, 0, 0], turning[:, 0, 2] = np.cos(angles), np.sin(angles)
+    turning[:, 2, 0], turning[:, 2, 2] = -np.sin(angles), np.cos(angles)
+    found = extent_of(turning)
+    assert found.radius == 1.0
+    np.testing.assert_allclose(found.focus, [0, 0, np.cos(angles).mean()], atol=1e-6)
 
 
 def test_starts_that_the_data_does_not_have_are_refused(views):

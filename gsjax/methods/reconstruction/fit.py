@@ -105,10 +105,13 @@ def begin(
         background: what is behind the scene, where the data says so.
 
     Raises:
-        ValueError: there is no view, or nothing of the kind from which the fit is to start.
+        ValueError: there is no view, or none in which a pixel counts, or nothing of the kind from which the
+            fit is to start.
     """
     if not views:
         raise ValueError("views: expected at least one photograph to fit, found none")
+    if not any(view.mask is None or view.mask.any() for view in views):
+        raise ValueError("masks: in none of the photographs to fit does any pixel count; are they inverted?")
     extent = extent_of(np.stack([view.viewmat for view in views]))
     points, colors, source = start_points(views, cloud, config.start, config.seed)
     slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))

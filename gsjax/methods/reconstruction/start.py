@@ -36,8 +36,8 @@ class Extent(NamedTuple):
 
     Attributes:
         focus: the point nearest to all optical axes.
-        radius: how far the cameras stand from their middle, at most; the unit of rates. Cameras that all
-            stand at one place leave it to how far away the focus is, or 1.
+        radius: 1.1 times how far cameras stand from their middle, at most; the unit of rates. Where all
+            stand at one place, 1, and the focus is as far ahead.
     """
 
     focus: Float[np.ndarray, "3"]
@@ -50,14 +50,14 @@ def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
     centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
     axes = rotations[:, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    middle, ahead = centers.mean(0), axes.mean(0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    if spread <= 1e-6 * max(1.0, float(np.abs(centers).max())):  # nothing says how far away things are
+        return Extent(middle + ahead, 1.0)
     # Parallel axes meet nowhere: then the point one radius ahead of the middle is as good as any.
-    spread = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     weak = 1e-3 * np.eye(3) * len(centers)
-    ahead = centers.mean(0) + axes.mean(0) * (spread or 1.0)
-    total = np.einsum("nij,nj->i", across, centers) + weak @ ahead
-    focus = np.linalg.solve(across.sum(0) + weak, total)
-    away = float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    return Extent(focus, 1.1 * spread if spread > 1e-6 * max(away, 1e-9) else max(away, 1e-3) or 1.0)
+    total = np.einsum("nij,nj->i", across, centers) + weak @ (middle + ahead * spread)
+    return Extent(np.linalg.solve(across.sum(0) + weak, total), 1.1 * spread)
 
 
 def start_points(

@@ -1,0 +1,119 @@
+"""What does each part of a fit buy in a given time?"""
+
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+from recordings import recorded
+
+from gsjax.cli.fit import Budget, split
+from gsjax.cli.fit_results import Curve, judge, living, look
+from gsjax.data import open_photographs
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.reconstruction import FitConfig, StartConfig, View, begin, fit, light_of
+from gsjax.metrics.image import ssim
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.render import plan_render, render
+
+MINUTES, SCALE, JUDGED_EVERY_S = 4.0, 0.25, 30.0
+DEFAULT = FitConfig(steps=30_000)
+SETTINGS = {
+    "default": DEFAULT,
+    "degree 0": replace(DEFAULT, sh_degree=0),
+    "degree 2": replace(DEFAULT, sh_degree=2, sh_every=400),
+    "at most 5000": replace(DEFAULT, cap=5_000, start=StartConfig(count=5_000)),
+    "at most 10000": replace(DEFAULT, cap=10_000, start=StartConfig(count=10_000)),
+    "at most 20000": replace(DEFAULT, cap=20_000),
+    "half the size": DEFAULT,
+    "split": replace(DEFAULT, strategy="split", cap=200_000),
+    "no coarse stage": replace(DEFAULT, coarse_until=0.0),
+}
+
+
+@lru_cache(maxsize=2)
+def views_at(scale: float) -> tuple[list[View], list[View]]:
+    """Fitted and held-out photographs of fox."""
+    photographs = open_photographs(str(recorded("fox"))).scaled(scale)
+    chosen, held_out = split(photographs, 8)
+
+    def view(i: int) -> View:
+        return View(photographs.image(i), None, None, photographs.viewmats[i], photographs.Ks[i])
+
+    return [view(i) for i in chosen], [view(i) for i in held_out]
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """A fit of so many minutes, and where it stands every half."""
+    jax.clear_caches()
+    setting = options["setting"]
+    config = replace(SETTINGS[setting], seed=seed)
+    views, _ = views_at(SCALE / 2 if setting == "half the size" else SCALE)
+    shown, held_out = views_at(SCALE)
+    problem, state = begin(views, config)
+    curve, rows = Curve(), []
+    budget = Budget(config.steps, MINUTES, curve)
+    judged = [(str(i), view) for i, view in enumerate(held_out)]
+    recent: list[float] = []
+    for fitted in fit(problem, state, steps=budget):
+        budget.took(fitted.seconds)
+        recent = [*recent[-49:], fitted.seconds]
+        curve.took(fitted.seconds, 0.0)
+        state, last = fitted.state, fitted.state.step >= budget(fitted.state.step)
+        if last or curve.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
+            rows.append((curve.seconds / 60, judge(problem, state.gaussians, judged).mean()["psnr"]))
+    gaussians = living(state.gaussians)[0]
+    needed = take(gaussians, light_of(gaussians, shown) >= config.prune)
+    seen = [look(needed, view, problem.background, config.antialiased)[0] for view in held_out]
+    return {
+        "psnr": float(np.mean([one.psnr() for one in seen])),
+        "ssim": float(np.mean([ssim(one.image, one.truth) for one in seen])),
+        "gaussians": needed.num,
+        "unneeded": gaussians.num - needed.num,
+        "steps": state.step,
+        "steps_a_second": state.step / curve.seconds,
+        "step_over_draw": float(np.median(recent)) / _draw_seconds(gaussians, shown[0]),
+        "curve": rows,
+    }
+
+
+def _draw_seconds(gaussians: Gaussians, view: View) -> float:
+    """Median time of drawing a photograph's view, which a step is compared with."""
+    height, width = view.image.shape[:2]
+    camera = Camera(*(jnp.asarray(a, jnp.float32)[None] for a in (view.viewmat, view.K)), width, height)
+    plan, times = plan_render(gaussians, camera), []
+    for _ in range(6):
+        begun = perf_counter()
+        jax.block_until_ready(render(gaussians, camera, plan).colors)
+        times.append(perf_counter() - begun)
+    return float(np.median(times[1:]))
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """PSNR over minutes, and over what is needed for it."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(10, 4), layout="constrained")
+    over_time, over_count = drawing.subplots(1, 2, sharey=True)
+    for i, row in enumerate(rows):
+        minutes, psnr = zip(*row["curve"], strict=True)
+        how = {"color": f"C{i}", "lw": 2.5 if row["setting"] == "default" else 1.2}
+        over_time.plot(minutes, psnr, label=row["setting"], **how)
+        over_count.plot(row["gaussians"], row["psnr"], "o", color=f"C{i}")
+        over_count.annotate(
+            row["setting"], (row["gaussians"], row["psnr"]), (5, 3), textcoords="offset points", fontsize=8
+        )
+    over_time.set(xlabel="minutes", ylabel="held-out PSNR [dB]")
+    over_count.set(xlabel="Gaussians that are needed", xlim=(0, None))
+    over_time.legend(frameon=False, fontsize=8)
+    for axes in (over_time, over_count):
+        axes.grid(color="0.9")
+    drawing.savefig(path, dpi=120)
