@@ -19,7 +19,7 @@ from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve, judge, living, look
 from gsjax.data import open_photographs
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.reconstruction import FitConfig, StartConfig, View, begin, fit, light_of
+from gsjax.methods.reconstruction import FitConfig, StartConfig, View, begin, fit, light_of, needed
 from gsjax.metrics.image import ssim
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
@@ -71,13 +71,13 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         if last or curve.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
             rows.append((curve.seconds / 60, judge(problem, state.gaussians, judged).mean()["psnr"]))
     gaussians = living(state.gaussians)[0]
-    needed = take(gaussians, light_of(gaussians, shown) >= config.prune)
-    seen = [look(needed, view, problem.background, config.antialiased)[0] for view in held_out]
+    kept = take(gaussians, needed(light_of(gaussians, shown), config.prune))
+    seen = [look(kept, view, problem.background, config.antialiased)[0] for view in held_out]
     return {
         "psnr": float(np.mean([one.psnr() for one in seen])),
         "ssim": float(np.mean([ssim(one.image, one.truth) for one in seen])),
-        "gaussians": needed.num,
-        "unneeded": gaussians.num - needed.num,
+        "gaussians": kept.num,
+        "unneeded": gaussians.num - kept.num,
         "steps": state.step,
         "steps_a_second": state.step / curve.seconds,
         "step_over_draw": float(np.median(recent)) / _draw_seconds(gaussians, shown[0]),

@@ -25,7 +25,7 @@ from gsjax.cli.tensorboard import TensorBoard
 from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import write_ply
-from gsjax.methods.reconstruction import PRESETS, FitConfig, Problem, View, begin, fit, light_of
+from gsjax.methods.reconstruction import PRESETS, FitConfig, Problem, View, begin, fit, light_of, needed
 from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
@@ -217,11 +217,11 @@ def without_needless(problem: Problem, gaussians: Gaussians, notes: Notes) -> Ga
     if not config.prune or not gaussians.num:
         return gaussians
     mode = "antialiased" if config.antialiased else "classic"
-    needed = light_of(gaussians, problem.views, mode) >= config.prune
-    if not needed.all():
-        some = f"{(~needed).sum():,} of {gaussians.num:,} Gaussians"
-        notes.add(f"{some} sent less than {config.prune:g} pixels of light into every photograph: left out.")
-    return take(gaussians, needed)
+    kept = needed(light_of(gaussians, problem.views, mode), config.prune)
+    if not kept.all():
+        some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
+        notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
+    return take(gaussians, kept)
 
 
 class Budget:

@@ -18,7 +18,7 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import atomic_write
 from gsjax.methods.reconstruction import Fitted, Problem, View
-from gsjax.metrics.image import depth_error, psnr, ssim
+from gsjax.metrics.image import depth_error, psnr, ssim, with_matched_colors
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians, cull_invalid, take
@@ -105,9 +105,9 @@ class Scores:
 
     def mean(self) -> dict[str, float | None]:
         """Over the views that have a number."""
-        names = ("psnr", "ssim", "depth_mm")
+        names = ("psnr", "ssim", "depth_mm", "psnr_matched")
         known = {
-            name: [r[name] for r in self.rows if r[name] is not None and np.isfinite(r[name])]
+            name: [r[name] for r in self.rows if r.get(name) is not None and np.isfinite(r[name])]
             for name in names
         }
         return {name: float(np.mean(values)) if values else None for name, values in known.items()}
@@ -132,6 +132,8 @@ def judge(
         row: dict[str, Any] = {"view": name, "psnr": seen.psnr(), "ssim": None, "depth_mm": None}
         if folder is not None:
             row |= {"ssim": seen.ssim(), "depth_mm": seen.depth_mm()}
+            if problem.config.exposure:  # which that of a photograph never fitted cannot be known
+                row["psnr_matched"] = seen.psnr_matched()
             path = folder.render("held_out", len(rows))
             write_panel(path, seen)
             row["picture"] = str(path.relative_to(folder.path))
@@ -160,6 +162,11 @@ class Seen:
     def psnr(self) -> float:
         """Where the photograph counts, dB."""
         return psnr(self.image, self.truth, self.view.mask)
+
+    def psnr_matched(self) -> float:
+        """The same, exposure and white balance apart."""
+        matched = with_matched_colors(self.image, self.truth, self.view.mask)
+        return psnr(matched, self.truth, self.view.mask)
 
     def ssim(self) -> float | None:
         """Where the photograph counts; None where it is smaller than the window."""
@@ -258,6 +265,8 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     test = found["test"]
     if test and test["psnr"] is not None:
         words = f"{test['psnr']:.2f} dB" + ("" if test["ssim"] is None else f", SSIM {test['ssim']:.3f}")
+        matched = test["psnr_matched"]
+        words += "" if matched is None else f", {matched:.2f} dB with colours matched"
         words += "" if test["depth_mm"] is None else f", depth {test['depth_mm']:.0f} mm off"
         grid.add_row("[bold]held out[/]", f"{words} (mean of {photographs['held_out']} views)")
     grid.add_row("[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, SH degree {found['sh_degree']}")

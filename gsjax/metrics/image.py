@@ -87,6 +87,19 @@ def ssim(
     return float(np.mean(similarity[mask])) if mask.any() else float("nan")
 
 
+def with_matched_colors(
+    image: Float[np.ndarray, "height width 3"],
+    target: Float[np.ndarray, "height width 3"],
+    mask: Bool[np.ndarray, "height width"] | None = None,
+) -> Float[np.ndarray, "height width 3"]:
+    """The image under the affine map of its colours that brings it nearest to the target, by least squares:
+    what is left is no difference in exposure or white balance."""
+    counted = np.ones(image.shape[:2], bool) if mask is None else mask
+    colors = np.concatenate([image[counted], np.ones((int(counted.sum()), 1))], axis=1)
+    map_ = np.linalg.lstsq(colors, target[counted], rcond=None)[0]
+    return np.clip(image @ map_[:3] + map_[3], 0, 1)
+
+
 def ms_ssim(
     image: Num[np.ndarray, "..."],
     reference: Num[np.ndarray, "..."],

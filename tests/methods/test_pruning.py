@@ -2,9 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsjax.geometry.cameras import intrinsics, look_at
-from gsjax.methods.reconstruction import View, light_of
+from gsjax.methods.reconstruction import View, light_of, needed
 from gsjax.rasterize.reference import rasterization_reference
 from gsjax.scene.gaussians import gaussians_from_activated
 
@@ -45,11 +47,21 @@ def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
             HEIGHT,
         )[0]
         summed.append(np.asarray(drawn).sum((0, 1)))
-    np.testing.assert_allclose(light, np.max(summed, axis=0), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(light, np.max(summed, axis=0) / (WIDTH * HEIGHT), rtol=1e-3, atol=1e-6)
 
 
 def test_what_is_hidden_or_behind_all_cameras_sends_none():
     light = light_of(wall(), [view((3.0, 0.2, 0.5))])
     assert light[-1] == 0.0
-    assert light[-2] < 0.05
-    assert np.median(light[:-2]) > 1.0
+    assert light[-2] < 1e-4
+    assert np.median(light[:-2]) > 1e-3
+
+
+@given(st.lists(st.floats(0, 0.01), max_size=30), st.floats(0, 0.05))
+def test_what_is_left_out_is_needed_least_and_sends_no_more_than_the_share(light, share):
+    light = np.array(light)
+    kept = needed(light, share)
+    assert light[~kept].sum() <= share + 1e-12
+    if kept.any():
+        assert light[~kept].max(initial=0.0) <= light[kept].min()
+        assert light[~kept].sum() + light[kept].min() > share - 1e-12  # and one more would be too much

@@ -307,6 +307,18 @@ def test_starts_that_the_data_does_not_have_are_refused(views):
     assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
 
 
+def test_points_that_no_photograph_shows_are_no_start(views):
+    random = np.random.default_rng(0)
+    points, colors = random.uniform(-0.5, 0.5, (50, 3)), np.full((50, 3), 0.5)
+    away = points + np.array([0, 0, 1e6])
+    with pytest.warns(UserWarning, match="of the data's 50 points the photographs show 0"):
+        assert start_points(views, (away, colors), StartConfig(count=10), 0)[2] == "depth"
+    with pytest.warns(UserWarning, match="axes and the unit"):
+        assert start_points(views, (away, colors), StartConfig(source="cloud"), 0)[2] == "cloud"
+    some = np.concatenate([away, points])
+    assert start_points(views, (some, np.full((100, 3), 0.5)), StartConfig(), 0)[2] == "cloud"
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [({"steps": 0}, "steps"), ({"sh_degree": 4}, "sh_degree"), ({"dssim_weight": 1.5}, "dssim_weight")],

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from gsjax.metrics.image import depth_error, ms_ssim, psnr, ssim
+from gsjax.metrics.image import depth_error, ms_ssim, psnr, ssim, with_matched_colors
 
 
 def pair(seed=0, shape=(40, 30, 3)):
@@ -138,3 +138,14 @@ def test_depth_error_counts_valid_pixels_only():
     assert math.isnan(depth_error(0 * depth, reference).mean_abs_mm)
     with pytest.raises(ValueError, match="mask: got shape"):
         depth_error(depth, reference, first_row[1:])
+
+
+def test_a_difference_in_exposure_and_white_balance_can_be_taken_away():
+    random = np.random.default_rng(0)
+    target = random.uniform(0.2, 0.8, (20, 30, 3))
+    tinted = target @ np.array([[0.8, 0.05, 0], [0, 0.9, 0], [0.02, 0, 0.7]]) + np.array([0.05, 0, 0.1])
+    np.testing.assert_allclose(with_matched_colors(tinted, target), target, atol=1e-9)
+    mask = np.zeros((20, 30), bool)
+    mask[:, :10] = True
+    spoilt = np.where(mask[..., None], tinted, random.uniform(size=target.shape))
+    np.testing.assert_allclose(with_matched_colors(spoilt, target, mask)[mask], target[mask], atol=1e-9)

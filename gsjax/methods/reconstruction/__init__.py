@@ -19,7 +19,7 @@ from gsjax.methods.reconstruction.config import (
 )
 from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, begin, fit
 from gsjax.methods.reconstruction.model import Model
-from gsjax.methods.reconstruction.pruning import light_of
+from gsjax.methods.reconstruction.pruning import light_of, needed
 from gsjax.methods.reconstruction.start import Extent, View, extent_of
 from gsjax.methods.reconstruction.step import Batch, Observation, fit_loss, grow, reconstruction_step
 
@@ -44,5 +44,6 @@ __all__ = [
     "fit_loss",
     "grow",
     "light_of",
+    "needed",
     "reconstruction_step",
 ]

@@ -98,8 +98,9 @@ class FitConfig:
     """Draw with Mip-Splatting's compensation, for views from other distances."""
     background: Literal["data", "black", "white", "random"] = "data"
     """Colour behind the scene; data: what the photographs were composited on, else black."""
-    prune: float = 0.5
-    """In the end, Gaussians that send less light than this into every photograph, in pixels, are left out."""
+    prune: float = 0.002
+    """In the end, Gaussians that are needed least are left out, as many as together send at most this share
+    of the light into any photograph."""
     exposure: bool = False
     """Learn an affine map of colours for each photograph, where exposure or white balance differ."""
     refine_poses: bool = False
@@ -117,7 +118,7 @@ class FitConfig:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.sh_degree not in range(4):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
-        for name in ("dssim_weight", "coarse_until"):
+        for name in ("dssim_weight", "coarse_until", "prune"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
 

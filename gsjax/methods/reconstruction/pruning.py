@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.reconstruction.start import View
@@ -15,11 +15,26 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render, render
 
 
+def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]:
+    """All but those that are needed least, which together send at most a share of the light into any view.
+
+    Args:
+        light: from `light_of`.
+        share: of the light, 0 to 1.
+    """
+    order = np.argsort(light, kind="stable")
+    kept = np.ones(len(light), bool)
+    kept[order[np.cumsum(light[order], dtype=np.float64) <= share]] = (
+        False  # sums of maxima: no view has more
+    )
+    return kept
+
+
 def light_of(
     gaussians: Gaussians, views: list[View], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
-    """How many pixels' worth of light each Gaussian sends into the view that sees the most of it: the largest
-    over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i.
+    """What share of a picture's light each Gaussian sends, in the view that has the most of it: the largest
+    over views of the mean over pixels of its weight in compositing, w_i = alpha_i T_i.
 
     The sums are the gradient of the composited sum of a feature that is 1 everywhere.
     """
@@ -37,7 +52,7 @@ def light_of(
             if not bool(meta.overflow.any()):
                 break
             plans[width, height] = plans[width, height].grown(int(meta.needed.max()), 1.3)
-        most = np.maximum(most, np.asarray(weights))
+        most = np.maximum(most, np.asarray(weights) / (width * height))
     return most
 
 

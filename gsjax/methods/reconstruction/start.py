@@ -1,5 +1,6 @@
 """The first Gaussians: on the data's points, on its depth, or at random before the cameras. On the host."""
 
+import warnings
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,8 @@ from gsjax.methods.reconstruction.config import StartConfig
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
+
+_FEW = 0.1  # share of the points that photographs show, below which something is wrong
 
 
 class View(NamedTuple):
@@ -71,10 +74,12 @@ def start_points(
     random = np.random.default_rng(seed)
     has_depth = any(view.depth is not None for view in views)
     source = config.source
+    has_points = cloud is not None and len(cloud[0]) > 0
+    is_seen = has_points and source in ("auto", "cloud") and _is_seen(cloud[0], views)
     if source == "auto":
-        source = "cloud" if cloud is not None and len(cloud[0]) else "depth" if has_depth else "random"
+        source = "cloud" if is_seen else "depth" if has_depth else "random"
     if source == "cloud":
-        if cloud is None or not len(cloud[0]):
+        if not has_points:
             raise ValueError("start.source: the data has no points; use depth, random or auto")
         return *cloud, source
     if source == "depth":
@@ -82,6 +87,24 @@ def start_points(
             raise ValueError("start.source: the data has no depth; use cloud, random or auto")
         return *_from_depth(views, config.count, random), source
     return *_at_random(views, config.count, random), source
+
+
+def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
+    """Whether photographs show any of the points; a warning where they show few."""
+    seen = np.zeros(len(points), bool)
+    for view in views:
+        height, width = view.image.shape[:2]
+        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        ahead = local[:, 2] > 0
+        x, y, z = (local[ahead] @ view.K.T).T
+        seen[ahead] |= (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
+    if seen.mean() < _FEW:
+        warnings.warn(
+            f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
+            "the unit of the poses?",
+            stacklevel=2,
+        )
+    return bool(seen.any())
 
 
 def _from_depth(views, count, random):
