@@ -24,7 +24,7 @@ from gsjax.metrics.image import ssim
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
-MINUTES, SCALE, JUDGED_EVERY_S = 4.0, 0.25, 30.0
+MINUTES, SCALE, JUDGED_EVERY_S = 3.0, 0.25, 20.0
 DEFAULT = FitConfig(steps=30_000)
 SETTINGS = {
     "default": DEFAULT,
@@ -52,7 +52,7 @@ def views_at(scale: float) -> tuple[list[View], list[View]]:
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """A fit of so many minutes, and where it stands every half."""
+    """A fit of so many minutes, and where it stands now and then."""
     jax.clear_caches()
     setting = options["setting"]
     config = replace(SETTINGS[setting], seed=seed)

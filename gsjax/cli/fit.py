@@ -1,5 +1,6 @@
 """`gsjax fit`: a static scene from posed photographs."""
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.tensorboard import TensorBoard
+from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import write_ply
@@ -29,6 +31,7 @@ from gsjax.methods.reconstruction import PRESETS, FitConfig, Problem, View, begi
 from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
+_LARGE = 1600  # pixels, a side
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _MEASURED = 50  # steps whose time says how many are left in a budget
@@ -99,6 +102,7 @@ def run(options: Options) -> int:
         if options.resume:
             folder.check_config(options, but=_OF_NO_BEARING)
         folder.write_config(options)
+        _say_if_large(photographs)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
         fitted = [views[i] for i in chosen]
@@ -169,6 +173,14 @@ def _check(options: Options) -> None:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
     if options.until_psnr is not None and options.test_every == 0:
         raise ValueError("--until-psnr: nothing is held out to judge by; leave out --test-every 0")
+
+
+def _say_if_large(photographs: Photographs) -> None:
+    width, height = photographs.sizes.max(0)
+    if max(width, height) > _LARGE:
+        scale = 2.0 ** np.floor(np.log2(_LARGE / max(width, height)))
+        message = f"photographs of {width}x{height} take long and need much memory; try --scale {scale:g}"
+        warnings.warn(message, DataWarning, stacklevel=2)
 
 
 def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
