@@ -19,7 +19,7 @@ from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve, judge, living, look
 from gsjax.data import open_photographs
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.reconstruction import FitConfig, StartConfig, View, begin, fit, light_of, needed
+from gsjax.methods.reconstruction import FitConfig, SplitConfig, StartConfig, View, begin, fit, light_of, needed
 from gsjax.metrics.image import ssim
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
@@ -28,13 +28,13 @@ MINUTES, SCALE, JUDGED_EVERY_S = 3.0, 0.25, 20.0
 DEFAULT = FitConfig(steps=30_000)
 SETTINGS = {
     "default": DEFAULT,
-    "degree 0": replace(DEFAULT, sh_degree=0),
-    "degree 2": replace(DEFAULT, sh_degree=2, sh_every=400),
+    "degree 1 from step 200": replace(DEFAULT, sh_every=200),
+    "degree 3 from step 600": replace(DEFAULT, sh_degree=3, sh_every=200),
     "at most 5000": replace(DEFAULT, cap=5_000, start=StartConfig(count=5_000)),
     "at most 10000": replace(DEFAULT, cap=10_000, start=StartConfig(count=10_000)),
     "at most 20000": replace(DEFAULT, cap=20_000),
     "half the size": DEFAULT,
-    "split": replace(DEFAULT, strategy="split", cap=200_000),
+    "split": replace(DEFAULT, strategy="split", cap=200_000, split=SplitConfig(begin=100, end=0.7)),
     "no coarse stage": replace(DEFAULT, coarse_until=0.0),
 }
 
