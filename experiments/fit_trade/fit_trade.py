@@ -19,7 +19,16 @@ from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve, judge, living, look
 from gsjax.data import open_photographs
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.reconstruction import FitConfig, SplitConfig, StartConfig, View, begin, fit, light_of, needed
+from gsjax.methods.reconstruction import (
+    FitConfig,
+    SplitConfig,
+    StartConfig,
+    View,
+    begin,
+    fit,
+    light_of,
+    needed,
+)
 from gsjax.metrics.image import ssim
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
