@@ -117,11 +117,24 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, 
 
 def test_a_preset_is_named_before_the_dataset_and_what_is_given_counts_more(photographs, tmp_path, capfd):
     run = tmp_path / "run"
-    code = main(["fit", "classic", str(photographs), "--out", str(run), *QUICK, "--fit.split.begin", "4"])
+    code = main(
+        [
+            "fit",
+            "classic",
+            str(photographs),
+            "--out",
+            str(run),
+            *QUICK,
+            "--fit.split.begin",
+            "4",
+            "--tensorboard",
+        ]
+    )
     said = capfd.readouterr()
     assert code == 0, said
     config = yaml.safe_load((run / "config.yml").read_text())["fit"]
     assert (config["strategy"], config["cap"], config["split"]["begin"]) == ("split", 150, 4)
+    assert list((run / "tensorboard").glob("events.*"))
     with pytest.raises(SystemExit):
         main(["fit", "--help"])
     said = capfd.readouterr().out

@@ -5,6 +5,7 @@ import io
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
@@ -75,6 +76,17 @@ def test_properties_stand_in_the_order_of_3dgs(tmp_path):
         *rest,
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
+
+
+def test_trimesh_opens_it_as_points(tmp_path):
+    gaussians = random_gaussians(9, degree=2)
+    write_ply(tmp_path / "scene.ply", gaussians)
+    opened = trimesh.load(tmp_path / "scene.ply")
+    assert isinstance(opened, trimesh.PointCloud)
+    np.testing.assert_array_equal(opened.vertices, gaussians.means)
+    fields = opened.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(np.ravel(fields["opacity"]), gaussians.logit_opacities)
+    np.testing.assert_array_equal(np.ravel(fields["scale_1"]), gaussians.log_scales[:, 1])
 
 
 @pytest.mark.parametrize(("text", "byte_order"), [(True, "="), (False, ">"), (False, "<")])
