@@ -72,11 +72,10 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     budget = Budget(config.steps, MINUTES, curve)
     judged = [(str(i), view) for i, view in enumerate(held_out)]
     recent: list[float] = []
-    for fitted in fit(problem, state, steps=budget):
-        budget.took(fitted.seconds)
+    for fitted in fit(problem, state, share=budget):
         recent = [*recent[-49:], fitted.seconds]
         curve.took(fitted.seconds, 0.0)
-        state, last = fitted.state, fitted.state.step >= budget(fitted.state.step)
+        state, last = fitted.state, budget(fitted.state.step) >= 1
         if last or curve.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
             rows.append((curve.seconds / 60, judge(problem, state.gaussians, judged).mean()["psnr"]))
     gaussians = living(state.gaussians)[0]

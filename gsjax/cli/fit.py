@@ -26,15 +26,26 @@ from gsjax.cli.tensorboard import TensorBoard
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
+from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.reconstruction import PRESETS, FitConfig, Problem, View, begin, fit, light_of, needed
+from gsjax.methods.reconstruction import (
+    PRESETS,
+    FitConfig,
+    Model,
+    Problem,
+    View,
+    as_found,
+    begin,
+    fit,
+    light_of,
+    needed,
+)
 from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
 _LARGE = 1600  # pixels, a side
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
-_MEASURED = 50  # steps whose time says how many are left in a budget
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
 
 HELP = (
@@ -57,7 +68,7 @@ class Options:
     test_every: int = 8
     """Hold out every so-manieth photograph, to judge by, where the data has no split; 0 holds out none."""
     minutes: float | None = None
-    """Stop after so many minutes: the number of steps then follows from how fast they are."""
+    """Stop after so many minutes of steps, compiling included: how many there are follows from their pace."""
     until_psnr: float | None = None
     """Stop when held-out photographs are seen with so many dB."""
     judge_every: int = 500
@@ -101,12 +112,12 @@ def run(options: Options) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         if options.resume:
             folder.check_config(options, but=_OF_NO_BEARING)
-        folder.write_config(options)
         _say_if_large(photographs)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
         fitted = [views[i] for i in chosen]
         problem, state = begin(fitted, options.fit, cloud, photographs.background)
+        folder.write_config(options)  # from here on an earlier run is gone
         curve = Curve()
         if options.resume:
             state, curve = load(folder.resume, problem, state)
@@ -117,13 +128,19 @@ def run(options: Options) -> int:
         if curve.skipped:
             notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
         gaussians, finished = living(state.gaussians)[0], stopped is None
-        if finished:  # who pressed Ctrl-C does not wait for these
-            gaussians = without_needless(problem, gaussians, notes)
-            write_orbit(folder, problem, gaussians)
+        found_views = as_found(problem, state.model)
+        write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
+        if finished:  # who pressed Ctrl-C does not wait for this, nor for the video
+            gaussians = without_needless(found_views, problem.config, gaussians, notes)
         write_ply(folder.scene, gaussians)
         scores = judge(
             problem, gaussians, judged or [(photographs.names[i], views[i]) for i in chosen[:1]], folder
         )
+        if finished:
+            try:
+                write_orbit(folder, problem._replace(views=found_views), gaussians)
+            except (OSError, ValueError) as error:
+                notes.add(f"There is no video: {describe_error(error)}")
         found = {
             "kind": "fit",
             "dataset": photographs.name,
@@ -223,13 +240,24 @@ def read_views(photographs: Photographs, console: Console) -> list[View]:
             raise
 
 
-def without_needless(problem: Problem, gaussians: Gaussians, notes: Notes) -> Gaussians:
+def write_cameras(folder: RunFolder, names: list[str], views: list[View], model: Model) -> None:
+    """Writes cameras.npz, where cameras or exposures were learned: names [V], viewmats [V,4,4] (world to
+    camera, OpenCV axes), exposures [V,3,4] (the affine maps of colours)."""
+    if model.twists is None and model.exposures is None:
+        return
+    found = {"names": np.array(names), "viewmats": np.stack([view.viewmat for view in views])}
+    if model.exposures is not None:
+        exposures = np.asarray(model.exposures)
+        found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)
+    write_npz(folder.path / "cameras.npz", found)
+
+
+def without_needless(views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes) -> Gaussians:
     """Those that some photograph needs."""
-    config = problem.config
     if not config.prune or not gaussians.num:
         return gaussians
     mode = "antialiased" if config.antialiased else "classic"
-    kept = needed(light_of(gaussians, problem.views, mode), config.prune)
+    kept = needed(light_of(gaussians, views, mode), config.prune)
     if not kept.all():
         some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
         notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
@@ -237,21 +265,18 @@ def without_needless(problem: Problem, gaussians: Gaussians, notes: Notes) -> Ga
 
 
 class Budget:
-    """How many steps there will be: those of the config, or as many as fit into so many minutes."""
+    """What share of a fit is done: of its steps, or of its minutes, whichever is more."""
 
     def __init__(self, steps: int, minutes: float | None, curve: Curve):
-        self._steps, self._minutes, self._curve, self._total = steps, minutes, curve, steps
-        self._recent: list[float] = []
+        self._steps, self._curve = steps, curve
+        self._seconds = np.inf if minutes is None else 60 * minutes
 
-    def took(self, seconds: float) -> None:
-        """A step took so long."""
-        self._recent = [*self._recent[1 - _MEASURED :], seconds]
+    def __call__(self, step: int) -> float:
+        return max(step / self._steps, (self._curve.seconds + self._curve.compile_seconds) / self._seconds)
 
-    def __call__(self, step: int) -> int:
-        if self._minutes is not None and len(self._recent) == _MEASURED and step % _MEASURED == 0:
-            left = 60 * self._minutes - self._curve.seconds - self._curve.compile_seconds
-            self._total = min(self._steps, step + max(0, int(left / np.mean(self._recent))))
-        return self._total
+    def steps(self, step: int) -> int:
+        """About how many there will be, at the pace so far."""
+        return min(self._steps, round(step / max(self(step), 1e-9)))
 
 
 def follow(
@@ -279,19 +304,19 @@ def follow(
     with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task("fitting", total=options.fit.steps, completed=state.step, told="compiling")
         try:
-            steps = fit(problem, state, steps=budget)
+            met = options.until_psnr is not None and curve.has_met(options.until_psnr)
+            steps = iter(()) if met else fit(problem, state, share=budget)
             while (fitted := undisturbed(next, steps, None)) is not None:
                 state, step = fitted.state, fitted.state.step
-                budget.took(fitted.seconds)
                 curve.took(fitted.seconds, fitted.compile_seconds)
                 curve.skipped += bool(fitted.info["skipped"])
                 now = perf_counter()
-                if now - drawn > _SHOWN_EVERY_S or step == budget(step):
+                last = budget(step) >= 1
+                if now - drawn > _SHOWN_EVERY_S or last:
                     told = curve.in_words(fitted, len(judged) > 0)
-                    progress.update(task, completed=step, total=budget(step), told=told)
+                    progress.update(task, completed=step, total=budget.steps(step), told=told)
                     progress.refresh()
                     drawn = now
-                last = step >= budget(step)
                 look = step % options.judge_every == 0 or last
                 if step % _LOGGED_EVERY == 0 or look:
                     psnr = (
@@ -300,7 +325,7 @@ def follow(
                     curve.add(fitted, psnr, folder)
                     if board is not None:
                         board.add(curve.rows[-1])
-                    if options.until_psnr is not None and psnr is not None and psnr >= options.until_psnr:
+                    if options.until_psnr is not None and curve.has_met(options.until_psnr):
                         break
                 saver(state, curve, last=False)
             saver(state, curve, last=True)

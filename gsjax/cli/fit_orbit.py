@@ -9,7 +9,7 @@ from gsjax.geometry.paths import orbit
 from gsjax.io.video import VideoWriter
 from gsjax.methods.reconstruction import Problem
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import render_with_room
 
 NAME = "orbit"
 _FRAMES, _FPS, _LONGEST = 90, 30, 480
@@ -23,14 +23,10 @@ def write_orbit(folder: RunFolder, problem: Problem, gaussians: Gaussians) -> No
     width, height = max(1, round(scale * width)), max(1, round(scale * height))
     K = np.diag([scale, scale, 1.0]) @ view.K
     viewmats = orbit(np.stack([v.viewmat for v in problem.views]), problem.extent.focus, _FRAMES)
-    background = jnp.array([problem.background or (0.0, 0.0, 0.0)])
+    behind = jnp.array([problem.background or (0.0, 0.0, 0.0)])
     mode, plan = "antialiased" if problem.config.antialiased else "classic", None
     with VideoWriter(folder.video(NAME), _FPS) as video:
         for viewmat in viewmats:
             camera = Camera(*(jnp.asarray(a, jnp.float32)[None] for a in (viewmat, K)), width, height)
-            plan = plan or plan_render(gaussians, camera, headroom=1.3, rasterize_mode=mode)
-            drawn = render(gaussians, camera, plan, backgrounds=background)
-            while bool(drawn.meta.overflow.any()):
-                plan = plan.grown(int(drawn.meta.needed.max()), 1.3)
-                drawn = render(gaussians, camera, plan, backgrounds=background)
+            drawn, plan = render_with_room(gaussians, camera, plan, backgrounds=behind, rasterize_mode=mode)
             video.write(np.asarray(drawn.colors[0]))

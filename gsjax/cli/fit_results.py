@@ -22,7 +22,7 @@ from gsjax.metrics.image import depth_error, psnr, ssim, with_matched_colors
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians, cull_invalid, take
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import render_with_room
 from gsjax.viz.colors import side_by_side
 from gsjax.viz.plots import fit_curve, save
 
@@ -64,7 +64,8 @@ class Curve:
         """One step more."""
         self.seconds += seconds
         self.compile_seconds += compile_seconds
-        self._rate = 0.95 * self._rate + 0.05 * seconds if self._rate else seconds
+        if not compile_seconds:
+            self._rate = 0.95 * self._rate + 0.05 * seconds if self._rate else seconds
 
     def add(self, fitted: Fitted, test_psnr: float | None, folder: RunFolder) -> None:
         """A row, which stands in metrics.jsonl at once."""
@@ -82,14 +83,18 @@ class Curve:
         with atomic_write(folder.metrics_lines) as temporary:
             temporary.write_text(lines, encoding="utf-8")
 
+    def has_met(self, goal: float) -> bool:
+        """Whether held-out views were seen with so many dB when they were last looked at."""
+        looked = [row["test_psnr"] for row in self.rows if row["test_psnr"] is not None]
+        return bool(looked) and looked[-1] >= goal
+
     def in_words(self, fitted: Fitted, judged: bool) -> str:
         """For the progress bar."""
         tested = [row["test_psnr"] for row in self.rows if row["test_psnr"] is not None]
         test = f", held out {tested[-1]:.1f} dB" if judged and tested else ""
         count = int(fitted.info["alive"])
-        return (
-            f"loss {float(fitted.info['loss']):.3f}{test}, {count:,} Gaussians, {1 / self._rate:.1f} steps/s"
-        )
+        pace = f", {1 / self._rate:.1f} steps/s" if self._rate else ""
+        return f"loss {float(fitted.info['loss']):.3f}{test}, {count:,} Gaussians{pace}"
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
@@ -178,7 +183,8 @@ class Seen:
         """How far depth is off, where something is drawn; None where none was measured."""
         if self.view.depth is None:
             return None
-        return depth_error(self.depth, self.view.depth, self.covered).mean_abs_mm
+        counted = self.covered if self.view.mask is None else self.covered & self.view.mask
+        return depth_error(self.depth, self.view.depth, counted).mean_abs_mm
 
 
 def look(
@@ -201,13 +207,7 @@ def look(
     viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (view.viewmat, view.K))
     camera, mode = Camera(viewmat, K, width, height), "antialiased" if antialiased else "classic"
     behind = jnp.array([background or (0.0, 0.0, 0.0)])
-    while True:
-        if plan is None or plan.sh_degree != gaussians.sh_degree:
-            plan = plan_render(gaussians, camera, headroom=1.3, rasterize_mode=mode)
-        drawn = render(gaussians, camera, plan, backgrounds=behind)
-        if not bool(drawn.meta.overflow.any()):
-            break
-        plan = plan.grown(int(drawn.meta.needed.max()), 1.3)
+    drawn, plan = render_with_room(gaussians, camera, plan, backgrounds=behind, rasterize_mode=mode)
     image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), view.image / 255
     if view.mask is not None:
         image = np.where(view.mask[..., None], image, truth)
@@ -242,7 +242,7 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
         subtitle=f"{photographs['fitted']} photographs fitted, {photographs['held_out']} held out",
         summary=cards,
         strips=[Media(folder.path / row["picture"], row["view"]) for row in shown],
-        videos=[Media(folder.video(ORBIT), "About the scene")] if found["complete"] else (),
+        videos=[Media(folder.video(ORBIT), "About the scene")] if folder.video(ORBIT).exists() else (),
         plots=[Media(plot, "Held-out PSNR, and the number of Gaussians, over minutes")],
         tables=[
             Table(

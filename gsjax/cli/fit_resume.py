@@ -58,7 +58,7 @@ def load(folder: Path, problem: Problem, start: FitState) -> tuple[FitState, Cur
     Raises:
         CheckpointError: there are only damaged ones.
     """
-    wrong = None
+    wrong, damaged = None, []
     for path in reversed(_saved(folder)):
         try:
             metadata = load_metadata(path)
@@ -66,9 +66,12 @@ def load(folder: Path, problem: Problem, start: FitState) -> tuple[FitState, Cur
             model, optimizer = enlarged(problem, start.model, start.optimizer, *size)
             like = FitState(model, optimizer, 0, np.zeros((metadata["sizes"], 4), int))
             state, _ = load_checkpoint(path, like)
+            for later in damaged:  # else they would count among the newest
+                later.unlink()
             return state, Curve.of(metadata["curve"])
         except CheckpointError as error:
             wrong = error
+            damaged.append(path)
     if wrong is not None:
         raise wrong
     return start, Curve()

@@ -12,7 +12,8 @@ import yaml
 
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
-_FILES = ("config.yml", "metrics.json", "metrics.jsonl", "trajectory.npz", "scene.ply", "report.html")
+_FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
+_FILES += ("trajectory.npz", "scene.ply", "cameras.npz")
 _FOLDERS = ("renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
@@ -34,6 +35,7 @@ class RunFolder:
           trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
           scene.ply               the Gaussians: of a fit, or of the first frame with their labels
+          cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
           renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
           video_CAM.mp4           input, render, error and labels side by side; of a fit video_orbit.mp4
           plots/NAME.svg|png      update time, error over frames, ...
@@ -50,7 +52,7 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool = False):
-        """Makes the folder, clearing what an unfinished run left there unless it is to go on.
+        """Makes the folder. What an earlier run left there is cleared when this one writes its settings.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
@@ -64,7 +66,7 @@ class RunFolder:
             FileExistsError: something that is not a run is there; nothing of it is touched.
             NotADirectoryError: `path` is a file.
         """
-        self.path = Path(path)
+        self.path, self._stale = Path(path), False
         if resume and not self.config.is_file():
             raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():
@@ -84,11 +86,7 @@ class RunFolder:
             raise FileExistsError(
                 f"{self.path}: holds a finished run; name another folder, or replace it with --overwrite"
             )
-        if resume:
-            return
-        for name in (*_FILES, *_FOLDERS, *_PATTERNS):
-            for entry in self.path.glob(name):
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        self._stale = not resume
 
     @property
     def finished(self) -> bool:
@@ -141,12 +139,17 @@ class RunFolder:
         return path
 
     def write_config(self, config: Any) -> None:
-        """Writes config.yml from a dataclass instance, nested ones included.
+        """Writes config.yml from a dataclass instance, nested ones included, in place of an earlier run.
 
         Raises:
             TypeError: `config` is not a dataclass instance.
         """
         text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
+        for name in (*_FILES, *_FOLDERS, *_PATTERNS) if self._stale else ():
+            for entry in self.path.glob(name):
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        self._stale = False
+        self.report.unlink(missing_ok=True)  # that of a part: a run is finished when it has its own
         with atomic_write(self.config) as temporary:
             temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 

@@ -41,8 +41,8 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any]) -> None:
-    """Write named arrays as a compressed .npz that loads with `allow_pickle=False`.
+def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
+    """Write named arrays as an .npz that loads with `allow_pickle=False`, compressed unless told.
 
     Raises:
         ValueError: an array holds Python objects, which only pickle could store.
@@ -53,7 +53,7 @@ def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any]) -> None:
         raise ValueError(f"write_npz: {objects} hold Python objects; want numbers, booleans or strings")
     # Through a stream, because np.savez appends .npz to names that lack it.
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
+        (np.savez_compressed if compress else np.savez)(stream, **arrays)
 
 
 def _plain(value: Any) -> Any:

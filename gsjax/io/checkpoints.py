@@ -49,7 +49,8 @@ def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, A
         "sha256": _checksum({name: array for name, (array, _) in arrays.items()}),
     }
     stored = {name: array for name, (array, _) in arrays.items()}
-    write_npz(path, stored | {_HEADER: np.array(json.dumps(header))})
+    # Uncompressed: optimizers' floats shrink by a tenth, in sixty times the time.
+    write_npz(path, stored | {_HEADER: np.array(json.dumps(header))}, compress=False)
 
 
 def load_checkpoint(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:

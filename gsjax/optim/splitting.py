@@ -73,7 +73,7 @@ def divide(
     *,
     threshold: float,
     large: float,
-    too_large: float,
+    too_large: Float[Array, ""] | float,
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
     """Clone, split and prune. Where vacant slots are too few, those that are pulled hardest come first.
 

@@ -89,3 +89,30 @@ def render(
     if visibility is not None:
         images, alphas, meta = jax.tree.map(lambda a: a[:, 0], (images, alphas, meta))
     return Rendered(images[..., :3], images[..., 3], alphas[..., 0], meta.features, meta)
+
+
+def render_with_room(
+    gaussians: Gaussians,
+    cameras: Camera,
+    plan: Plan | None = None,
+    *,
+    backgrounds: Float[Array, "c 3"] | None = None,
+    rasterize_mode: str = "classic",
+    headroom: float = 1.3,
+) -> tuple[Rendered, Plan]:
+    """What `render` draws, and a plan that held it: that of an earlier call, made or grown where it must be.
+    For loops on the host, over views of one size.
+
+    Args:
+        gaussians, cameras, backgrounds: as for `render`.
+        plan: of an earlier call.
+        rasterize_mode: of a plan that is made.
+        headroom: how many times as much as it needs a plan holds.
+    """
+    if plan is None or plan.sh_degree != gaussians.sh_degree:
+        plan = plan_render(gaussians, cameras, headroom=headroom, rasterize_mode=rasterize_mode)
+    drawn = render(gaussians, cameras, plan, backgrounds=backgrounds)
+    while bool(drawn.meta.overflow.any()):
+        plan = plan.grown(int(drawn.meta.needed.max()), headroom)
+        drawn = render(gaussians, cameras, plan, backgrounds=backgrounds)
+    return drawn, plan

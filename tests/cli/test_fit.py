@@ -9,6 +9,7 @@ import time
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import pytest
 import yaml
 
@@ -212,12 +213,18 @@ def test_what_is_held_out_is_as_the_data_says_or_every_so_manieth(photographs):
         split(replace(nine, splits=("test",) * 9), 4)
 
 
-def test_a_budget_of_minutes_is_as_many_steps_as_fit():
+def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
     curve = Curve()
-    budget = Budget(10_000, 1.0, curve)
-    for step in range(100):
-        assert budget(step) == (10_000 if step < 50 else 550)
-        curve.took(0.1, 5.0 if step == 0 else 0.0)
-        budget.took(0.1)
-    assert budget(100) == 100 + int((60 - 5 - 10) / 0.1) == 550
-    assert Budget(10_000, None, curve)(5000) == 10_000
+    budget, shares = Budget(7_000, 1.0, curve), []
+    for step in range(7_000):
+        shares.append(budget(step))
+        if shares[-1] >= 1:
+            break
+        curve.took(0.01 if shares[-1] < 0.25 else 0.05, 5.0 if step == 0 else 0.0)  # small photographs first
+    assert shares[0] == 0.0
+    assert shares[1] == pytest.approx(5.01 / 60)
+    assert max(np.diff(shares[1:])) < 0.001
+    assert step == pytest.approx(1000 + 900, abs=5)  # 10 s of 0.01, 45 of 0.05, 5 of compiling
+    resumed = Budget(7_000, 1.0, Curve.of(curve.metadata()))
+    assert resumed(step) == shares[-1]
+    assert Budget(10_000, None, curve)(5_000) == 0.5

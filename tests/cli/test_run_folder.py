@@ -89,13 +89,17 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
         (finished.path / name).mkdir()
         (finished.path / name / "video.mp4").touch()
     run = RunFolder(finished.path, overwrite=True)
-    assert contents(run) == ["my notes.txt"]
+    assert run.finished  # until there is something to take its place
+    run.write_config(Config())
+    assert contents(run) == ["config.yml", "my notes.txt"]
     assert not run.finished
 
 
 def test_unfinished_run_is_replaced(finished):
     finished.report.unlink()
-    assert contents(RunFolder(finished.path)) == ["my notes.txt"]
+    run = RunFolder(finished.path)
+    run.write_config(Config())
+    assert contents(run) == ["config.yml", "my notes.txt"]
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

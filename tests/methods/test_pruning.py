@@ -47,7 +47,9 @@ def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
             HEIGHT,
         )[0]
         summed.append(np.asarray(drawn).sum((0, 1)))
-    np.testing.assert_allclose(light, np.max(summed, axis=0) / (WIDTH * HEIGHT), rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        light, np.max([one / one.sum() for one in summed], axis=0), rtol=1e-3, atol=1e-6
+    )
 
 
 def test_what_is_hidden_or_behind_all_cameras_sends_none():
@@ -65,3 +67,9 @@ def test_what_is_left_out_is_needed_least_and_sends_no_more_than_the_share(light
     if kept.any():
         assert light[~kept].max(initial=0.0) <= light[kept].min()
         assert light[~kept].sum() + light[kept].min() > share - 1e-12  # and one more would be too much
+
+
+def test_a_scene_that_is_small_in_its_pictures_is_needed_all_the_same():
+    far = look_at(np.array([60.0, 0.0, 0.0]), np.zeros(3))
+    light = light_of(wall(), [view((3.0, 0.2, 0.5))._replace(viewmat=far)])
+    assert needed(light, 0.002).sum() > 100

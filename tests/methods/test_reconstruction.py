@@ -13,6 +13,7 @@ from gsjax.methods.reconstruction import (
     Batch,
     FitConfig,
     FitState,
+    GrowthConfig,
     Model,
     Observation,
     RatesConfig,
@@ -24,7 +25,7 @@ from gsjax.methods.reconstruction import (
     fit,
     fit_loss,
 )
-from gsjax.methods.reconstruction.fit import enlarged
+from gsjax.methods.reconstruction.fit import _observe, enlarged
 from gsjax.methods.reconstruction.model import exposed, refined
 from gsjax.methods.reconstruction.start import start_points
 from gsjax.optim.densification import is_alive
@@ -210,7 +211,7 @@ def test_slots_fill_up_to_the_cap_and_no_further(views):
     problem, state = begin(views, config)
     first = int(is_alive(state.gaussians).sum())
     counts = [
-        int(is_alive(fitted.state.gaussians).sum()) for fitted in fit(problem, state, steps=lambda i: 40)
+        int(is_alive(fitted.state.gaussians).sum()) for fitted in fit(problem, state, share=lambda i: i / 40)
     ]
     assert first == 40
     assert max(counts) == config.cap
@@ -244,7 +245,7 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
 
 def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(views):
     problem, state = begin(views, QUICK)
-    *_, fitted = fit(problem, state, steps=lambda i: 3)
+    *_, fitted = fit(problem, state, share=lambda i: i / 3)
     model, optimizer = fitted.state.model, fitted.state.optimizer
     wider, known = enlarged(problem, model, optimizer, 2, QUICK.cap + 30)
     assert wider.gaussians.sh_degree == 2
@@ -269,7 +270,7 @@ def test_masks_that_leave_nothing_are_refused(views):
 def test_poison_in_a_photograph_cannot_be_and_in_a_gaussian_skips_the_step(views):
     problem, state = begin(views, QUICK)
     sick = eqx.tree_at(lambda s: s.model.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
-    (fitted, *_) = fit(problem, sick, steps=lambda i: 1)
+    (fitted, *_) = fit(problem, sick, share=lambda i: i / 1)
     assert bool(fitted.info["skipped"])
     assert np.isfinite(np.asarray(fitted.state.gaussians.means)).all()
 
@@ -320,9 +321,65 @@ def test_points_that_no_photograph_shows_are_no_start(views):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
-    [({"steps": 0}, "steps"), ({"sh_degree": 4}, "sh_degree"), ({"dssim_weight": 1.5}, "dssim_weight")],
+    ("kind", "name", "value", "says"),
+    [
+        (FitConfig, "steps", 0, "steps: expected at least 1, found 0"),
+        (FitConfig, "sh_degree", 4, "sh_degree: expected at least 0 and at most 3, found 4"),
+        (FitConfig, "dssim_weight", 1.5, "dssim_weight: expected"),
+        (FitConfig, "prune", -0.1, "prune: expected"),
+        (StartConfig, "count", 0, "start.count: expected at least 1"),
+        (StartConfig, "opacity", 2.0, "start.opacity: expected"),
+        (StartConfig, "scale", float("nan"), "start.scale: expected"),
+        (RatesConfig, "means", -1.0, "rates.means: expected"),
+        (GrowthConfig, "every", 0, "growth.every: expected"),
+        (GrowthConfig, "factor", 0.9, "growth.factor: expected"),
+        (SplitConfig, "every", 0, "split.every: expected"),
+        (SplitConfig, "reset_every", 0, "split.reset_every: expected"),
+    ],
 )
-def test_settings_without_meaning_are_refused(changes, says):
-    with pytest.raises(ValueError, match=f"{says} must be"):
-        FitConfig(**changes)
+def test_settings_without_meaning_are_refused(kind, name, value, says):
+    with pytest.raises(ValueError, match=says):
+        kind(**{name: value})
+
+
+def test_another_background_than_that_of_the_data_is_refused(views):
+    with pytest.raises(ValueError, match="leave it at data"):
+        begin(views, replace(QUICK, background="random"), background=(1.0, 1.0, 1.0))
+
+
+def test_depth_that_knows_nothing_is_no_start(views):
+    blind = [view._replace(depth=np.zeros_like(view.depth)) for view in views]
+    assert start_points(blind, None, StartConfig(count=10), 0)[2] == "random"
+    with pytest.raises(ValueError, match="the data has no depth"):
+        start_points(blind, None, StartConfig(source="depth"), 0)
+
+
+def test_photographs_with_and_without_masks_and_depth_share_one_program(views):
+    ones = np.ones((HEIGHT, WIDTH), bool)
+    holed = ones.copy()
+    holed[0, 0] = False  # which is gone in a smaller picture
+    mixed = [
+        view._replace(mask=[None, ones, holed][i % 3], depth=view.depth if i % 2 else None)
+        for i, view in enumerate(views)
+    ]
+    kinds = {
+        jax.tree.structure(_observe(view, i, shrink, (True, True)))
+        for i, view in enumerate(mixed)
+        for shrink in (1,)
+    }
+    assert len(kinds) == 1
+    problem, state = begin(
+        mixed, replace(QUICK, sh_degree=0, coarse_until=0.0, growth=GrowthConfig(begin=99))
+    )
+    compiling = [fitted.compile_seconds > 0 for fitted in fit(problem, state, share=lambda i: i / 12)]
+    assert sum(compiling) == 1
+
+
+def test_few_grow_too(views):
+    growth = replace(QUICK.growth, every=5, begin=5, opacity_cost=0.0)
+    config = replace(
+        QUICK, growth=growth, start=StartConfig(source="depth", count=4, opacity=0.9), sh_degree=0
+    )
+    problem, state = begin(views[:4], config)
+    *_, fitted = fit(problem, state, share=lambda i: i / 16)
+    assert int(fitted.info["alive"]) > 4

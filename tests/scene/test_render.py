@@ -1,5 +1,7 @@
 """A scene and cameras to images: the same as the public rasterizer called by hand."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 import gsjax
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
 from gsjax.scene.gaussians import gaussians_from_activated
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import plan_render, render, render_with_room
 
 WIDTH, HEIGHT = 40, 28
 
@@ -149,3 +151,17 @@ def test_a_plan_holds_its_scene_and_takes_options(scene, cameras):
 def test_under_a_trace_it_asks_for_a_plan(scene, cameras):
     with pytest.raises(ValueError, match="plan"):
         jax.jit(lambda g: render(g, cameras).colors)(scene)
+
+
+def test_a_plan_is_made_kept_and_grown_as_it_must_be(scene, cameras):
+    wanted = render(scene, cameras).colors
+    drawn, plan = render_with_room(scene, cameras)
+    np.testing.assert_array_equal(drawn.colors, wanted)
+    assert render_with_room(scene, cameras, plan)[1] is plan
+    drawn, grown = render_with_room(scene, cameras, replace(plan, capacity=16))
+    np.testing.assert_array_equal(drawn.colors, wanted)
+    assert grown.capacity >= int(drawn.meta.needed.max())
+    bare = eqx.tree_at(
+        lambda g: g.shN, scene, jnp.zeros((scene.num, 3, 3)), is_leaf=lambda leaf: leaf is None
+    )
+    assert render_with_room(bare, cameras, plan)[1].sh_degree == 1  # another degree asks for another plan

@@ -17,7 +17,7 @@ from gsjax.methods.reconstruction.config import (
     SplitConfig,
     StartConfig,
 )
-from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, begin, fit
+from gsjax.methods.reconstruction.fit import FitState, Fitted, Problem, as_found, begin, fit
 from gsjax.methods.reconstruction.model import Model
 from gsjax.methods.reconstruction.pruning import light_of, needed
 from gsjax.methods.reconstruction.start import Extent, View, extent_of
@@ -38,6 +38,7 @@ __all__ = [
     "SplitConfig",
     "StartConfig",
     "View",
+    "as_found",
     "begin",
     "extent_of",
     "fit",

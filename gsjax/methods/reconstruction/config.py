@@ -1,7 +1,9 @@
 """How a scene is fitted to photographs. Comments become the command line's help."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -14,6 +16,11 @@ class StartConfig:
     """How many, where they are drawn from depth or at random."""
     opacity: float = 0.1
     """Of all of them; more where depth says that something is there."""
+    scale: float = 1.0
+    """Of all of them, in distances to their neighbours."""
+
+    def __post_init__(self):
+        _expect(self, "start.", count=(1, np.inf), opacity=(1e-3, 0.999), scale=(1e-6, np.inf))
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,9 @@ class RatesConfig:
     """Of each photograph's map of colours, where exposure is learned."""
     twists: float = 2e-4
     """Of the cameras' turns, radians, and shifts, radii of the scene; it falls to a hundredth by the end."""
+
+    def __post_init__(self):
+        _expect(self, "rates.", **{field.name: (0, np.inf) for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -52,6 +62,10 @@ class GrowthConfig:
     scale_cost: float = 0.01
     """Weight of the mean scale, in radii of the scene."""
 
+    def __post_init__(self):
+        _expect(self, "growth.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), factor=(1, np.inf))
+        _expect(self, "growth.", **dict.fromkeys(("noise", "opacity_cost", "scale_cost"), (0, np.inf)))
+
 
 @dataclass(frozen=True)
 class SplitConfig:
@@ -68,9 +82,13 @@ class SplitConfig:
     large: float = 0.01
     """Scale above which one is split and not cloned, in radii of the scene."""
     too_large: float = 0.1
-    """Scale above which one is pruned."""
+    """Scale above which one is pruned, once opacities were lowered: the background begins few and large."""
     reset_every: int = 3_000
     """Steps after which all opacities are lowered to 0.01: what is not needed stays there."""
+
+    def __post_init__(self):
+        _expect(self, "split.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), reset_every=(1, np.inf))
+        _expect(self, "split.", large=(0, np.inf), too_large=(0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -112,15 +130,17 @@ class FitConfig:
     split: SplitConfig = field(default_factory=SplitConfig)
 
     def __post_init__(self):
-        positive = ("steps", "cap", "sh_every")
-        for name in positive:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.sh_degree not in range(4):
-            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
-        for name in ("dssim_weight", "coarse_until", "prune"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        _expect(self, steps=(1, np.inf), cap=(1, np.inf), sh_degree=(0, 3), sh_every=(1, np.inf))
+        _expect(self, dssim_weight=(0, 1), depth_weight=(0, np.inf), coarse_until=(0, 1), prune=(0, 1))
+
+
+def _expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
+    """Raises ValueError for the first field that lies outside its range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not low <= value <= high:
+            most = "" if high == np.inf else f" and at most {high:g}"
+            raise ValueError(f"{where}{name}: expected at least {low:g}{most}, found {value}")
 
 
 PRESETS = {
@@ -135,9 +155,9 @@ PRESETS = {
         sh_degree=3,
         sh_every=1_000,
         coarse_until=0.0,
-        start=StartConfig(count=100_000),
+        start=StartConfig(count=100_000, opacity=0.5, scale=0.1),
         growth=GrowthConfig(begin=500, end=25 / 30),
     ),
 }
-"""Settings by name: for a first look, with 3DGS's cloning and splitting, for RGB-D, and those of 3DGS-MCMC,
-which ask for a GPU or a night."""
+"""Settings by name: for a first look, with 3DGS's cloning and splitting, for RGB-D, and about those of
+3DGS-MCMC, which ask for a GPU or a night."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.reconstruction.config import FitConfig
-from gsjax.methods.reconstruction.model import Model, carried_over, model_of, with_degree, with_slots
+from gsjax.methods.reconstruction.model import Model, carried_over, model_of, refined, with_degree, with_slots
 from gsjax.methods.reconstruction.start import Extent, View, extent_of, in_slots, start_points
 from gsjax.methods.reconstruction.step import (
     Batch,
@@ -106,16 +106,21 @@ def begin(
 
     Raises:
         ValueError: there is no view, or none in which a pixel counts, or nothing of the kind from which the
-            fit is to start.
+            fit is to start, or another background is asked for than the data has.
     """
     if not views:
         raise ValueError("views: expected at least one photograph to fit, found none")
+    if background is not None and config.background != "data":
+        raise ValueError(
+            f"background: the photographs stand on {background} where nothing is, which before "
+            f"{config.background!r} would be learned as a thing; leave it at data"
+        )
     if not any(view.mask is None or view.mask.any() for view in views):
         raise ValueError("masks: in none of the photographs to fit does any pixel count; are they inverted?")
     extent = extent_of(np.stack([view.viewmat for view in views]))
     points, colors, source = start_points(views, cloud, config.start, config.seed)
     slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
-    gaussians = in_slots(points, colors, slots, config.start.opacity, config.seed)
+    gaussians = in_slots(points, colors, slots, config.start, config.seed)
     behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
     behind["data"] = background or behind["black"]
     problem = Problem(views, config, extent, behind[config.background], source)
@@ -124,15 +129,17 @@ def begin(
     return problem, FitState(model, state, 0, np.zeros((0, 4), int))
 
 
-def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None = None) -> Iterator[Fitted]:
-    """Step by step, until as many are made as are wanted. The same state, problem and `steps` give the same
-    bits, wherever the fit was begun or resumed.
+def fit(
+    problem: Problem, state: FitState, *, share: Callable[[int], float] | None = None
+) -> Iterator[Fitted]:
+    """Step by step, until all is done. The same state, problem and `share` give the same bits, wherever the
+    fit was begun or resumed.
 
     Args:
         problem: from `begin`.
         state: from `begin`, or that of an earlier `Fitted`.
-        steps: step -> how many there will be in all, which a budget of time finds out as it goes; those of
-            the config unless given.
+        share: step -> what share of the fit is done before it, by which rates fall and photographs grow; at 1
+            it ends. That of the config's steps unless given.
     """
     config, views = problem.config, problem.views
     key = jax.random.key(config.seed)
@@ -141,14 +148,17 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
     seen: dict[tuple[int, int], Observation] = {}
     model, optimizer = state.model, state.optimizer
     compiled: set[Any] = set()
+    # All observations are of one kind, for each kind is a program of its own.
+    kinds = any(_counts(view) is not None for view in views), any(view.depth is not None for view in views)
     i = state.step
-    while i < (total := config.steps if steps is None else steps(i)):
-        share = i / total
+    while (done := i / config.steps if share is None else share(i)) < 1:
         degree = min(config.sh_degree, i // config.sh_every)
         model, optimizer = enlarged(problem, model, optimizer, degree, 0)
-        v, shrink = _turn(config.seed, i, len(views)), _shrink(config, share)
+        v, shrink = _turn(config.seed, i, len(views)), _shrink(config, done)
         if (v, shrink) not in seen:
-            seen[v, shrink] = _observe(views[v], v, shrink)
+            if any(of != shrink for _, of in seen):
+                seen.clear()  # photographs of a size that is over
+            seen[v, shrink] = _observe(views[v], v, shrink, kinds)
         observed = seen[v, shrink]
         size = (shrink, observed.camera.width, observed.camera.height)
         begun, compiling = perf_counter(), 0.0
@@ -161,7 +171,7 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
             if new not in compiled:  # the first call of a program is not the time of a step
                 started = perf_counter()
             walk = jax.random.fold_in(jax.random.fold_in(key, _WALK), i)
-            model, optimizer, info = advance(model, optimizer, batch, share, walk)
+            model, optimizer, info = advance(model, optimizer, batch, done, walk)
             overflow = bool(info["overflow"])
             if new not in compiled:
                 compiling += perf_counter() - started
@@ -169,12 +179,16 @@ def fit(problem: Problem, state: FitState, *, steps: Callable[[int], int] | None
             if not overflow:
                 break
             plans[size] = plan.grown(int(info["needed"]), _HEADROOM).capacity
-        if _densifies(config, i, share):
+        if _densifies(config, i, done):
+            started, new = perf_counter(), (model.gaussians.num, model.gaussians.sh_degree)
             turn = jax.random.fold_in(jax.random.fold_in(key, _GROWTH), i)
             if config.strategy == "split":
                 room = min(config.cap, rung(int(slots_wanted(model, optimizer, config))))
                 model, optimizer = enlarged(problem, model, optimizer, 0, room)
             model, optimizer = densify(model, optimizer, turn, i, _all_looked(config, i, len(views)))
+            if new not in compiled:
+                compiling += perf_counter() - started
+                compiled.add(new)
         i += 1
         capacity = np.array([[*of, room] for of, room in plans.items()], int)
         now = FitState(model, optimizer, i, capacity)
@@ -196,7 +210,7 @@ def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
             return grow(model, optimizer, key, config.cap, config.growth.factor, all_looked)
         every, between = config.split.reset_every, config.split.every
         reset = i // every > jnp.maximum(i - between, 0) // every
-        return split(model, optimizer, key, config, radius, reset, all_looked)
+        return split(model, optimizer, key, config, radius, reset, i > every, all_looked)
 
     return advance, densify
 
@@ -227,9 +241,19 @@ def _all_looked(config: FitConfig, step: int, views: int) -> bool:
     return step >= period and step % period == 0
 
 
-def _observe(view: View, number: int, shrink: int) -> Observation:
-    """A view on the device, in a picture of another size."""
-    image, mask, depth = view.image, view.mask, view.depth
+def _counts(view: View) -> np.ndarray | None:
+    """Which pixels count, where not all do."""
+    return None if view.mask is None or view.mask.all() else view.mask
+
+
+def _observe(view: View, number: int, shrink: int, kinds: tuple[bool, bool]) -> Observation:
+    """A view on the device, in a picture of another size. `kinds`: with a mask, with depth, known or not."""
+    image, mask, depth = view.image, _counts(view), view.depth
+    masked, with_depth = kinds
+    if masked and mask is None:
+        mask = np.ones(image.shape[:2], bool)
+    if with_depth and depth is None:
+        depth = np.zeros(image.shape[:2], np.float32)
     height, width = (max(1, side // shrink) for side in image.shape[:2])
     factors = np.array([width / image.shape[1], height / image.shape[0], 1.0])
     if shrink > 1:
@@ -240,7 +264,7 @@ def _observe(view: View, number: int, shrink: int) -> Observation:
     dtype = jnp.result_type(float)
     viewmat, K = (jnp.asarray(a, dtype)[None] for a in (view.viewmat, factors[:, None] * view.K))
     known = None if depth is None else jnp.asarray(depth, dtype)[None]
-    counts = None if mask is None or mask.all() else jnp.asarray(mask)[None]
+    counts = None if mask is None else jnp.asarray(mask)[None]
     camera = Camera(viewmat, K, width, height)
     return Observation(jnp.asarray(image)[None], counts, known, camera, jnp.asarray(number, jnp.int32))
 
@@ -258,6 +282,20 @@ def _background(problem: Problem, key: Array, step: int) -> Float[Array, "1 3"]:
     if problem.background is not None:
         return jnp.array([problem.background])
     return jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, _RANDOM_BACKGROUND), step), (1, 3))
+
+
+def as_found(problem: Problem, model: Model) -> list[View]:
+    """The views from where the fit found their cameras."""
+    if model.twists is None:
+        return problem.views
+    viewmats = (
+        refined(
+            jnp.asarray(view.viewmat, jnp.float32)[None], model.twists, jnp.int32(i), problem.extent.radius
+        )[0]
+        for i, view in enumerate(problem.views)
+    )
+    found = [np.asarray(viewmat, np.float64) for viewmat in viewmats]
+    return [view._replace(viewmat=viewmat) for view, viewmat in zip(problem.views, found, strict=True)]
 
 
 def enlarged(problem: Problem, model: Model, optimizer: Any, degree: int, slots: int) -> tuple[Model, Any]:

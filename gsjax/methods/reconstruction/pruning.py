@@ -33,8 +33,8 @@ def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]
 def light_of(
     gaussians: Gaussians, views: list[View], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
-    """What share of a picture's light each Gaussian sends, in the view that has the most of it: the largest
-    over views of the mean over pixels of its weight in compositing, w_i = alpha_i T_i.
+    """What share of the scene's light each Gaussian sends, in the view that has the most of it: the largest
+    over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i, over that of all.
 
     The sums are the gradient of the composited sum of a feature that is 1 everywhere.
     """
@@ -52,7 +52,8 @@ def light_of(
             if not bool(meta.overflow.any()):
                 break
             plans[width, height] = plans[width, height].grown(int(meta.needed.max()), 1.3)
-        most = np.maximum(most, np.asarray(weights) / (width * height))
+        total = float(weights.sum())
+        most = np.maximum(most, np.asarray(weights) / max(total, 1e-12))
     return most
 
 

@@ -72,14 +72,15 @@ def start_points(
         ValueError: the source that is asked for is not there.
     """
     random = np.random.default_rng(seed)
-    has_depth = any(view.depth is not None for view in views)
+    has_depth = any(_known_depth(view).any() for view in views)
     source = config.source
-    has_points = cloud is not None and len(cloud[0]) > 0
-    is_seen = has_points and source in ("auto", "cloud") and _is_seen(cloud[0], views)
+    if cloud is not None and not len(cloud[0]):
+        cloud = None
+    is_seen = cloud is not None and source in ("auto", "cloud") and _is_seen(cloud[0], views)
     if source == "auto":
         source = "cloud" if is_seen else "depth" if has_depth else "random"
     if source == "cloud":
-        if not has_points:
+        if cloud is None:
             raise ValueError("start.source: the data has no points; use depth, random or auto")
         return *cloud, source
     if source == "depth":
@@ -107,14 +108,22 @@ def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
     return bool(seen.any())
 
 
+def _known_depth(view: View) -> np.ndarray:
+    """Depth where it is known and counts, else 0."""
+    if view.depth is None:
+        return np.zeros((1, 1))
+    known = np.isfinite(view.depth) & (view.depth > 0)
+    return np.where(known if view.mask is None else known & view.mask, view.depth, 0)
+
+
 def _from_depth(views, count, random):
     """Pixels with depth, as many from each view."""
     each = -(-count // len(views))
     points, colors = [], []
     for view in views:
-        if view.depth is None or not (view.depth > 0).any():
+        known = _known_depth(view)
+        if not known.any():
             continue
-        known = view.depth if view.mask is None else np.where(view.mask, view.depth, 0)
         some = points_from_rgbd(view.image, known, view.viewmat, view.K)
         kept = random.permutation(len(some[0]))[:each]
         points.append(some[0][kept])
@@ -140,12 +149,12 @@ def _at_random(views, count, random):
     return points, colors
 
 
-def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, opacity: float, seed: int) -> Gaussians:
+def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int) -> Gaussians:
     """Spheres on the points (some of them, where there are more than slots), and empty slots behind them."""
     if len(points) > slots:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:slots])
         points, colors = points[chosen], colors[chosen]
-    started = gaussians_from_points(points, colors, opacity=opacity, scale_factor=1.0)
+    started = gaussians_from_points(points, colors, opacity=config.opacity, scale_factor=config.scale)
     rest = slots - started.num
     padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], rest, axis=0)]), started)
     logits = np.asarray(padded.logit_opacities).copy()

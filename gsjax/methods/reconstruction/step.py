@@ -145,7 +145,7 @@ def grow(
     Where all photographs looked since the last time, those that none has seen count as dead."""
     gaussians, pull = _without_unseen(model.gaussians, state, all_looked), _pull_of(state)
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
-    slots = jnp.clip((used * factor).astype(jnp.int32), used, cap)
+    slots = jnp.clip(jnp.ceil(used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
     state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
     seen = jnp.where(all_looked, 0.0, jnp.where(touched, 1.0, pull.seen))  # who is new cannot have been seen
@@ -166,11 +166,17 @@ def split(
     config: FitConfig,
     radius: float,
     reset: Bool[Array, ""] | bool,
+    pruning: Bool[Array, ""] | bool,
     all_looked: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
     """Gaussians that are pulled hard are cloned or split, others pruned, and what was known of pulls is
-    forgotten; with `reset`, opacities are lowered. Where all photographs looked since the last time, those
-    that none has seen are pruned too."""
+    forgotten.
+
+    Args:
+        reset: lower opacities.
+        pruning: prune what is too large.
+        all_looked: all photographs looked since the last time, so those that none has seen are pruned too.
+    """
     options, pull = config.split, _pull_of(state)
     moved, touched = divide(
         _without_unseen(model.gaussians, state, all_looked),
@@ -179,7 +185,7 @@ def split(
         config.cap,
         threshold=options.pull,
         large=options.large * radius,
-        too_large=options.too_large * radius,
+        too_large=jnp.where(pruning, options.too_large * radius, jnp.inf),
     )
     moved = keep_if(jnp.asarray(reset), with_low_opacities(moved), moved)
     every = jnp.full_like(touched, True)
