@@ -18,6 +18,7 @@ from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import undisturbed
+from gsjax.cli.machine import available_mb
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
@@ -44,6 +45,7 @@ from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
 _LARGE = 1600  # pixels, a side
+_BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
@@ -224,7 +226,14 @@ def read_views(photographs: Photographs, console: Console) -> list[View]:
 
     Raises:
         DataError: one is bad.
+        ValueError: they are too many for this machine's memory.
     """
+    wanted, free = photographs.sizes.prod(1).sum() * _BYTES_A_PIXEL / 1e6, available_mb()
+    if wanted > free:
+        raise ValueError(
+            f"{photographs.name}: {photographs.num} photographs need some {wanted / 1e3:.1f} GB, and "
+            f"{free / 1e3:.1f} GB are free; try --scale"
+        )
 
     def read(i: int) -> View:
         mask, depth = photographs.mask(i), photographs.depth(i)

@@ -70,6 +70,15 @@ def resident_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # macOS counts bytes
 
 
+def available_mb() -> float:
+    """Memory that a program may still take, MB; infinity where the system does not tell."""
+    meminfo = Path("/proc/meminfo")
+    if not meminfo.exists():
+        return float("inf")
+    fields = dict(line.split(":") for line in meminfo.read_text().splitlines())
+    return int(fields["MemAvailable"].split()[0]) / 1e3
+
+
 def name(machine: dict[str, Any]) -> str:
     """What two runs must share for their milliseconds to be compared: processor, cores and device."""
     device = "" if machine["device"] == "cpu" else f", {machine['device']}"

@@ -170,7 +170,7 @@ def _write(
         for name in names:
             (images / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(folder / name, images / name)
-    (options.out / REPORT).unlink(missing_ok=True)
+    write_json(options.out / REPORT, {"complete": False})  # whose folder it is, whatever happens from here on
     for new, old in ((images, options.out / "images"), (sparse, options.out / "sparse")):
         if new.exists():
             if old.exists():

@@ -275,6 +275,10 @@ def _say_left_out(
         warnings.warn(message, DataWarning, stacklevel=4)
 
 
+def _is_transparent(pixels: np.ndarray) -> bool:
+    return pixels.shape[-1] == 4 and bool((pixels[..., 3] < 255).any())
+
+
 def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     ideal = [straighten(frame.lens, *frame.size) for frame in frames]
     clear = np.array(background)
@@ -302,7 +306,8 @@ def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
     }
     times = np.array([np.nan if frame.time is None else frame.time for frame in frames])
     moving = np.isfinite(times).all() and np.ptp(times) > 0
-    transparent = read_rgba(frames[0].image, *frames[0].size).shape[-1] == 4
+    some = frames[:: max(1, len(frames) // 3)]
+    transparent = any(_is_transparent(read_rgba(frame.image, *frame.size)) for frame in some)
     return Photographs(
         name=root.resolve().name,
         names=tuple(frame.name for frame in frames),

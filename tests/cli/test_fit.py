@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+import gsjax.cli.fit
 from gsjax.cli import main
 from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve
@@ -228,3 +229,20 @@ def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
     resumed = Budget(7_000, 1.0, Curve.of(curve.metadata()))
     assert resumed(step) == shares[-1]
     assert Budget(10_000, None, curve)(5_000) == 0.5
+
+
+def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_cleared(
+    gsjax_fit, tmp_path, monkeypatch
+):
+    old = tmp_path / "run"
+    old.mkdir()
+    (old / "config.yml").write_text("# gsjax run\n")
+    (old / "scene.ply").write_text("of before")
+    monkeypatch.setattr(gsjax.cli.fit, "available_mb", lambda: 0.1)
+    code, said = gsjax_fit(*QUICK)
+    assert code == 2
+    assert "9 photographs need some 0.0 GB, and 0.0 GB are free; try --scale" in said
+    monkeypatch.undo()
+    code, said = gsjax_fit(*QUICK, "--fit.start.source", "depth")
+    assert (code, "the data has no depth" in said) == (2, True)
+    assert (old / "scene.ply").read_text() == "of before"

@@ -254,6 +254,12 @@ class Page:
         return seen, depth_range(means, np.asarray(seen.viewmat[0]), camera.fov, width / height)
 
     def _send_splats(self) -> None:
+        try:
+            self._recolor()
+        except Exception as error:  # in a thread of its own nobody else would hear of it
+            self._say("The splats cannot be shown", str(error), color="red")
+
+    def _recolor(self) -> None:
         coloring = self._coloring.value
         look = Look(coloring)
         if coloring == "depth":

@@ -59,6 +59,8 @@ class Viewer:
         page = Page(client, self._shared)
         with self._lock:
             self._pages[client.client_id] = page
+        if client.client_id not in self._server.get_clients():  # it left while its page was made
+            self._gone(client)
 
     def _gone(self, client: Any) -> None:
         with self._lock:
