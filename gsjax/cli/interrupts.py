@@ -1,20 +1,20 @@
 """Ctrl-C that is not lost.
 
-Python raises KeyboardInterrupt wherever it happens to be. In a callback of the garbage collector (JAX has
-one) or in a finalizer the exception is printed and dropped, and the program goes on as if nobody had asked.
+Python raises KeyboardInterrupt wherever it happens to be. In a finalizer, or a callback of the garbage
+collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on
+as if nobody had asked. Here Ctrl-C is raised again until it is heard.
 """
 
 import signal
+import sys
 import threading
-import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-DEAF = frozenset({"_xla_gc_callback", "gc_callback", "__del__", "called_by_xla", "undisturbed"})
-"""Functions in which exceptions are dropped: callbacks of the garbage collector and of XLA, and finalizers
-(callbacks of weak references are a fourth kind, known by their file); and one that is not to be disturbed."""
+DEAF = frozenset({"called_by_xla", "undisturbed"})
+"""Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and what is not to be disturbed."""
 RETRY_S = 0.01
 
 
@@ -25,9 +25,9 @@ def undisturbed(call: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def is_deaf(frame: FrameType | None) -> bool:
-    """Whether an exception raised in `frame` would be dropped."""
+    """Whether an exception raised in `frame` would be dropped, or do harm."""
     while frame is not None:
-        if frame.f_code.co_name in DEAF or frame.f_code.co_filename == weakref.__file__:
+        if frame.f_code.co_name in DEAF:
             return True
         frame = frame.f_back
     return False
@@ -47,10 +47,20 @@ def heard_interrupts() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if is_deaf(frame):
-            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+            try_again()
         else:
             raise KeyboardInterrupt
 
+    def try_again() -> None:
+        signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+
+    def dropped(unraisable: Any) -> None:
+        if unraisable.exc_type is KeyboardInterrupt:
+            try_again()
+        else:
+            print_dropped(unraisable)
+
+    print_dropped, sys.unraisablehook = sys.unraisablehook, dropped
     before = signal.signal(signal.SIGALRM, interrupt)
     signal.signal(signal.SIGINT, interrupt)
     try:
@@ -59,3 +69,4 @@ def heard_interrupts() -> Iterator[None]:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGALRM, before)
+        sys.unraisablehook = print_dropped

@@ -1,7 +1,9 @@
 import gc
 import os
 import signal
+import sys
 import time
+import weakref
 
 import pytest
 
@@ -20,27 +22,52 @@ def test_an_interrupt_is_raised_at_once():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_an_interrupt_in_a_callback_that_drops_exceptions_is_raised_after_it():
-    calls = []
+def in_the_garbage_collector():
+    def callback(phase, info):
+        gc.callbacks.remove(callback)
+        interrupt()
 
-    def _xla_gc_callback(phase, info):  # the name that JAX's has
-        if not calls:
-            calls.append(phase)
-            interrupt()
-            time.sleep(0.05)
-
-    gc.callbacks.append(_xla_gc_callback)
-    try:
-        with pytest.raises(KeyboardInterrupt), heard_interrupts():
-            collect_and_wait()
-    finally:
-        gc.callbacks.remove(_xla_gc_callback)
-    assert calls
-
-
-def collect_and_wait() -> None:
+    gc.callbacks.append(callback)
     gc.collect()
-    time.sleep(5)
+
+
+def in_a_finalizer():
+    class Finalized:
+        def __del__(self):
+            interrupt()
+
+    Finalized()
+
+
+def of_a_weak_reference():
+    class Referred: ...
+
+    referred = Referred()
+    reference = weakref.ref(referred, lambda _: interrupt())
+    del referred
+    assert reference() is None
+
+
+@pytest.mark.parametrize("callback", [in_the_garbage_collector, in_a_finalizer, of_a_weak_reference])
+def test_an_interrupt_that_a_callback_drops_is_raised_again(callback):
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+        callback()
+        time.sleep(5)
+    assert sys.unraisablehook is before
+
+
+def test_other_exceptions_that_are_dropped_are_printed_as_before(monkeypatch):
+    printed = []
+    monkeypatch.setattr(sys, "unraisablehook", printed.append)
+
+    class Faulty:
+        def __del__(self):
+            raise ValueError
+
+    with heard_interrupts():
+        Faulty()
+    assert [each.exc_type for each in printed] == [ValueError]
 
 
 def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
