@@ -14,6 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 from recordings import recorded
+from static_fit.static_fit import SCENES
 
 from gsjax.cli.fit import Budget, split
 from gsjax.cli.fit_results import Curve, judge, living, look
@@ -33,12 +34,13 @@ from gsjax.metrics.image import ssim
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
-MINUTES, SCALE, JUDGED_EVERY_S = 3.0, 0.25, 20.0
+MINUTES, JUDGED_EVERY_S = 3.0, 20.0
 DEFAULT = FitConfig(steps=30_000)
 SETTINGS = {
     "default": DEFAULT,
     "degree 1 from step 200": replace(DEFAULT, sh_every=200),
     "degree 3 from step 600": replace(DEFAULT, sh_degree=3, sh_every=200),
+    "at most 2000": replace(DEFAULT, cap=2_000, start=StartConfig(count=2_000)),
     "at most 5000": replace(DEFAULT, cap=5_000, start=StartConfig(count=5_000)),
     "at most 10000": replace(DEFAULT, cap=10_000, start=StartConfig(count=10_000)),
     "at most 20000": replace(DEFAULT, cap=20_000),
@@ -49,13 +51,15 @@ SETTINGS = {
 
 
 @lru_cache(maxsize=2)
-def views_at(scale: float) -> tuple[list[View], list[View]]:
-    """Fitted and held-out photographs of fox."""
-    photographs = open_photographs(str(recorded("fox"))).scaled(scale)
+def views_at(scene: str, size: float = 1.0) -> tuple[list[View], list[View]]:
+    """Fitted and held-out photographs; `size` 1 is that of static_fit."""
+    how = SCENES[scene]
+    photographs = open_photographs(str(recorded(scene)), how.get("read")).scaled(size * how["scale"])
     chosen, held_out = split(photographs, 8)
 
     def view(i: int) -> View:
-        return View(photographs.image(i), None, None, photographs.viewmats[i], photographs.Ks[i])
+        depth, viewmat, K = photographs.depth(i), photographs.viewmats[i], photographs.Ks[i]
+        return View(photographs.image(i), None, depth, viewmat, K)
 
     return [view(i) for i in chosen], [view(i) for i in held_out]
 
@@ -63,10 +67,11 @@ def views_at(scale: float) -> tuple[list[View], list[View]]:
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """A fit of so many minutes, and where it stands now and then."""
     jax.clear_caches()
-    setting = options["setting"]
-    config = replace(SETTINGS[setting], seed=seed)
-    views, _ = views_at(SCALE / 2 if setting == "half the size" else SCALE)
-    shown, held_out = views_at(SCALE)
+    scene, setting = options["scene"], options["setting"]
+    shown, held_out = views_at(scene)
+    views = views_at(scene, 0.5)[0] if setting == "half the size" else shown
+    depth_weight = 0.0 if shown[0].depth is None else 0.5
+    config = replace(SETTINGS[setting], seed=seed, depth_weight=depth_weight)
     problem, state = begin(views, config)
     curve, rows = Curve(), []
     budget = Budget(config.steps, MINUTES, curve)
@@ -106,22 +111,39 @@ def _draw_seconds(gaussians: Gaussians, view: View) -> float:
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """PSNR over minutes, and over what is needed for it."""
+    """A row a scene: PSNR over minutes with the best of each moment, and over what is needed for it."""
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(10, 4), layout="constrained")
-    over_time, over_count = drawing.subplots(1, 2, sharey=True)
-    for i, row in enumerate(rows):
-        minutes, psnr = zip(*row["curve"], strict=True)
-        how = {"color": f"C{i}", "lw": 2.5 if row["setting"] == "default" else 1.2}
-        over_time.plot(minutes, psnr, label=row["setting"], **how)
-        over_count.plot(row["gaussians"], row["psnr"], "o", color=f"C{i}")
-        over_count.annotate(
-            row["setting"], (row["gaussians"], row["psnr"]), (5, 3), textcoords="offset points", fontsize=8
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(row["setting"] for row in rows))}
+    drawing = Figure(figsize=(10, 4 * len(scenes)), layout="constrained")
+    for scene, (over_time, over_count) in zip(
+        scenes, drawing.subplots(len(scenes), 2, sharey="row", squeeze=False), strict=True
+    ):
+        points = []
+        for row in rows:
+            if row["scene"] != scene:
+                continue
+            color, default = colors[row["setting"]], row["setting"] == "default"
+            minutes, psnr = zip(*row["curve"], strict=True)
+            points += row["curve"]
+            over_time.plot(minutes, psnr, color=color, lw=2.5 if default else 1.2, label=row["setting"])
+            over_count.plot(row["gaussians"], row["psnr"], "o", color=color)
+            place = (row["gaussians"], row["psnr"])
+            over_count.annotate(row["setting"], place, (5, 3), textcoords="offset points", fontsize=8)
+        minutes, psnr = zip(*sorted(points), strict=True)
+        over_time.step(
+            minutes,
+            np.maximum.accumulate(psnr),
+            where="post",
+            color="0.7",
+            lw=5,
+            zorder=0,
+            label="best so far",
         )
-    over_time.set(xlabel="minutes", ylabel="held-out PSNR [dB]")
-    over_count.set(xlabel="Gaussians that are needed", xlim=(0, None))
-    over_time.legend(frameon=False, fontsize=8)
-    for axes in (over_time, over_count):
-        axes.grid(color="0.9")
+        over_time.set(title=scene, xlabel="minutes", ylabel="held-out PSNR [dB]")
+        over_count.set(title=f"{scene}, in the end", xlabel="Gaussians that are needed", xscale="log")
+        over_time.legend(frameon=False, fontsize=8)
+        for axes in (over_time, over_count):
+            axes.grid(color="0.9")
     drawing.savefig(path, dpi=120)

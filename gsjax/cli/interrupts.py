@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 DEAF = frozenset({"called_by_xla", "undisturbed"})
-"""Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and what is not to be disturbed."""
+"""Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions; what is not to be disturbed."""
 RETRY_S = 0.01
 
 

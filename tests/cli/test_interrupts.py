@@ -50,10 +50,13 @@ def of_a_weak_reference():
 
 @pytest.mark.parametrize("callback", [in_the_garbage_collector, in_a_finalizer, of_a_weak_reference])
 def test_an_interrupt_that_a_callback_drops_is_raised_again(callback):
-    before = sys.unraisablehook
-    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+    def call_and_wait():
         callback()
         time.sleep(5)
+
+    before = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), heard_interrupts():
+        call_and_wait()
     assert sys.unraisablehook is before
 
 

@@ -320,6 +320,14 @@ def test_points_that_no_photograph_shows_are_no_start(views):
     assert start_points(views, (some, np.full((100, 3), 0.5)), StartConfig(), 0)[2] == "cloud"
 
 
+def test_points_in_another_unit_than_the_poses_are_told(views):
+    points, colors = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)), np.full((50, 3), 0.5)
+    with pytest.warns(UserWarning, match=r"so far away .* are they in the unit of the poses"):
+        start_points(views, (1e3 * points, colors), StartConfig(), 0)
+    same_place = [view._replace(viewmat=views[0].viewmat) for view in views]
+    start_points(same_place, (points, colors), StartConfig(), 0)  # says nothing: a warning fails the test
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "value", "says"),
     [

@@ -14,6 +14,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 _FEW = 0.1  # share of the points that photographs show, below which something is wrong
+_FLAT_PX = 1.0  # by which cameras shift what they see against each other, below which nothing has a depth
 
 
 class View(NamedTuple):
@@ -41,10 +42,12 @@ class Extent(NamedTuple):
         focus: the point nearest to all optical axes.
         radius: 1.1 times how far cameras stand from their middle, at most; the unit of rates. Where all
             stand at one place, 1, and the focus is as far ahead.
+        is_point: whether all do.
     """
 
     focus: Float[np.ndarray, "3"]
     radius: float
+    is_point: bool = False
 
 
 def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
@@ -56,7 +59,7 @@ def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
     middle, ahead = centers.mean(0), axes.mean(0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
     if spread <= 1e-6 * max(1.0, float(np.abs(centers).max())):  # nothing says how far away things are
-        return Extent(middle + ahead, 1.0)
+        return Extent(middle + ahead, 1.0, is_point=True)
     # Parallel axes meet nowhere: then the point one radius ahead of the middle is as good as any.
     weak = 1e-3 * np.eye(3) * len(centers)
     total = np.einsum("nij,nj->i", across, centers) + weak @ (middle + ahead * spread)
@@ -92,17 +95,26 @@ def start_points(
 
 def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
     """Whether photographs show any of the points; a warning where they show few."""
-    seen = np.zeros(len(points), bool)
+    seen, disparities = np.zeros(len(points), bool), np.zeros(len(points))
+    extent = extent_of(np.stack([view.viewmat for view in views]))
     for view in views:
         height, width = view.image.shape[:2]
         local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         ahead = local[:, 2] > 0
         x, y, z = (local[ahead] @ view.K.T).T
-        seen[ahead] |= (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
+        shown = (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
+        seen[ahead] |= shown
+        disparities[np.flatnonzero(ahead)[shown]] = view.K[0, 0] * extent.radius / z[shown]
     if seen.mean() < _FEW:
         warnings.warn(
             f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
             "the unit of the poses?",
+            stacklevel=2,
+        )
+    elif (flat := np.median(disparities[seen])) < _FLAT_PX and not extent.is_point:
+        warnings.warn(
+            f"the data's points lie so far away that cameras {extent.radius:.3g} apart see them shifted by "
+            f"{flat:.2g} pixels: are they in the unit of the poses?",
             stacklevel=2,
         )
     return bool(seen.any())
