@@ -26,7 +26,7 @@ test: $(VENV)/installed-test ## the tests; slow ones left out
 	$(PYTEST)
 
 test-all: $(VENV)/installed-test ## every test, the slow ones too
-	$(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
+	XLA_FLAGS= $(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
 
 bench: $(VENV)/installed-test ## the whole benchmark suite, on a machine that does nothing else
 	$(BIN)/gsjax bench

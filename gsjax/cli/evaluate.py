@@ -1,7 +1,7 @@
 """`gsjax eval`: scores a scene that `gsjax fit` left, again or in more ways."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -13,17 +13,16 @@ from rich.progress import track
 from rich.table import Table as Grid
 from rich.text import Text
 
-from gsjax.cli.fit import read_views, split
 from gsjax.cli.fit_results import Seen, look, write_panel
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
+from gsjax.cli.photographs import photographs_of_run, read_views, split
 from gsjax.cli.query import fresh_folder
 from gsjax.cli.report import Media, Table, format_number, write_report
 from gsjax.cli.run_records import EVALUATION, Record, digest, read_record
 from gsjax.cli.summary import Column
 from gsjax.data.errors import DataError
-from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
@@ -167,10 +166,8 @@ def _choose(options: Options, record: Record) -> Chosen:
         ValueError: they cannot be read, are others than those of the fit, or none is held out.
     """
     config, dataset = record.config, options.dataset or str(record.config.get("dataset"))
-    stored = config.get("read") or {}
-    read = ReadOptions(**{f.name: stored[f.name] for f in fields(ReadOptions) if f.name in stored})
     try:
-        photographs = open_photographs(dataset, read).scaled(config.get("scale", 1.0))
+        photographs = photographs_of_run(config, dataset)
     except DataError as error:
         raise ValueError(f"{error} It was read for the fit; --dataset says where it is now") from error
     train, held_out = split(photographs, config["test_every"])

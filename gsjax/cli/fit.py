@@ -1,7 +1,5 @@
 """`gsjax fit`: a static scene from posed photographs."""
 
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from time import perf_counter
@@ -10,23 +8,20 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Int
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import undisturbed
-from gsjax.cli.machine import available_mb
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
+from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.tensorboard import TensorBoard
-from gsjax.data.errors import DataWarning
-from gsjax.data.open import ReadOptions, open_photographs
-from gsjax.data.photographs import Photographs
+from gsjax.data.open import ReadOptions
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
 from gsjax.methods.reconstruction import (
@@ -44,8 +39,6 @@ from gsjax.methods.reconstruction import (
 from gsjax.scene.gaussians import Gaussians, take
 
 _SHOWN_EVERY_S = 0.2
-_LARGE = 1600  # pixels, a side
-_BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
 _LOGGED_EVERY = 100  # steps
 _JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
@@ -65,6 +58,12 @@ class Options:
     """Folder of photographs or of a recording, all of whose frames are taken as photographs of one scene."""
     out: Path
     """Folder for the run."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames of a recording, or which photographs, as Python slices them: 4:5 is the fifth alone."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of the cameras of a recording to fit. All that are not held out, unless given."""
+    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of cameras of a recording that are held out, instead of every so-manieth photograph."""
     scale: float = 1.0
     """Fit photographs this many times smaller, as in 0.25; time goes with the number of pixels."""
     test_every: int = 8
@@ -109,12 +108,19 @@ def run(options: Options) -> int:
     _check(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
-        photographs = open_photographs(options.dataset, options.read).scaled(options.scale)
+        photographs = choose_photographs(
+            options.dataset,
+            options.read,
+            scale=options.scale,
+            frames=options.frames,
+            cameras=options.cameras,
+            eval_cameras=options.eval_cameras,
+        )
         chosen, held_out = split(photographs, options.test_every)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         if options.resume:
             folder.check_config(options, but=_OF_NO_BEARING)
-        _say_if_large(photographs)
+        say_if_large(photographs)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
         fitted = [views[i] for i in chosen]
@@ -192,61 +198,6 @@ def _check(options: Options) -> None:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
     if options.until_psnr is not None and options.test_every == 0:
         raise ValueError("--until-psnr: nothing is held out to judge by; leave out --test-every 0")
-
-
-def _say_if_large(photographs: Photographs) -> None:
-    width, height = photographs.sizes.max(0)
-    if max(width, height) > _LARGE:
-        scale = 2.0 ** np.floor(np.log2(_LARGE / max(width, height)))
-        message = f"photographs of {width}x{height} take long and need much memory; try --scale {scale:g}"
-        warnings.warn(message, DataWarning, stacklevel=2)
-
-
-def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
-    """Which photographs are fitted and which are held out: as the data says, else every so-manieth.
-
-    Raises:
-        ValueError: none is left to fit.
-    """
-    indices = np.arange(photographs.num)
-    splits = None if photographs.splits is None else np.array(photographs.splits)
-    if splits is not None and (splits != "train").any():
-        held_out = np.isin(splits, "test" if (splits == "test").any() else "val")
-        chosen = indices[splits == "train"]
-    else:
-        held_out = (indices % every == 0) & (photographs.num > 1) if every else np.zeros(len(indices), bool)
-        chosen = indices[~held_out]
-    if not len(chosen):
-        raise ValueError(f"{photographs.name}: of {photographs.num} photographs none is left to fit")
-    return chosen, indices[held_out]
-
-
-def read_views(photographs: Photographs, console: Console) -> list[View]:
-    """All photographs in memory.
-
-    Raises:
-        DataError: one is bad.
-        ValueError: they are too many for this machine's memory.
-    """
-    wanted, free = photographs.sizes.prod(1).sum() * _BYTES_A_PIXEL / 1e6, available_mb()
-    if wanted > free:
-        raise ValueError(
-            f"{photographs.name}: {photographs.num} photographs need some {wanted / 1e3:.1f} GB, and "
-            f"{free / 1e3:.1f} GB are free; try --scale"
-        )
-
-    def read(i: int) -> View:
-        mask, depth = photographs.mask(i), photographs.depth(i)
-        return View(photographs.image(i), mask, depth, photographs.viewmats[i], photographs.Ks[i])
-
-    with ThreadPoolExecutor(2) as executor:
-        jobs = [executor.submit(read, i) for i in range(photographs.num)]
-        try:
-            shown = track(jobs, "reading photographs", console=console, transient=True)
-            return [job.result() for job in shown]
-        except BaseException:
-            executor.shutdown(cancel_futures=True)
-            raise
 
 
 def write_cameras(folder: RunFolder, names: list[str], views: list[View], model: Model) -> None:

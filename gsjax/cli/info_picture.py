@@ -21,7 +21,8 @@ Groups = Mapping[str, np.ndarray]
 
 def by_split(photographs: Photographs) -> Groups:
     """What `gsjax fit` does with each photograph unless it is told otherwise."""
-    from gsjax.cli.fit import Options, split
+    from gsjax.cli.fit import Options
+    from gsjax.cli.photographs import split
 
     fitted, held_out = split(photographs, Options.test_every)
     others = np.setdiff1d(np.arange(photographs.num), np.concatenate([fitted, held_out]))

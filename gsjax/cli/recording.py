@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
-from gsjax.data import Sequence, open_sequence
+from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 
@@ -41,14 +41,20 @@ class Recording:
         return self.judged.camera_ids[self.tracked.num_cameras :]
 
 
-def open_recording(dataset: str, cameras: Indices[int], eval_cameras: Indices[int], frames: str) -> Recording:
+def open_recording(
+    dataset: str,
+    cameras: Indices[int],
+    eval_cameras: Indices[int],
+    frames: str,
+    read: ReadOptions | None = None,
+) -> Recording:
     """Open a dataset and choose frames and cameras; without `cameras` all that are not held out.
 
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen.
         DataError: the dataset cannot be read.
     """
-    sequence = open_sequence(dataset)
+    sequence = open_sequence(dataset, read)
     known = list(sequence.camera_ids)
     chosen = [c for c in known if c not in eval_cameras] if not cameras else list(cameras)
     for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):
@@ -60,9 +66,11 @@ def open_recording(dataset: str, cameras: Indices[int], eval_cameras: Indices[in
             raise ValueError(f"{option}: camera {twice[0]} is named twice.")
     both = [c for c in chosen if c in eval_cameras]
     if both:
-        raise ValueError(f"--eval-cameras: camera {both[0]} is tracked too; a judge must not be. Drop one.")
+        raise ValueError(
+            f"--eval-cameras: camera {both[0]} stands in --cameras too; a judge must not."
+        )
     if not chosen:
-        raise ValueError(f"--cameras: no camera is left to track; {sequence.name} has {known}.")
+        raise ValueError(f"--cameras: none is left; {sequence.name} has {known}.")
     total = sequence.num_frames
     chosen_frames = parse_frames(frames)
     if not range(total)[chosen_frames]:
@@ -96,7 +104,7 @@ def parse_frames(text: str) -> slice:
         found = f"found {text!r}; :4 is the first four, 4:5 the fifth alone"
         raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, {found}.")
     if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
-        raise ValueError(f"--frames: frames are tracked forwards; found the step {parts[2]}.")
+        raise ValueError(f"--frames: frames go forwards; found the step {parts[2]}.")
     return slice(*parts)
 
 

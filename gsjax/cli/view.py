@@ -13,9 +13,9 @@ from rich.console import Console
 
 from gsjax.cli.messages import Notes, say_error, stage
 from gsjax.cli.outputs import write_png
+from gsjax.cli.photographs import photographs_of_run
 from gsjax.cli.run_folder import SIGNATURE, is_run
 from gsjax.cli.saved_run import SavedRun, open_run, read_tracking
-from gsjax.data.open import ReadOptions, open_photographs
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import read_ply
 from gsjax.optim.compiler import host_options
@@ -144,16 +144,14 @@ def _of_fit(path: Path, notes: Notes) -> Viewable:
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         antialiased = bool(settings["fit"]["antialiased"])
         behind = settings["fit"]["background"]
-        dataset, scale, read = str(settings["dataset"]), float(settings["scale"]), settings["read"]
-        options = ReadOptions(**{k: tuple(v) if isinstance(v, list) else v for k, v in read.items()})
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        shots, photographs = None, None
+        try:
+            photographs = photographs_of_run(settings)
+            shots = _shots_of(photographs)
+        except (ValueError, OSError) as error:
+            notes.warn(f"its photographs are not shown: {error}")
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
-    shots, photographs = None, None
-    try:
-        photographs = open_photographs(dataset, options).scaled(scale)
-        shots = _shots_of(photographs)
-    except (ValueError, OSError) as error:
-        notes.warn(f"its photographs are not shown: {error}")
     background = photographs.background if photographs is not None and behind == "data" else None
     if background is None:
         background = (1.0, 1.0, 1.0) if behind == "white" else (0.0, 0.0, 0.0)

@@ -132,9 +132,9 @@ def test_mask_that_is_all_background(refused, recording):
         (("--cameras", "0", "7"), "--cameras: table has no camera 7; it has [0, 1, 2]."),
         (("--eval-cameras", "9"), "--eval-cameras: table has no camera 9"),
         (("--cameras", "0", "0"), "camera 0 is named twice"),
-        (("--cameras", "0", "--eval-cameras", "0"), "camera 0 is tracked too"),
+        (("--cameras", "0", "--eval-cameras", "0"), "camera 0 stands in --cameras too"),
         (("--cameras", "0", "--mask-camera", "2"), "camera 2 is not tracked; the tracked ones are [0]."),
-        (("--eval-cameras", "0", "1", "2"), "no camera is left to track"),
+        (("--eval-cameras", "0", "1", "2"), "--cameras: none is left"),
         (("--frames", "60:90"), "--frames: 60:90 holds no frame of table, which has 0 to 3."),
         (("--frames", "4"), "found '4'; :4 is the first four"),
         (("--frames", "x"), "--frames: expected START:STOP"),
@@ -192,8 +192,8 @@ def test_empty_frame(sound, recording, still):
 
 
 def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
-    def with_nan(path):
-        found = open_sequence(path)
+    def with_nan(path, read):
+        found = open_sequence(path, read)
 
         def load(t, c):
             image = found.load_image(t, c) / 255.0

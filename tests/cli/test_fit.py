@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,9 +14,8 @@ import yaml
 
 import gsjax.cli.fit
 from gsjax.cli import main
-from gsjax.cli.fit import Budget, split
+from gsjax.cli.fit import Budget
 from gsjax.cli.fit_results import Curve
-from gsjax.data import open_photographs
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
 from gsjax.methods.reconstruction import PRESETS
@@ -197,21 +195,6 @@ def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path)
     assert code == 2
     assert "11.png" in said
     assert "cut off" in said
-
-
-def test_what_is_held_out_is_as_the_data_says_or_every_so_manieth(photographs):
-    with pytest.warns(UserWarning, match="have no file"):
-        nine = open_photographs(photographs)
-    chosen, held_out = split(nine, 4)
-    assert held_out.tolist() == [0, 4, 8]
-    assert sorted([*chosen, *held_out]) == list(range(9))
-    assert split(nine, 0)[1].tolist() == []
-    alone = nine.select([3])
-    assert [part.tolist() for part in split(alone, 8)] == [[0], []]
-    said = replace(nine, splits=("train",) * 6 + ("val",) + ("test",) * 2)
-    assert [part.tolist() for part in split(said, 4)] == [[0, 1, 2, 3, 4, 5], [7, 8]]
-    with pytest.raises(ValueError, match="none is left to fit"):
-        split(replace(nine, splits=("test",) * 9), 4)
 
 
 def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
