@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
-from gsjax.cli.interrupts import undisturbed
+from gsjax.cli.interrupts import hear, undisturbed
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.messages import describe as describe_error
@@ -288,6 +288,7 @@ def follow(
                     if options.until_psnr is not None and curve.has_met(options.until_psnr):
                         break
                 saver(state, curve, last=False)
+                hear()
             saver(state, curve, last=True)
         except (KeyboardInterrupt, Exception) as stopped:
             if any(leaf.is_deleted() for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array)):

@@ -16,12 +16,26 @@ from typing import Any
 DEAF = frozenset({"called_by_xla", "undisturbed"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions; what is not to be disturbed."""
 RETRY_S = 0.01
+_waiting = threading.Event()  # signals are the process's, and so is whether one waits
 
 
 def undisturbed(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What `call` gives; Ctrl-C is heard after it. It is for steps that give away the buffers they replace:
-    to stop in the middle of one would lose both the old and the new."""
+    """What `call` gives; Ctrl-C waits for its end and for `hear`. It is for steps that give away the buffers
+    they replace: to stop in the middle of one would lose both the old and the new."""
     return call(*arguments)
+
+
+def hear() -> None:
+    """Raises KeyboardInterrupt where Ctrl-C waits: between undisturbed calls is too little time for it."""
+    if _waiting.is_set():
+        _forget()
+        raise KeyboardInterrupt
+
+
+def _forget() -> None:
+    """Nothing waits: who hears Ctrl-C once must not be disturbed by it while tidying up."""
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    _waiting.clear()
 
 
 def is_deaf(frame: FrameType | None) -> bool:
@@ -49,9 +63,11 @@ def heard_interrupts() -> Iterator[None]:
         if is_deaf(frame):
             try_again()
         else:
+            _forget()
             raise KeyboardInterrupt
 
     def try_again() -> None:
+        _waiting.set()
         signal.setitimer(signal.ITIMER_REAL, RETRY_S)
 
     def dropped(unraisable: Any) -> None:
@@ -66,7 +82,7 @@ def heard_interrupts() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        _forget()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGALRM, before)
         sys.unraisablehook = print_dropped

@@ -101,11 +101,14 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, 
     long = (*QUICK, "--fit.steps", "100000", "--judge-every", "50")
     command = [sys.executable, "-m", "gsjax.cli", "fit", str(photographs), "--out", str(run), *long]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    while not (run / "metrics.jsonl").exists():
-        time.sleep(0.05)
-        assert process.poll() is None
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
+    try:
+        while not (run / "metrics.jsonl").exists():
+            time.sleep(0.05)
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert process.returncode == 130, said
     assert "Traceback" not in said
     found = json.loads((run / "metrics.json").read_text())

@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from gsjax.cli.interrupts import heard_interrupts, undisturbed
+from gsjax.cli.interrupts import hear, heard_interrupts, undisturbed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -88,7 +88,28 @@ def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
 
     with pytest.raises(KeyboardInterrupt), heard_interrupts():
         step_and_wait()
-    assert done[0] == 3
+    assert done == [3, 3]
+
+
+def test_between_undisturbed_steps_an_interrupt_is_heard_at_once():
+    steps = []
+
+    def step(first):
+        if first:
+            interrupt()
+        time.sleep(0.03)
+
+    def walk():
+        for _ in range(100):
+            steps.append(undisturbed(step, not steps))
+            hear()
+
+    with heard_interrupts():
+        with pytest.raises(KeyboardInterrupt):
+            walk()
+        time.sleep(0.03)  # nothing is raised a second time
+        hear()
+    assert len(steps) == 1
 
 
 def test_somebody_elses_handler_stays():
