@@ -13,7 +13,7 @@ from rich.progress import track
 from rich.table import Table as Grid
 from rich.text import Text
 
-from gsjax.cli.fit_results import Seen, look, write_panel
+from gsjax.cli.fit_results import Seen, look, mean_scores, write_panel
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
@@ -36,6 +36,7 @@ NO_LPIPS = (
 )
 COLUMNS = (
     Column("PSNR", "psnr", "dB", 2),
+    Column("PSNR, colours matched", "psnr_matched", "dB", 2),
     Column("SSIM", "ssim", "", 3),
     Column("MS-SSIM", "ms_ssim", "", 3),
     Column("LPIPS", "lpips", "", 3),
@@ -92,12 +93,13 @@ def run(options: Options) -> int:
         photographs, indices, held_out = _choose(options, record)
         views = read_views(photographs.select(indices.tolist()), console)
         folder, rows = fresh_folder(record.path / EVALUATION.parent), []
+        exposed = bool(record.config["fit"].get("exposure"))
         looks = _looks(record, gaussians, views, photographs.background)
         for seen in track(looks, "scoring", len(views), console=console, transient=True):
             picture, i = Path("renders", f"{len(rows):06d}.png"), len(rows)
             write_panel(folder / picture, seen)
             row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
-            rows.append(row | scores(seen, weights) | {"picture": picture.as_posix()})
+            rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
         _say_what_is_missing(notes, record, rows, views, weights)
         known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
         found = {
@@ -108,7 +110,7 @@ def run(options: Options) -> int:
             "num_gaussians": gaussians.num,
             "lpips": known or {"absent": NO_LPIPS},
             "mean": {
-                kind: mean([row for row in rows if row["split"] == kind])
+                kind: mean_scores([row for row in rows if row["split"] == kind], [c.key for c in COLUMNS])
                 for kind in dict.fromkeys(row["split"] for row in rows)
             },
             "views": rows,
@@ -121,28 +123,25 @@ def run(options: Options) -> int:
     return 0
 
 
-def scores(seen: Seen, weights: LpipsWeights | None) -> dict[str, float | None]:
+def scores(seen: Seen, weights: LpipsWeights | None, exposed: bool = False) -> dict[str, float | None]:
     """How a view is seen, by the keys of `COLUMNS`; None where the picture is too small for a score, or the
-    photographs or the user lack what it takes."""
+    photographs or the user lack what it takes.
+
+    Args:
+        seen: the view.
+        weights: of LPIPS.
+        exposed: the fit learned an exposure for each photograph, so PSNR is taken with colours matched too.
+    """
     pair, side = (seen.image, seen.truth, seen.view.mask), min(seen.covered.shape)
     perceived = weights is not None and side >= weights.least_side
     return {
         "psnr": seen.psnr(),
+        "psnr_matched": seen.psnr_matched() if exposed else None,
         "ssim": seen.ssim(),
         "ms_ssim": ms_ssim(*pair) if side >= MS_SSIM_LEAST_SIDE else None,
         "lpips": lpips(weights, *pair) if weights is not None and perceived else None,
         "depth_mm": seen.depth_mm(),
     }
-
-
-def mean(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Of each score, over the views that have a finite one."""
-    means = {}
-    for column in COLUMNS:
-        values = np.array([np.nan if row[column.key] is None else row[column.key] for row in rows], float)
-        known = values[np.isfinite(values)]
-        means[column.key] = float(known.mean()) if len(known) else None
-    return means
 
 
 def _check(record: Record) -> None:

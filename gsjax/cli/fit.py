@@ -8,10 +8,12 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.fit_orbit import write_orbit
+from gsjax.cli.fit_parts import parts
 from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import hear, undisturbed
@@ -135,11 +137,13 @@ def run(options: Options) -> int:
         state, stopped = follow(options, problem, state, curve, judged, folder, console, board)
         if curve.skipped:
             notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
-        gaussians, finished = living(state.gaussians)[0], stopped is None
+        gaussians, finished, worth = living(state.gaussians)[0], stopped is None, []
         found_views = as_found(problem, state.model)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
         if finished:  # who pressed Ctrl-C does not wait for this, nor for the video
-            gaussians = without_needless(found_views, problem.config, gaussians, notes)
+            gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
+            if judged and gaussians.num:
+                worth = parts(problem, gaussians, light, some_of(judged), curve)
         write_ply(folder.scene, gaussians)
         scores = judge(
             problem, gaussians, judged or [(photographs.names[i], views[i]) for i in chosen[:1]], folder
@@ -170,6 +174,7 @@ def run(options: Options) -> int:
             "machine": describe_machine(),
             "test": scores.mean() if len(held_out) else None,
             "views": scores.rows,
+            "parts": worth,
             "curve": curve.rows,
             "notes": notes.all,
         }
@@ -212,16 +217,23 @@ def write_cameras(folder: RunFolder, names: list[str], views: list[View], model:
     write_npz(folder.path / "cameras.npz", found)
 
 
-def without_needless(views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes) -> Gaussians:
-    """Those that some photograph needs."""
-    if not config.prune or not gaussians.num:
-        return gaussians
-    mode = "antialiased" if config.antialiased else "classic"
-    kept = needed(light_of(gaussians, views, mode), config.prune)
+def without_needless(
+    views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes
+) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
+    """Those that some photograph needs, and the light that each sends."""
+    if not gaussians.num:
+        return gaussians, np.zeros(0)
+    light = light_of(gaussians, views, "antialiased" if config.antialiased else "classic")
+    kept = needed(light, config.prune) if config.prune else np.ones(len(light), bool)
     if not kept.all():
         some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
         notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
-    return take(gaussians, kept)
+    return take(gaussians, kept), light[kept]
+
+
+def some_of(judged: list[tuple[str, View]]) -> list[tuple[str, View]]:
+    """The held-out views that are looked at on the way."""
+    return judged[:: max(1, len(judged) // _JUDGED_AT_MOST)][:_JUDGED_AT_MOST]
 
 
 class Budget:
@@ -252,7 +264,7 @@ def follow(
     """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
     state, and what stopped it early."""
     budget, saver = Budget(options.fit.steps, options.minutes, curve), Saver(folder, options.save_every)
-    some = judged[:: max(1, len(judged) // _JUDGED_AT_MOST)][:_JUDGED_AT_MOST]
+    some = some_of(judged)
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=None),

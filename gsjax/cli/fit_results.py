@@ -1,6 +1,7 @@
 """What a fit came to: its curve, its scores, pictures of views that it never saw, and the report."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,15 +84,18 @@ class Curve:
         with atomic_write(folder.metrics_lines) as temporary:
             temporary.write_text(lines, encoding="utf-8")
 
+    def looks(self) -> list[dict[str, Any]]:
+        """The rows with a look at held-out views."""
+        return [row for row in self.rows if row["test_psnr"] is not None]
+
     def has_met(self, goal: float) -> bool:
         """Whether held-out views were seen with so many dB when they were last looked at."""
-        looked = [row["test_psnr"] for row in self.rows if row["test_psnr"] is not None]
-        return bool(looked) and looked[-1] >= goal
+        return any(row["test_psnr"] >= goal for row in self.looks()[-1:])
 
     def in_words(self, fitted: Fitted, judged: bool) -> str:
         """For the progress bar."""
-        tested = [row["test_psnr"] for row in self.rows if row["test_psnr"] is not None]
-        test = f", held out {tested[-1]:.1f} dB" if judged and tested else ""
+        tested = self.looks()
+        test = f", held out {tested[-1]['test_psnr']:.1f} dB" if judged and tested else ""
         count = int(fitted.info["alive"])
         pace = f", {1 / self._rate:.1f} steps/s" if self._rate else ""
         return f"loss {float(fitted.info['loss']):.3f}{test}, {count:,} Gaussians{pace}"
@@ -110,12 +114,16 @@ class Scores:
 
     def mean(self) -> dict[str, float | None]:
         """Over the views that have a number."""
-        names = ("psnr", "ssim", "depth_mm", "psnr_matched")
-        known = {
-            name: [r[name] for r in self.rows if r.get(name) is not None and np.isfinite(r[name])]
-            for name in names
-        }
-        return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+        return mean_scores(self.rows, ("psnr", "ssim", "depth_mm", "psnr_matched"))
+
+
+def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
+    """Of each score, over the views that have a finite one; None where none has."""
+    known = {
+        name: [row[name] for row in rows if row.get(name) is not None and np.isfinite(row[name])]
+        for name in names
+    }
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
 def living(gaussians: Gaussians) -> tuple[Gaussians, int]:
@@ -252,10 +260,21 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
                 ("", "dB", "", "mm"),
                 decimals=(None, 2, 3, 1),
             ),
+            *_tables_of_parts(found["parts"]),
             Table("Time", ("part", "seconds"), times, ("", "s"), decimals=(None, 1)),
         ],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
+
+
+def _tables_of_parts(parts: list[dict[str, Any]]) -> list[Table]:
+    """What each part of the scene is worth, where that was looked at."""
+    if not parts:
+        return []
+    rows = [[row["part"], row["gaussians"], row["sh_degree"], row["psnr"]] for row in parts]
+    title = "What each part bought: as it is, and with less of it (not fitted again)"
+    heads, units = ("of the scene", "Gaussians", "SH degree", "PSNR, held out"), ("", "", "", "dB")
+    return [Table(title, heads, rows, units, decimals=(None, 0, 0, 2))]
 
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -132,6 +133,9 @@ def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
     assert 0.5 < found["ssim"] < found["ms_ssim"] < 1
     assert found["depth_mm"] == pytest.approx(20, abs=1e-3)
     assert found["lpips"] is None
+    assert found["psnr_matched"] is None
+    dimmed = replace(seen, image=0.5 * truth + 0.2)
+    assert scores(dimmed, None, exposed=True)["psnr_matched"] > scores(dimmed, None)["psnr"] + 20
 
 
 def test_a_comparison_takes_what_it_found(gsjax_eval, run, fitted, weights, tmp_path, capfd):

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 import gsjax.cli.fit
+import gsjax.cli.photographs
 from gsjax.cli import main
 from gsjax.cli.fit import Budget
 from gsjax.cli.fit_results import Curve
@@ -59,6 +60,15 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     pictures = sorted((run / "renders" / "held_out").iterdir())
     assert len(pictures) == 3
     assert cv2.imread(str(pictures[0])).shape[:2] == (7 * 36, 3 * 7 * 48)  # enlarged, for its captions
+    parts = {row["part"]: row for row in found["parts"]}
+    count, looks = gaussians.num, [line["test_psnr"] for line in lines]
+    assert parts["all"] == {"part": "all", "gaussians": count, "sh_degree": 1, "psnr": found["test"]["psnr"]}
+    assert parts["half of the Gaussians"]["gaussians"] == -(-count // 2)
+    assert parts["a sixteenth"]["psnr"] < parts["half of the Gaussians"]["psnr"] <= parts["all"]["psnr"] + 0.5
+    assert parts["colours of degree 0"]["sh_degree"] == 0
+    assert parts["colours of degree 0"]["psnr"] != parts["all"]["psnr"]
+    assert {row["psnr"] for name, row in parts.items() if name.startswith("after")} <= set(looks[:-1])
+    assert "a sixteenth" in (run / "report.html").read_text()
     assert "data:image/png" in (run / "report.html").read_text()
     assert "data:video/mp4" in (run / "report.html").read_text()
     assert describe_video(run / "video_orbit.mp4").frames == 90
@@ -224,7 +234,7 @@ def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_
     old.mkdir()
     (old / "config.yml").write_text("# gsjax run\n")
     (old / "scene.ply").write_text("of before")
-    monkeypatch.setattr(gsjax.cli.fit, "available_mb", lambda: 0.1)
+    monkeypatch.setattr(gsjax.cli.photographs, "available_mb", lambda: 0.1)
     code, said = gsjax_fit(*QUICK)
     assert code == 2
     assert "9 photographs need some 0.0 GB, and 0.0 GB are free; try --scale" in said
