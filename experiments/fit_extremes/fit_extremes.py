@@ -27,10 +27,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     if "Traceback" in told:
         raise RuntimeError(told)
     memory = float(re.search(r"memory_mb (\S+)", told).group(1))
-    warned = [line for line in told.splitlines() if line.startswith(("warning", "error"))]
-    row = {"code": done.returncode, "memory_mb": memory, "said": " ".join(warned).replace(str(folder), "")}
+    row = {"code": done.returncode, "memory_mb": memory}
     if done.returncode:
-        return row
+        return row | {"said": next(line for line in told.splitlines() if line.startswith("error"))}
     found = json.loads((out / "metrics.json").read_text())
     gaussians, _ = read_ply(out / "scene.ply")
     leaves = (
@@ -47,7 +46,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "finite": all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in leaves),
         "skipped": found["skipped"],
         "seconds_a_step": found["seconds"]["fit"] / found["steps"],
-        "said": " ".join([row["said"], *(note for note in found["notes"] if note not in row["said"])]),
+        "said": " ".join(found["notes"]).replace(f"{folder}/", ""),
     }
 
 
