@@ -420,7 +420,7 @@ def test_half_precision_is_composited_in_float32(dtype):
     got, gradient, _ = drawn(halved, cotangent(64, 48), this)
     want, slope, _ = drawn(rounded, cotangent(64, 48), this)
     assert got.dtype == jnp.float32
-    np.testing.assert_array_equal(got, want)
+    np.testing.assert_allclose(got, want, atol=1e-5)  # half precision would be 1e-3 off
     for key in set(TRAINED) - {"colors"}:
-        assert relative_error(gradient[key], slope[key]) < 1e-6
+        assert relative_error(gradient[key], slope[key]) < 1e-5
     np.testing.assert_array_equal(gradient["colors"], slope["colors"].astype(dtype))
