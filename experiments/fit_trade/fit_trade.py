@@ -128,9 +128,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
             minutes, psnr = zip(*row["curve"], strict=True)
             points += row["curve"]
             over_time.plot(minutes, psnr, color=color, lw=2.5 if default else 1.2, label=row["setting"])
-            over_count.plot(row["gaussians"], row["psnr"], "o", color=color)
-            place = (row["gaussians"], row["psnr"])
-            over_count.annotate(row["setting"], place, (5, 3), textcoords="offset points", fontsize=8)
+            over_count.plot(row["gaussians"], row["psnr"], "o", color=color, ms=8 if default else 6)
         minutes, psnr = zip(*sorted(points), strict=True)
         over_time.step(
             minutes,
@@ -143,6 +141,8 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         )
         over_time.set(title=scene, xlabel="minutes", ylabel="held-out PSNR [dB]")
         over_count.set(title=f"{scene}, in the end", xlabel="Gaussians that are needed", xscale="log")
+        over_count.set_xticks(ticks := [2_000, 5_000, 10_000, 20_000, 50_000], [f"{n:,}" for n in ticks])
+        over_count.minorticks_off()
         over_time.legend(frameon=False, fontsize=8)
         for axes in (over_time, over_count):
             axes.grid(color="0.9")

@@ -1,5 +1,6 @@
 """One experiment: its config.yaml, its script, the cells of its sweep, and what is known of each."""
 
+import ast
 import contextlib
 import copy
 import dataclasses
@@ -115,10 +116,10 @@ class Experiment:
 
     @property
     def fingerprint(self) -> str:
-        """Changes with the script, with what stands beside it and with the config's version: what was made
-        under another one is stale."""
+        """Changes with the script but for its `figure`, with what stands beside it and with the config's
+        version: what was made under another one is stale."""
         beside = sorted(path for path in self.script.parent.glob("*.py") if path.name != self.script.name)
-        texts = [self.text, *(path.read_text(encoding="utf-8") for path in beside)]
+        texts = [_without_figure(self.text), *(path.read_text(encoding="utf-8") for path in beside)]
         return hashlib.sha256("\n".join([str(self.config.version), *texts]).encode()).hexdigest()[:16]
 
     @property
@@ -182,6 +183,18 @@ class Experiment:
         wanted = "a function figure(rows, path), which the config describes"
         _expect(callable(figure) or not self.config.figure, f"{self.script}", wanted, "none")
         return run, figure
+
+
+def _without_figure(script: str) -> str:
+    """A script's text but for its top-level function `figure`: a plot drawn otherwise changes no row."""
+    try:
+        figures = [f for f in ast.parse(script).body if isinstance(f, ast.FunctionDef) and f.name == "figure"]
+    except SyntaxError:
+        return script  # loading it says so
+    lines = script.splitlines()
+    for f in reversed(figures):
+        del lines[f.lineno - 1 : f.end_lineno]
+    return "\n".join(lines)
 
 
 @cache

@@ -232,6 +232,20 @@ def test_a_stale_cell_is_reported_and_runs_again(toy, gsjax, change):
     assert "stale" not in gsjax("list")[1]
 
 
+def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
+    drawn = "\ndef figure(rows, path):\n    path.write_text({!r})\n"
+    folder = toy(SCRIPT + drawn.format("one"), figure={"caption": "c"})
+    gsjax("run", "toy")
+    calls()
+    toy(SCRIPT + drawn.format("another"), figure={"caption": "c"})
+    assert "4 of 4" in gsjax("list")[1]
+    gsjax("run", "toy")
+    assert calls() == []
+    assert (folder / "figure.png").read_text() == "another"
+    toy(SCRIPT.replace("/ 10", "/ 5") + drawn.format("another"), figure={"caption": "c"})
+    assert "4 stale" in gsjax("list")[1]
+
+
 def test_no_line_of_the_table_averages_over_two_versions(toy, gsjax):
     toy(seeds=[0, 1])
     gsjax("run", "toy")
