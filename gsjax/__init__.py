@@ -5,7 +5,7 @@ scene       Gaussians, Tags, Camera, Frame, render, plan_render
 data        open_sequence, Sequence
 tracking    start_scene, scene_from_shapes, track, object_tracker, TrackerConfig
 files       read_ply, write_ply
-speed       host_options, keep_freed_memory
+speed       host_options, keep_freed_memory, keep_programs
 """
 
 import importlib
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         start_scene,
         track,
     )
-    from gsjax.optim.compiler import host_options, keep_freed_memory
+    from gsjax.optim.compiler import host_options, keep_freed_memory, keep_programs
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
     from gsjax.rasterize.rasterization import plan, rasterization
@@ -45,7 +45,7 @@ _HOMES = {
         "start_scene",
         "track",
     ),
-    "gsjax.optim.compiler": ("host_options", "keep_freed_memory"),
+    "gsjax.optim.compiler": ("host_options", "keep_freed_memory", "keep_programs"),
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),
     "gsjax.rasterize.rasterization": ("plan", "rasterization"),
@@ -67,6 +67,7 @@ __all__ = [
     "composite_tile",
     "host_options",
     "keep_freed_memory",
+    "keep_programs",
     "object_tracker",
     "open_sequence",
     "plan",

@@ -1,6 +1,9 @@
 """`gsjax fit`: a static scene from posed photographs."""
 
-from dataclasses import dataclass, field, make_dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, make_dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -18,9 +21,10 @@ from gsjax.cli.fit_results import Curve, judge, living, print_results, write_res
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import hear, undisturbed
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.messages import Notes
+from gsjax.cli.messages import Notes, stage
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
+from gsjax.cli.recording import located
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.tensorboard import TensorBoard
 from gsjax.data.open import ReadOptions
@@ -65,17 +69,18 @@ class Options:
     cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
     """Ids of the cameras of a recording to fit. All that are not held out, unless given."""
     eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of cameras of a recording that are held out, instead of every so-manieth photograph."""
+    """Ids of cameras of a recording that are held out, instead of every N-th photograph."""
     scale: float = 1.0
     """Fit photographs this many times smaller, as in 0.25; time goes with the number of pixels."""
     test_every: int = 8
-    """Hold out every so-manieth photograph, to judge by, where the data has no split; 0 holds out none."""
+    """Hold out every N-th photograph, to judge by, where the data has no split; 0 holds out none."""
     minutes: float | None = None
-    """Stop after so many minutes of steps, compiling included: how many there are follows from their pace."""
+    """Stop after so many minutes of steps, compiling included: how many there are follows from their pace.
+    The first fit on a machine compiles for about a minute; programs are kept for later ones."""
     until_psnr: float | None = None
     """Stop when held-out photographs are seen with so many dB."""
     judge_every: int = 500
-    """Steps between looks at held-out photographs."""
+    """Steps between looks at held-out photographs; under --minutes there are ten besides."""
     save_every: float = 30.0
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
@@ -83,7 +88,7 @@ class Options:
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
     overwrite: bool = False
-    """Replace a finished run in the same folder."""
+    """Replace an earlier run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
     read: ReadOptions = field(default_factory=ReadOptions)
@@ -96,6 +101,12 @@ def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
     """The options where the first word is that of a preset: how the scene is fitted is then that preset's
     unless given."""
     if not arguments or arguments[0] not in PRESETS:
+        if len(arguments) > 1 and not arguments[0].startswith("-") and not arguments[1].startswith("-"):
+            meant = get_close_matches(arguments[0], PRESETS, 1)
+            raise ValueError(
+                f"expected a dataset, or a preset and a dataset, found {arguments[0]!r} and {arguments[1]!r}"
+                f"; presets are {', '.join(PRESETS)}" + (f": did you mean {meant[0]}?" if meant else "")
+            )
         return Options, arguments
     fitted = ("fit", FitConfig, field(default=PRESETS[arguments[0]]))
     return make_dataclass("Options", [fitted], bases=(Options,), frozen=True), arguments[1:]
@@ -120,14 +131,15 @@ def run(options: Options) -> int:
         )
         chosen, held_out = split(photographs, options.test_every)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset))
         if options.resume:
-            folder.check_config(options, but=_OF_NO_BEARING)
+            folder.check_config(settings, but=_OF_NO_BEARING)
         say_if_large(photographs)
         views = read_views(photographs, console)
         cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
         fitted = [views[i] for i in chosen]
         problem, state = begin(fitted, options.fit, cloud, photographs.background)
-        folder.write_config(options)  # from here on an earlier run is gone
+        folder.write_config(settings)  # from here on an earlier run is gone
         curve = Curve()
         if options.resume:
             state, curve = load(folder.resume, problem, state)
@@ -135,22 +147,24 @@ def run(options: Options) -> int:
         board = TensorBoard(folder.path, curve.rows) if options.tensorboard else None
         judged = [(photographs.names[i], views[i]) for i in held_out]
         state, stopped = follow(options, problem, state, curve, judged, folder, console, board)
-        if curve.skipped:
-            notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
+        seconds = {"fit": curve.seconds, "compile": curve.compile_seconds}
         gaussians, finished, worth = living(state.gaussians)[0], stopped is None, []
+        _say_what_was_odd(options, curve, gaussians, finished, notes)
         found_views = as_found(problem, state.model)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
         if finished:  # who pressed Ctrl-C does not wait for this, nor for the video
-            gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
-            if judged and gaussians.num:
-                worth = parts(problem, gaussians, light, some_of(judged), curve)
+            with _timed(seconds, "parts", console, "looking at what each part of the scene is worth"):
+                gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
+                if judged and gaussians.num:
+                    worth = parts(problem, gaussians, light, some_of(judged), curve)
         write_ply(folder.scene, gaussians)
-        scores = judge(
-            problem, gaussians, judged or [(photographs.names[i], views[i]) for i in chosen[:1]], folder
-        )
+        with _timed(seconds, "scores", console, "scoring held-out photographs"):
+            shown = judged or [(photographs.names[i], views[i]) for i in chosen[:1]]
+            scores = judge(problem, gaussians, shown, folder)
         if finished:
             try:
-                write_orbit(folder, problem._replace(views=found_views), gaussians)
+                with _timed(seconds, "video", console, "drawing a video of the scene"):
+                    write_orbit(folder, problem._replace(views=found_views), gaussians)
             except (OSError, ValueError) as error:
                 notes.add(f"There is no video: {describe_error(error)}")
         found = {
@@ -166,11 +180,7 @@ def run(options: Options) -> int:
             "photographs": {"fitted": len(chosen), "held_out": len(held_out)},
             "size": photographs.sizes.max(0),
             "start": problem.start,
-            "seconds": {
-                "fit": curve.seconds,
-                "compile": curve.compile_seconds,
-                "total": perf_counter() - begun,
-            },
+            "seconds": seconds | {"total": perf_counter() - begun},
             "machine": describe_machine(),
             "test": scores.mean() if len(held_out) else None,
             "views": scores.rows,
@@ -203,6 +213,33 @@ def _check(options: Options) -> None:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
     if options.until_psnr is not None and options.test_every == 0:
         raise ValueError("--until-psnr: nothing is held out to judge by; leave out --test-every 0")
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str, console: Console, words: str) -> Iterator[None]:
+    """Say what goes on after the fit, and how long it took."""
+    begun = perf_counter()
+    with stage(console, words):
+        yield
+    seconds[name] = perf_counter() - begun
+
+
+def _say_what_was_odd(
+    options: Options, curve: Curve, gaussians: Gaussians, finished: bool, notes: Notes
+) -> None:
+    if curve.skipped:
+        notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
+    compiling, given = curve.compile_seconds, 60 * (options.minutes or np.inf)
+    if compiling > given / 3:
+        notes.warn(
+            f"compiling took {compiling:.0f} of the {given:.0f} seconds, steps had the rest; the next fit "
+            "at this size finds its programs compiled"
+        )
+    if finished and gaussians.sh_degree < options.fit.sh_degree:
+        notes.add(
+            f"Colours are of degree {gaussians.sh_degree}: a degree is added every "
+            f"{options.fit.sh_every:,} steps (--fit.sh-every)."
+        )
 
 
 def write_cameras(folder: RunFolder, names: list[str], views: list[View], model: Model) -> None:
@@ -248,7 +285,7 @@ class Budget:
 
     def steps(self, step: int) -> int:
         """About how many there will be, at the pace so far."""
-        return min(self._steps, round(step / max(self(step), 1e-9)))
+        return max(step, min(self._steps, round(step / max(self(step), 1e-9))))
 
 
 def follow(
@@ -272,7 +309,7 @@ def follow(
         TextColumn("{task.fields[told]}"),
         TimeRemainingColumn(),
     )
-    drawn = 0.0
+    drawn, tenths = 0.0, 0
     with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
         task = progress.add_task("fitting", total=options.fit.steps, completed=state.step, told="compiling")
         try:
@@ -290,11 +327,16 @@ def follow(
                     progress.refresh()
                     drawn = now
                 look = step % options.judge_every == 0 or last
+                if options.minutes is not None and int(10 * budget(step)) > tenths:
+                    look, tenths = True, int(10 * budget(step))
                 if step % _LOGGED_EVERY == 0 or look:
                     psnr = (
                         judge(problem, fitted.state.gaussians, some).mean()["psnr"] if look and some else None
                     )
                     curve.add(fitted, psnr, folder)
+                    if look and not console.is_terminal:
+                        told = curve.in_words(fitted, len(judged) > 0)
+                        console.print(f"step {step:,} of {budget.steps(step):,}: {told}", soft_wrap=True)
                     if board is not None:
                         board.add(curve.rows[-1])
                     if options.until_psnr is not None and curve.has_met(options.until_psnr):

@@ -239,7 +239,7 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
         if test["ssim"] is not None:
             cards["SSIM, held out"] = f"{test['ssim']:.3f}"
     cards["Gaussians"] = found["num_gaussians"]
-    cards["Fitted for"] = (f"{found['seconds']['fit'] / 60:.1f}", "minutes")
+    cards["Fitted for"] = (f"{_minutes(found):.1f}", "minutes")
     rows = [[row["view"], row["psnr"], row["ssim"], row["depth_mm"]] for row in found["views"]]
     times = [[name, value] for name, value in found["seconds"].items()]
     shown = found["views"][:: max(1, len(found["views"]) // _SHOWN)][:_SHOWN]
@@ -267,6 +267,11 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
     )
 
 
+def _minutes(found: dict[str, Any]) -> float:
+    """Of steps and of compiling them, which is what --minutes is about."""
+    return (found["seconds"]["fit"] + found["seconds"]["compile"]) / 60
+
+
 def _tables_of_parts(parts: list[dict[str, Any]]) -> list[Table]:
     """What each part of the scene is worth, where that was looked at."""
     if not parts:
@@ -290,9 +295,10 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
         grid.add_row("[bold]held out[/]", f"{words} (mean of {photographs['held_out']} views)")
     grid.add_row("[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, SH degree {found['sh_degree']}")
     rate = found["steps"] / seconds["fit"] if seconds["fit"] else 0
-    part = "" if found["complete"] else " [bold yellow](partial run; go on with --resume)[/]"
-    words = f"{found['steps']:,} steps in {seconds['fit'] / 60:.1f} min ({rate:.1f} a second)"
-    grid.add_row("[bold]fit[/]", f"{words}, {seconds['compile']:.0f} s compiling{part}")
+    words = f"{found['steps']:,} steps in {_minutes(found):.1f} min ({rate:.1f} a second), "
+    grid.add_row("[bold]fit[/]", f"{words}{seconds['compile']:.0f} s of it compiling")
+    if not found["complete"]:
+        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
     console.print()
     console.print(grid)
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)

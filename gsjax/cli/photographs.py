@@ -19,7 +19,7 @@ from gsjax.data.open import ReadOptions, is_of_photographs, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.methods.reconstruction import View
 
-_LARGE = 1600  # pixels, a side
+_LEAST, _LARGE = 8, 1600  # pixels, a side
 _BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
 
 
@@ -60,14 +60,26 @@ def choose_photographs(
                 f"--frames: {frames} holds no photograph of {photographs.name}, which has 0 to "
                 f"{photographs.num - 1}."
             )
-        return photographs.select(chosen).scaled(scale)
+        return _scaled(photographs.select(chosen), scale)
     recording = open_recording(dataset, cameras, eval_cameras, frames, read)
     photographs = photographs_of(recording.judged)
     if eval_cameras:
         places = np.arange(photographs.num) % recording.judged.num_cameras
         held_out = places >= recording.tracked.num_cameras
         photographs = replace(photographs, splits=tuple("test" if out else "train" for out in held_out))
-    return photographs.scaled(scale)
+    return _scaled(photographs, scale)
+
+
+def _scaled(photographs: Photographs, scale: float) -> Photographs:
+    smaller = photographs.scaled(scale)
+    least = smaller.sizes.min(1).argmin()
+    (width, height), (before, high) = smaller.sizes[least], photographs.sizes[least]
+    if scale < 1 and min(width, height) < _LEAST:
+        raise ValueError(
+            f"--scale {scale:g}: a photograph of {before}x{high} would be {width}x{height}; expected "
+            f"{_LEAST} pixels or more a side"
+        )
+    return smaller
 
 
 def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) -> Photographs:

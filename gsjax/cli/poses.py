@@ -61,6 +61,11 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     of_video = options.images.is_file()
     in_place = not of_video and options.images.resolve() == (options.out / "images").resolve()
+    if not of_video and options.images.resolve() == options.out.resolve():
+        raise ValueError(
+            f"--out {options.out}: the photographs themselves lie there; name another folder, or move them "
+            f"to {options.out / 'images'} and give that"
+        )
     _check_out(options.out, in_place, options.overwrite)
     with Notes(console) as notes:
         names = [] if of_video else list_photographs(options.images)

@@ -1,5 +1,6 @@
 """Which part of a recording is tracked, which is only judged, and what its masks call things."""
 
+import os
 import warnings
 from collections.abc import Callable
 from collections.abc import Sequence as Indices
@@ -39,6 +40,12 @@ class Recording:
     def held_out(self) -> tuple[int, ...]:
         """Ids of the cameras that are only judged."""
         return self.judged.camera_ids[self.tracked.num_cameras :]
+
+
+def located(dataset: str) -> str:
+    """The absolute path of a dataset, by which a run finds it again from elsewhere; of a built-in scene its
+    name."""
+    return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)
 
 
 def open_recording(

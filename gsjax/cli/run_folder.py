@@ -48,21 +48,23 @@ class RunFolder:
     A run is finished when it has its report, and metrics.json does not say that it was stopped.
 
     Attributes:
-        path: the folder, which exists.
+        path: the folder, which exists once settings are written.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool = False):
-        """Makes the folder. What an earlier run left there is cleared when this one writes its settings.
+        """Claims the folder. It is made, and what an earlier run left there is cleared, when this run writes
+        its settings.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
-            overwrite: clear an earlier run although it is finished. What a run does not write beside it is
-                kept; its folders are cleared whole.
+            overwrite: clear an earlier run although it is finished, or could be resumed. What a run does
+                not write beside it is kept; its folders are cleared whole.
             resume: keep an unfinished run.
 
         Raises:
             FileNotFoundError: `resume` is on and no run is there.
-            FileExistsError: a finished run is there and `overwrite` is off.
+            FileExistsError: a finished run is there and `overwrite` is off, or an unfinished one that
+                has something to resume and both are off.
             FileExistsError: something that is not a run is there; nothing of it is touched.
             NotADirectoryError: `path` is a file.
         """
@@ -73,7 +75,6 @@ class RunFolder:
             raise NotADirectoryError(f"{self.path}: expected a folder, found a file; name another folder")
         if self.path.is_dir() and any(self.path.iterdir()):
             self._claim(overwrite, resume)
-        self.path.mkdir(parents=True, exist_ok=True)
 
     def _claim(self, overwrite: bool, resume: bool) -> None:
         # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
@@ -83,8 +84,15 @@ class RunFolder:
                 f"with {SIGNATURE!r}), found other files; name another folder"
             )
         if self.finished and not overwrite:
+            nothing = ", of which nothing is left to resume" if resume else ""
             raise FileExistsError(
-                f"{self.path}: holds a finished run; name another folder, or replace it with --overwrite"
+                f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
+                "--overwrite"
+            )
+        if self.resume.is_dir() and any(self.resume.iterdir()) and not (resume or overwrite):
+            raise FileExistsError(
+                f"{self.path}: holds an unfinished run; go on with it by --resume, or replace it with "
+                "--overwrite"
             )
         self._stale = not resume
 
@@ -149,20 +157,26 @@ class RunFolder:
             for entry in self.path.glob(name):
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         self._stale = False
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise type(error)(f"{self.path}: cannot make this folder ({error.strerror})") from error
         self.report.unlink(missing_ok=True)  # that of a part: a run is finished when it has its own
         with atomic_write(self.config) as temporary:
             temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError where config.yml says something else than `config`, the settings `but` apart."""
-        stored = yaml.safe_load(self.config.read_text(encoding="utf-8"))
-        given = _plain(dataclasses.asdict(config))
-        for name in given.keys() | stored.keys():
-            if name not in but and stored.get(name) != given.get(name):
-                raise ValueError(
-                    f"--resume: the run in {self.path} was begun with {name} {stored.get(name)!r}, now it is "
-                    f"{given.get(name)!r}; give the same, or begin anew without --resume"
-                )
+        stored = _flat(yaml.safe_load(self.config.read_text(encoding="utf-8")))
+        given = _flat(_plain(dataclasses.asdict(config)))
+        names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
+        others = [name for name in names if stored.get(name) != given.get(name)]
+        if others:
+            words = [f"{n} {stored.get(n)!r}, now it is {given.get(n)!r}" for n in others]
+            raise ValueError(
+                f"--resume: the run in {self.path} was begun with {'; with '.join(words)}. Give the same, or "
+                "replace the run with --overwrite instead"
+            )
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Writes metrics.json; numbers that are not finite become null."""
@@ -171,6 +185,14 @@ class RunFolder:
     def write_trajectory(self, **arrays: Any) -> None:
         """Writes trajectory.npz."""
         write_npz(self.path / "trajectory.npz", arrays)
+
+
+def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
+    """Nested settings by the names that options have on the command line: fit.start.count."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat(value, f"{within}{name}.") if isinstance(value, Mapping) else {within + name: value}
+    return flat
 
 
 def _plain(value: Any) -> Any:

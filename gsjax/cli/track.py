@@ -21,6 +21,7 @@ from gsjax.cli.recording import (
     Recording,
     draw_ahead,
     first_mask,
+    located,
     open_recording,
     warn_of_missing,
 )
@@ -105,7 +106,9 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = dataclasses.replace(options, cameras=recording.tracked.camera_ids)
+        settings = dataclasses.replace(
+            options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids
+        )
         if options.resume:
             folder.check_config(settings, but=("resume", "overwrite", "debug", "out", "cores"))
         folder.write_config(settings)

@@ -25,6 +25,10 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None and Path(error.filename) == temporary:
+            error.filename = os.fspath(path)  # the name that the user gave
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

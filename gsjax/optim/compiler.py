@@ -1,13 +1,17 @@
-"""What makes the same program faster on the host: compiler options, and memory that is kept."""
+"""What makes the same program faster on the host: compiler options, and what is kept: memory, programs."""
 
 import ctypes
+import hashlib
+import platform
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from platformdirs import user_cache_dir
 
 
 @cache
@@ -74,3 +78,45 @@ def keep_freed_memory() -> bool:
     if not mallopt(_MMAP_THRESHOLD, _KEPT):  # older ones refuse that, and the rest alone would do harm
         return False
     return bool(mallopt(_TRIM_THRESHOLD, _KEPT))
+
+
+_MOST_BYTES, _WORTH_S = 2**30, 0.3  # of programs on disk; what compiles faster is not kept
+
+
+def keep_programs(folder: str | Path | None = None) -> Path | None:
+    """Have JAX keep compiled programs on disk, up to 1 GiB, so that the next process finds them. The command
+    line does: what would compile for a minute starts in seconds. Call it before JAX computes anything.
+
+    Programs hold instructions that another processor may lack, so each kind has a folder of its own.
+
+    Args:
+        folder: where; the user's cache folder unless given.
+
+    Returns:
+        where they are kept; None, and nothing is changed, where JAX was told already
+        (`JAX_COMPILATION_CACHE_DIR`, or `JAX_ENABLE_COMPILATION_CACHE=0` for none), or nothing can be
+        written there.
+    """
+    if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
+        return None
+    kind = hashlib.sha256(_processor().encode()).hexdigest()[:8]
+    root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
+    place = root / f"programs-jax-{jax.__version__}-{kind}"
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=place):
+            pass
+    except OSError:
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_S)
+    return place
+
+
+def _processor() -> str:
+    """What tells processors with different instructions apart."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    marks = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+    return "\n".join([platform.machine(), platform.processor(), *marks])

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -73,6 +74,9 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert "data:video/mp4" in (run / "report.html").read_text()
     assert describe_video(run / "video_orbit.mp4").frames == 90
     assert not (run / "resume").exists()
+    assert set(found["seconds"]) == {"fit", "compile", "parts", "scores", "video", "total"}
+    config = yaml.safe_load((run / "config.yml").read_text())
+    assert Path(config["dataset"]).is_absolute()
 
     shown = Curve.took
 
@@ -93,7 +97,10 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
 
     code, said = gsjax_fit(*QUICK, "--resume", "--fit.seed", "5", name="stopped")
     assert code == 2
-    assert "--resume: the run in" in said
+    assert "was begun with fit.seed 0, now it is 5. Give the same" in " ".join(said.split())
+    code, said = gsjax_fit(*QUICK, name="stopped")
+    assert code == 2
+    assert "an unfinished run; go on with it by --resume" in " ".join(said.split())
     code, said = gsjax_fit(*QUICK, "--resume", name="stopped")
     assert code == 0, said
     assert "Resumed after 14 steps" in json.dumps(
@@ -102,6 +109,7 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (run / "scene.ply").read_bytes()
 
     assert gsjax_fit(*QUICK)[0] == 2  # a finished run is kept unless asked
+    assert "nothing is left to resume" in " ".join(gsjax_fit(*QUICK, "--resume")[1].split())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -152,6 +160,20 @@ def test_a_preset_is_named_before_the_dataset_and_what_is_given_counts_more(phot
         main(["fit", "--help"])
     said = capfd.readouterr().out
     assert all(name in said for name in PRESETS)
+    assert main(["fit", "clasic", str(photographs), "--out", str(run)]) == 2
+    said = " ".join(capfd.readouterr().err.split())
+    assert "presets are quick, classic, depth, published: did you mean classic?" in said
+
+
+def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
+    code, said = gsjax_fit(*QUICK, "--fit.steps", "100000", "--minutes", "0.01", "--fit.sh-every", "100")
+    assert code == 0, said
+    said = " ".join(said.split())
+    assert "compiling took" in said
+    assert "the next fit at this size finds its programs compiled" in said
+    assert "step 1 of 1: loss" in said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert "Colours are of degree 0: a degree is added every 100 steps (--fit.sh-every)." in found["notes"]
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):
@@ -184,6 +206,7 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
     ("options", "says"),
     [
         (("--scale", "0"), "--scale: expected above 0"),
+        (("--scale", "0.1"), "--scale 0.1: a photograph of 48x36 would be 5x4; expected 8 pixels"),
         (("--test-every", "1"), "--test-every: expected 0"),
         (("--minutes", "-1"), "--minutes: expected more than 0"),
         (("--until-psnr", "20", "--test-every", "0"), "--until-psnr: nothing is held out"),
@@ -191,10 +214,11 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
         (("--fit.start.source", "depth"), "start.source: the data has no depth"),
     ],
 )
-def test_wishes_that_cannot_be_met(gsjax_fit, options, says):
+def test_wishes_that_cannot_be_met(gsjax_fit, tmp_path, options, says):
     code, said = gsjax_fit(*options)
     assert code == 2
     assert says in said
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path):

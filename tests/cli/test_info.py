@@ -92,6 +92,12 @@ def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path
     assert "z (m)" in text
 
 
+def test_a_run_is_no_dataset(capfd, tmp_path):
+    (tmp_path / "config.yml").write_text("# gsjax run\n")
+    assert main(["info", str(tmp_path)]) == 2
+    assert "found the folder of a run; open its report.html" in " ".join(capfd.readouterr().err.split())
+
+
 def test_pictures_of_another_kind_are_refused_before_anything_is_read(capfd):
     assert main(["info", "nowhere", "--picture", "scene.bmp"]) == 2
     said = capfd.readouterr().err

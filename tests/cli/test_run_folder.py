@@ -95,11 +95,37 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
     assert not run.finished
 
 
-def test_unfinished_run_is_replaced(finished):
+def test_unfinished_run_is_replaced_where_it_left_nothing_to_resume(finished):
     finished.report.unlink()
+    finished.resume.mkdir()
     run = RunFolder(finished.path)
     run.write_config(Config())
     assert contents(run) == ["config.yml", "my notes.txt"]
+
+
+def test_unfinished_run_is_resumed_or_replaced_only_when_told(finished):
+    finished.report.unlink()
+    finished.resume.mkdir()
+    (finished.resume / "state.npz").touch()
+    before = contents(finished)
+    with pytest.raises(
+        FileExistsError, match=r"an unfinished run; go on with it by --resume, or .*--overwrite"
+    ):
+        RunFolder(finished.path)
+    RunFolder(finished.path, resume=True)
+    assert contents(finished) == before
+    RunFolder(finished.path, overwrite=True).write_config(Config())
+    assert contents(finished) == ["config.yml", "my notes.txt"]
+
+
+def test_a_folder_is_made_when_there_is_something_to_keep(tmp_path):
+    run = RunFolder(tmp_path / "a" / "run")
+    assert not (tmp_path / "a").exists()
+    run.write_config(Config())
+    assert run.config.is_file()
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file/run: cannot make this folder"):
+        RunFolder(tmp_path / "file" / "run").write_config(Config())
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

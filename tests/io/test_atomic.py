@@ -33,6 +33,12 @@ def test_folders_are_made_and_the_suffix_is_kept(tmp_path):
     assert os.listdir(tmp_path / "deep" / "er") == ["x.ply"]
 
 
+def test_errors_name_the_file_that_was_asked_for(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, atomic_write(tmp_path / "x.ply") as temporary:
+        temporary.read_bytes()
+    assert caught.value.filename == str(tmp_path / "x.ply")
+
+
 def test_json_holds_arrays_and_no_nan(tmp_path):
     value = {
         "a": jnp.arange(2),

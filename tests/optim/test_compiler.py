@@ -1,5 +1,9 @@
 """What makes programs faster on the host changes none of what they give."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,3 +41,31 @@ def test_what_is_not_finite_after_all_is_not_hidden():
     costs, pixels = in_memory((jnp.ones(3), jnp.arange(3)), jnp.array([jnp.nan, 1.0]))
     assert jnp.isnan(costs).all()
     np.testing.assert_array_equal(pixels, 0)
+
+
+PROGRAM = """
+import sys, jax
+from gsjax import keep_programs
+place = keep_programs(sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.jit(lambda x: x @ x + 1)(jax.numpy.ones((3, 3)))
+print(place)
+"""
+
+
+def test_programs_are_kept_where_nothing_else_was_said(tmp_path):
+    """In processes of their own, as JAX is told once."""
+
+    def said(place, **given):
+        others = {k: v for k, v in os.environ.items() if "COMPILATION_CACHE" not in k}
+        command = [sys.executable, "-c", PROGRAM, str(place)]
+        return subprocess.run(command, env=others | given, check=True, capture_output=True, text=True)
+
+    kept = said(tmp_path / "cache").stdout.strip()
+    assert kept.startswith(str(tmp_path / "cache" / f"programs-jax-{jax.__version__}-"))
+    assert list((tmp_path / "cache").glob("*/*-cache"))
+    assert said(tmp_path / "no", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own")).stdout.strip() == "None"
+    assert said(tmp_path / "no", JAX_ENABLE_COMPILATION_CACHE="0").stdout.strip() == "None"
+    (tmp_path / "file").touch()
+    assert said(tmp_path / "file").stdout.strip() == "None"
+    assert not (tmp_path / "no").exists()
