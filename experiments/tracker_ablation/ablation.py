@@ -26,7 +26,7 @@ FULL = PRESETS["paper"]
 
 def without_alignment(config: TrackerConfig) -> TrackerConfig:
     """What the paper has not: no Gauss-Newton, and no search by shifts and turns before it."""
-    return replace(config, align=replace(config.align, iterations=0, reach=0.0, turns=(0.0,)))
+    return replace(config, align=replace(config.align, iterations=0, reach=0.0, turns=()))
 
 
 VARIANTS = {

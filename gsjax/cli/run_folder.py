@@ -25,6 +25,19 @@ def is_run(folder: Path) -> bool:
     return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
 
 
+def expect_run(path: Path, made_by: str = "") -> None:
+    """Raises FileNotFoundError where there is no folder of a run, which is then said to be `made_by` a
+    command."""
+    wanted = f"{path}: expected the folder of a run" + (f" of {made_by}" if made_by else "")
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing there"
+        raise FileNotFoundError(f"{wanted}, found {found}; name its --out")
+    if not is_run(path):
+        raise FileNotFoundError(
+            f"{wanted}, whose config.yml begins with {SIGNATURE!r}, found other files; name its --out"
+        )
+
+
 class RunFolder:
     """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import yaml
 
-from gsjax.cli.run_folder import SIGNATURE, is_run
+from gsjax.cli.run_folder import expect_run
 
 Kind = Literal["fit", "track"]
 EVALUATION = Path("eval", "metrics.json")
@@ -59,14 +59,7 @@ def read_record(path: Path) -> Record:
         FileNotFoundError: there is no such folder, or it is no run's.
         ValueError: a file of it cannot be read, or the run is neither of `gsjax fit` nor of `gsjax track`.
     """
-    if not path.is_dir():
-        found = "a file" if path.exists() else "nothing there"
-        raise FileNotFoundError(f"{path}: expected the folder of a run, found {found}; name its --out")
-    if not is_run(path):
-        raise FileNotFoundError(
-            f"{path}: expected the folder of a run, whose config.yml begins with {SIGNATURE!r}, found other "
-            "files; name its --out"
-        )
+    expect_run(path)
     config = _config(path / "config.yml")
     kind = _kind(path, config)
     metrics = _object(path / "metrics.json", _SCORES[kind])

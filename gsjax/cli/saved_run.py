@@ -12,7 +12,7 @@ import yaml
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Recording, open_recording
-from gsjax.cli.run_folder import SIGNATURE, is_run
+from gsjax.cli.run_folder import expect_run
 from gsjax.data.errors import DataError
 from gsjax.io.ply import read_ply
 from gsjax.methods.object_tracker import Pose, TrackedScene
@@ -60,14 +60,7 @@ def open_run(path: Path) -> SavedRun:
         FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
         ValueError: a file holds something else than a run writes, or its recording cannot be opened.
     """
-    if not path.is_dir():
-        found = "a file" if path.exists() else "nothing there"
-        raise FileNotFoundError(f"{path}: expected the folder of a run of `gsjax track`, found {found}")
-    if not is_run(path):
-        raise FileNotFoundError(
-            f"{path}: expected the folder of a run of `gsjax track`, whose config.yml begins with "
-            f"{SIGNATURE!r}, found other files; name its --out"
-        )
+    expect_run(path, made_by="`gsjax track`")
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
     if missing:
         raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")

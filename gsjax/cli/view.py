@@ -14,7 +14,7 @@ from rich.console import Console
 from gsjax.cli.messages import Notes, say_error, stage
 from gsjax.cli.outputs import write_png
 from gsjax.cli.photographs import photographs_of_run
-from gsjax.cli.run_folder import SIGNATURE, is_run
+from gsjax.cli.run_folder import expect_run
 from gsjax.cli.saved_run import SavedRun, open_run, read_tracking
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import read_ply
@@ -122,11 +122,7 @@ def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
         return Viewable(path.name, gaussians, labels), path.absolute().parent
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
-    if not is_run(path):
-        raise FileNotFoundError(
-            f"{path}: expected the folder of a run, whose config.yml begins with {SIGNATURE!r}, found other "
-            "files; name the --out of a run, or a PLY file"
-        )
+    expect_run(path)
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "

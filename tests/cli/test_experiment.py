@@ -12,7 +12,7 @@ import yaml
 
 from gsjax.cli import experiment_sweep, machine, main
 from gsjax.cli.experiment import choose
-from gsjax.cli.experiment_sweep import Cell, read_experiment
+from gsjax.cli.experiment_sweep import Cell, experiment_names, read_experiment
 
 CONFIG = {
     "claim": "Larger pictures take longer.",
@@ -635,3 +635,17 @@ def test_the_one_in_the_docs_runs(toy, gsjax):
     drawn = (folder / "figure.png").read_bytes()
     gsjax("table", "toy")
     assert (folder / "figure.png").read_bytes() == drawn
+
+
+ROOT = Path(__file__).resolve().parents[2] / "experiments"
+
+
+@pytest.mark.parametrize("name", experiment_names(ROOT))
+def test_every_experiment_of_this_repository_can_be_loaded(name, tmp_path):
+    """Settings that scripts name may be gone or refused, which only a run would tell."""
+    try:
+        read_experiment(ROOT, name, tmp_path).load()
+    except ValueError as error:
+        if "No module named" not in str(error):
+            raise
+        pytest.skip(f"{error}")
