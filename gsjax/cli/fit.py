@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_parts import parts
-from gsjax.cli.fit_results import Curve, judge, living, print_results, write_results
+from gsjax.cli.fit_results import Curve, Plans, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import Saver, load
 from gsjax.cli.interrupts import hear, undisturbed
 from gsjax.cli.machine import describe as describe_machine
@@ -130,6 +130,8 @@ def run(options: Options) -> int:
             eval_cameras=options.eval_cameras,
         )
         chosen, held_out = split(photographs, options.test_every)
+        if options.until_psnr is not None and not len(held_out):
+            raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
@@ -152,21 +154,27 @@ def run(options: Options) -> int:
         _say_what_was_odd(options, curve, gaussians, finished, notes)
         found_views = as_found(problem, state.model)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
-        if finished:  # who pressed Ctrl-C does not wait for this, nor for the video
-            with _timed(seconds, "parts", console, "looking at what each part of the scene is worth"):
+        light = None
+        if finished:  # who pressed Ctrl-C does not wait for this
+            with _timed(seconds, "pruning", console, "leaving out what no photograph needs"):
                 gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
-                if judged and gaussians.num:
-                    worth = parts(problem, gaussians, light, some_of(judged), curve)
         write_ply(folder.scene, gaussians)
+        plans: Plans = {}
         with _timed(seconds, "scores", console, "scoring held-out photographs"):
             shown = judged or [(photographs.names[i], views[i]) for i in chosen[:1]]
-            scores = judge(problem, gaussians, shown, folder)
+            scores = judge(problem, gaussians, shown, folder, plans)
         if finished:
-            try:
-                with _timed(seconds, "video", console, "drawing a video of the scene"):
-                    write_orbit(folder, problem._replace(views=found_views), gaussians)
-            except (OSError, ValueError) as error:
-                notes.add(f"There is no video: {describe_error(error)}")
+            with (
+                _dispensable(notes, "table of what each part bought"),
+                _timed(seconds, "parts", console, "looking at what each part of the scene is worth"),
+            ):
+                if judged and gaussians.num:
+                    worth = parts(problem, gaussians, light, some_of(judged), curve, plans)
+            with (
+                _dispensable(notes, "video"),
+                _timed(seconds, "video", console, "drawing a video of the scene"),
+            ):
+                write_orbit(folder, problem._replace(views=found_views), gaussians)
         found = {
             "kind": "fit",
             "dataset": photographs.name,
@@ -211,8 +219,6 @@ def _check(options: Options) -> None:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {options.scale}")
     if options.test_every < 0 or options.test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
-    if options.until_psnr is not None and options.test_every == 0:
-        raise ValueError("--until-psnr: nothing is held out to judge by; leave out --test-every 0")
 
 
 @contextmanager
@@ -224,6 +230,15 @@ def _timed(seconds: dict[str, float], name: str, console: Console, words: str) -
     seconds[name] = perf_counter() - begun
 
 
+@contextmanager
+def _dispensable(notes: Notes, what: str) -> Iterator[None]:
+    """What a fit that is done can go without: Ctrl-C and errors end it, and the run still has its report."""
+    try:
+        yield
+    except (KeyboardInterrupt, OSError, ValueError) as error:
+        notes.warn(f"there is no {what}: {describe_error(error) if str(error) else 'Ctrl-C'}")
+
+
 def _say_what_was_odd(
     options: Options, curve: Curve, gaussians: Gaussians, finished: bool, notes: Notes
 ) -> None:
@@ -231,10 +246,9 @@ def _say_what_was_odd(
         notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
     compiling, given = curve.compile_seconds, 60 * (options.minutes or np.inf)
     if compiling > given / 3:
-        notes.warn(
-            f"compiling took {compiling:.0f} of the {given:.0f} seconds, steps had the rest; the next fit "
-            "at this size finds its programs compiled"
-        )
+        kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir
+        later = "; programs are kept, and the next fit at this size finds most of them" if kept else ""
+        notes.warn(f"compiling took {compiling:.0f} s, of {given:.0f} given{later}")
     if finished and gaussians.sh_degree < options.fit.sh_degree:
         notes.add(
             f"Colours are of degree {gaussians.sh_degree}: a degree is added every "
@@ -334,9 +348,12 @@ def follow(
                         judge(problem, fitted.state.gaussians, some).mean()["psnr"] if look and some else None
                     )
                     curve.add(fitted, psnr, folder)
-                    if look and not console.is_terminal:
+                    if look:
                         told = curve.in_words(fitted, len(judged) > 0)
-                        console.print(f"step {step:,} of {budget.steps(step):,}: {told}", soft_wrap=True)
+                        progress.update(task, told=told)
+                        progress.refresh()
+                        if not console.is_terminal:
+                            console.print(f"step {step:,} of {budget.steps(step):,}: {told}", soft_wrap=True)
                     if board is not None:
                         board.add(curve.rows[-1])
                     if options.until_psnr is not None and curve.has_met(options.until_psnr):

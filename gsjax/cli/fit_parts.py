@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.cli.fit_results import Curve, judge
+from gsjax.cli.fit_results import Curve, Plans, judge
 from gsjax.methods.reconstruction import Problem, View
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
@@ -22,6 +22,7 @@ def parts(
     light: Float[np.ndarray, "n"],
     views: list[tuple[str, View]],
     curve: Curve,
+    plans: Plans,
 ) -> list[dict[str, Any]]:
     """What is left (`part`) of the scene, of how many `gaussians` and which `sh_degree` (None: was not
     written down), and the mean `psnr` of the views then. Nothing is fitted again: a fit for less does better.
@@ -32,10 +33,11 @@ def parts(
         light: of `light_of`; who sends least is left out first.
         views: held-out ones, those that the curve was judged by.
         curve: how the fit went on.
+        plans: as `judge` has it.
     """
 
     def row(part: str, scene: Gaussians, count: int, degree: int) -> dict[str, Any]:
-        psnr = judge(problem, scene, views).mean()["psnr"]
+        psnr = judge(problem, scene, views, plans=plans).mean()["psnr"]
         return {"part": part, "gaussians": count, "sh_degree": degree, "psnr": psnr}
 
     count, degree = gaussians.num, gaussians.sh_degree
@@ -46,6 +48,12 @@ def parts(
         rows.append(row(name, _emptied(gaussians, order[kept:]), kept, degree))
     for less in reversed(range(degree)):
         rows.append(row(f"colours of degree {less}", _plainer(gaussians, less), count, less))
+    return rows + parts_of_time(curve)
+
+
+def parts_of_time(curve: Curve) -> list[dict[str, Any]]:
+    """The same after a part of the time: at the last look before it, where there was one."""
+    rows = []
     for name, share in _MINUTES.items():
         before = [r for r in curve.looks() if r["seconds"] <= share * curve.rows[-1]["seconds"]]
         if before:

@@ -132,11 +132,20 @@ def living(gaussians: Gaussians) -> tuple[Gaussians, int]:
     return alive, gaussians.num - alive.num
 
 
+Plans = dict[tuple[int, ...], Plan]
+"""By the size of the photograph: what held a view, and so a program that is compiled."""
+
+
 def judge(
-    problem: Problem, gaussians: Gaussians, views: list[tuple[str, View]], folder: RunFolder | None = None
+    problem: Problem,
+    gaussians: Gaussians,
+    views: list[tuple[str, View]],
+    folder: RunFolder | None = None,
+    plans: Plans | None = None,
 ) -> Scores:
-    """Draw views and compare them with their photographs; with a folder, write them side by side there."""
-    rows, plans = [], {}
+    """Draw views and compare them with their photographs; with a folder, write them side by side there. What
+    is judged with the same `plans` is drawn by the same programs."""
+    rows, plans = [], {} if plans is None else plans
     for name, view in views:
         size = view.image.shape
         seen, plans[size] = look(

@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.machine import keep_to_cores, resident_mb
+from gsjax.cli.machine import resident_mb
 from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
 from gsjax.cli.messages import describe as describe_error
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
@@ -39,7 +39,7 @@ class Options:
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
     out: Path
-    """Folder for the run. It must be new, empty, or hold an unfinished run."""
+    """Folder for the run: a new one, or that of an earlier run with --overwrite."""
     seconds: float = 60.0
     """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
     hz: float = 30.0
@@ -60,7 +60,7 @@ class Options:
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
     overwrite: bool = False
-    """Replace a finished run in the same folder."""
+    """Replace an earlier run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -88,10 +88,9 @@ def run(options: Options) -> int:
         ValueError, OSError: what was asked cannot be done; what was followed before that is on disk.
     """
     _check(options)
-    keep_to_cores(options.cores)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
-        folder = RunFolder(options.out, overwrite=options.overwrite)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=None)
         folder.write_config(options)
         source = _open(options, console)
         log = Log(source.scene.label_ids, source.names)

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.text import Text
 
 from gsjax.cli.interrupts import heard_interrupts
+from gsjax.cli.machine import keep_to_cores
 from gsjax.data.errors import DataWarning
 
 FITTING = "fitting the scene to the first frame, which takes half a minute to two"
@@ -52,6 +53,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         )
         debug = options.debug
         _expect_values(options, arguments)
+        keep_to_cores(getattr(options, "cores", None))  # before JAX looks how many there are
         compiler = import_module("gsjax.optim.compiler")
         compiler.keep_freed_memory()
         if command not in _COMPILE_ANEW:
@@ -59,7 +61,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         with heard_interrupts():
             return chosen.run(options)
     except KeyboardInterrupt:
-        say_error("stopped by Ctrl-C before there was anything to keep", word="stopped")
+        say_error("stopped by Ctrl-C; what is on disk stays", word="stopped")
         return 130
     except Exception as error:
         if debug:

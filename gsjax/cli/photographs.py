@@ -15,7 +15,7 @@ from rich.progress import track
 from gsjax.cli.machine import available_mb
 from gsjax.cli.recording import open_recording, parse_frames
 from gsjax.data.errors import DataWarning
-from gsjax.data.open import ReadOptions, is_of_photographs, open_photographs
+from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.methods.reconstruction import View
 
@@ -46,14 +46,14 @@ def choose_photographs(
         DataError: the dataset cannot be read.
         ValueError: none is chosen, a camera is not there, or photographs are asked for by camera.
     """
-    if is_of_photographs(dataset):
+    if is_of_photographs(dataset) or not is_recording(dataset):
+        photographs = open_photographs(dataset, read)
         for option, ids in (("--cameras", cameras), ("--eval-cameras", eval_cameras)):
             if ids:
                 raise ValueError(
                     f"{option}: {dataset} holds photographs, not a recording by numbered cameras; leave it "
                     "out (--frames chooses among photographs)"
                 )
-        photographs = open_photographs(dataset, read)
         chosen = range(photographs.num)[parse_frames(frames)]
         if not chosen:
             raise ValueError(

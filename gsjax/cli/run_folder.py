@@ -16,6 +16,7 @@ _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
 _FILES += ("trajectory.npz", "scene.ply", "cameras.npz")
 _FOLDERS = ("renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
+_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply")  # what a run that was stopped has come to
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
@@ -64,7 +65,7 @@ class RunFolder:
         path: the folder, which exists once settings are written.
     """
 
-    def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool = False):
+    def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool | None = False):
         """Claims the folder. It is made, and what an earlier run left there is cleared, when this run writes
         its settings.
 
@@ -72,12 +73,12 @@ class RunFolder:
             path: a folder that does not exist, is empty, or holds an earlier run.
             overwrite: clear an earlier run although it is finished, or could be resumed. What a run does
                 not write beside it is kept; its folders are cleared whole.
-            resume: keep an unfinished run.
+            resume: keep an unfinished run. None for commands that cannot go on with one.
 
         Raises:
             FileNotFoundError: `resume` is on and no run is there.
             FileExistsError: a finished run is there and `overwrite` is off, or an unfinished one that
-                has something to resume and both are off.
+                has come to something and both are off.
             FileExistsError: something that is not a run is there; nothing of it is touched.
             NotADirectoryError: `path` is a file.
         """
@@ -89,7 +90,7 @@ class RunFolder:
         if self.path.is_dir() and any(self.path.iterdir()):
             self._claim(overwrite, resume)
 
-    def _claim(self, overwrite: bool, resume: bool) -> None:
+    def _claim(self, overwrite: bool, resume: bool | None) -> None:
         # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
         if not is_run(self.path):
             raise FileExistsError(
@@ -102,10 +103,12 @@ class RunFolder:
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
                 "--overwrite"
             )
-        if self.resume.is_dir() and any(self.resume.iterdir()) and not (resume or overwrite):
+        resumable = self.resume.is_dir() and any(self.resume.iterdir())
+        worth = resumable or any((self.path / name).exists() for name in _OF_WORTH)
+        if worth and not (resume or overwrite):
+            advice = "go on with it by --resume, or " if resumable and resume is not None else ""
             raise FileExistsError(
-                f"{self.path}: holds an unfinished run; go on with it by --resume, or replace it with "
-                "--overwrite"
+                f"{self.path}: holds an unfinished run; {advice}replace it with --overwrite"
             )
         self._stale = not resume
 

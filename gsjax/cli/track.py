@@ -13,7 +13,6 @@ from rich.console import Console
 
 from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.machine import keep_to_cores
 from gsjax.cli.messages import FITTING, Notes, describe, say_error, stage
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
 from gsjax.cli.recording import (
@@ -51,7 +50,7 @@ class Options:
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording, or a built-in scene such as simulated:tabletop."""
     out: Path
-    """Folder for the run. It must be new, empty, or hold an unfinished run."""
+    """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
     cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
     """Ids of the cameras to track with. All that are not held out, unless given."""
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
@@ -71,7 +70,7 @@ class Options:
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options."""
     overwrite: bool = False
-    """Replace a finished run in the same folder."""
+    """Replace an earlier run in the same folder."""
     debug: bool = False
     """Show Python's traceback when something fails."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
@@ -101,7 +100,6 @@ def run(options: Options) -> int:
     """
     if options.budget_ms is not None and not options.budget_ms > 0:
         raise ValueError(f"--budget-ms: expected more than 0, found {options.budget_ms}")
-    keep_to_cores(options.cores)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)

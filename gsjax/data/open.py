@@ -99,11 +99,17 @@ def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Ph
                 "llff (down, right, back) or endonerf (right, up, back)"
             )
         return poses_bounds.read_llff(root, options.axes, options.images)
-    known = any(next(root.glob(mark), None) for mark in _LAYOUTS) or is_open3d(root)
-    if known or next(root.glob("cam*.mp4"), None):
+    if is_recording(root):
         return photographs_of(open_sequence(root, options))
     marks = {mark: layout for mark, (layout, _) in _LAYOUTS.items()}
     raise _unknown(root, _PHOTOGRAPHS | marks, options)
+
+
+def is_recording(path: str | Path) -> bool:
+    """Whether there is a recording over time, by what lies there."""
+    root = Path(path)
+    known = any(next(root.glob(mark), None) for mark in _LAYOUTS) or is_open3d(root)
+    return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
 def is_of_photographs(path: str | Path) -> bool:

@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import os
 import platform
 from functools import cache
 from pathlib import Path
@@ -87,7 +88,8 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
     """Have JAX keep compiled programs on disk, up to 1 GiB, so that the next process finds them. The command
     line does: what would compile for a minute starts in seconds. Call it before JAX computes anything.
 
-    Programs hold instructions that another processor may lack, so each kind has a folder of its own.
+    Programs hold instructions that another processor may lack, and are split among as many cores as there
+    were, so each kind has a folder of its own. What a full disk or a kill left of one is removed.
 
     Args:
         folder: where; the user's cache folder unless given.
@@ -100,13 +102,16 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
     if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
         return None
     kind = hashlib.sha256(_processor().encode()).hexdigest()[:8]
-    root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
-    place = root / f"programs-jax-{jax.__version__}-{kind}"
     try:
+        root = Path(folder) if folder is not None else Path(user_cache_dir("gsjax", appauthor=False))
+        place = root / f"programs-jax-{jax.__version__}-{kind}"
         place.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=place):
             pass
-    except OSError:
+        for program in place.glob("*-cache"):  # JAX writes when it was last used after it, and needs both
+            if not program.with_name(program.name.removesuffix("cache") + "atime").exists():
+                program.unlink(missing_ok=True)
+    except (OSError, RuntimeError):  # the latter: a user without a home
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
@@ -115,8 +120,9 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
 
 
 def _processor() -> str:
-    """What tells processors with different instructions apart."""
+    """What tells processors with different instructions apart, and how many cores of it may be used."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     marks = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    return "\n".join([platform.machine(), platform.processor(), *marks])
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return "\n".join([platform.machine(), platform.processor(), f"{cores}", *marks])

@@ -233,7 +233,7 @@ def test_a_stale_cell_is_reported_and_runs_again(toy, gsjax, change):
 
 
 def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
-    drawn = "\ndef figure(rows, path):\n    path.write_text({!r})\n"
+    drawn = "\f\ndef figure(rows, path):\n    path.write_text({!r})\n"
     folder = toy(SCRIPT + drawn.format("one"), figure={"caption": "c"})
     gsjax("run", "toy")
     calls()

@@ -96,7 +96,8 @@ def test_overwriting_clears_the_run_and_nothing_else(finished):
 
 
 def test_unfinished_run_is_replaced_where_it_left_nothing_to_resume(finished):
-    finished.report.unlink()
+    for name in ("report.html", "metrics.json", "trajectory.npz", "scene.ply"):
+        (finished.path / name).unlink()
     finished.resume.mkdir()
     run = RunFolder(finished.path)
     run.write_config(Config())
@@ -112,8 +113,13 @@ def test_unfinished_run_is_resumed_or_replaced_only_when_told(finished):
         FileExistsError, match=r"an unfinished run; go on with it by --resume, or .*--overwrite"
     ):
         RunFolder(finished.path)
+    with pytest.raises(FileExistsError, match=r"an unfinished run; replace it with --overwrite"):
+        RunFolder(finished.path, resume=None)
     RunFolder(finished.path, resume=True)
     assert contents(finished) == before
+    (finished.resume / "state.npz").unlink()
+    with pytest.raises(FileExistsError, match=r"an unfinished run; replace it with --overwrite"):
+        RunFolder(finished.path)  # a stream cannot be followed again
     RunFolder(finished.path, overwrite=True).write_config(Config())
     assert contents(finished) == ["config.yml", "my notes.txt"]
 

@@ -66,6 +66,10 @@ def test_programs_are_kept_where_nothing_else_was_said(tmp_path):
     assert list((tmp_path / "cache").glob("*/*-cache"))
     assert said(tmp_path / "no", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own")).stdout.strip() == "None"
     assert said(tmp_path / "no", JAX_ENABLE_COMPILATION_CACHE="0").stdout.strip() == "None"
+    for mark in (tmp_path / "cache").glob("*/*-atime"):
+        mark.unlink()  # as a kill leaves it, or a full disk
+    said(tmp_path / "cache")
+    assert list((tmp_path / "cache").glob("*/*-atime"))
     (tmp_path / "file").touch()
     assert said(tmp_path / "file").stdout.strip() == "None"
     assert not (tmp_path / "no").exists()

@@ -316,7 +316,8 @@ def test_a_plan_without_a_capacity_keeps_its_options(one_device_mesh):
     draw = gsjax.sharded_rasterization(one_device_mesh, cameras="cameras")
     plan = gsjax.Plan(WIDTH, HEIGHT, 0, near_plane=1.4, render_mode="RGB+ED", tile_size=16)
     options = {"width": WIDTH, "height": HEIGHT, "plan": plan}
-    assert difference(whole(draw(**scene, **options)), gsjax.rasterization(**scene, **options)) <= 1e-4
+    apart = difference(whole(draw(**scene, **options)), gsjax.rasterization(**scene, **options))
+    assert apart <= 5e-5  # which is rounding where nothing is optimised
 
 
 @pytest.mark.usefixtures("as_users_run")

@@ -152,6 +152,7 @@ def fit(
     kinds = any(_counts(view) is not None for view in views), any(view.depth is not None for view in views)
     i = state.step
     while (done := i / config.steps if share is None else share(i)) < 1:
+        begun, compiling = perf_counter(), 0.0
         degree = min(config.sh_degree, i // config.sh_every)
         model, optimizer = enlarged(problem, model, optimizer, degree, 0)
         v, shrink = _turn(config.seed, i, len(views)), _shrink(config, done)
@@ -161,20 +162,17 @@ def fit(
             seen[v, shrink] = _observe(views[v], v, shrink, kinds)
         observed = seen[v, shrink]
         size = (shrink, observed.camera.width, observed.camera.height)
-        begun, compiling = perf_counter(), 0.0
         while True:
             if size not in plans:
                 plans[size] = _plan(problem, model.gaussians, observed.camera, 0).capacity
             plan = _plan(problem, model.gaussians, observed.camera, plans[size])
             batch = Batch(observed, _background(problem, key, i), plan)
             new = (plan, model.gaussians.num)
-            if new not in compiled:  # the first call of a program is not the time of a step
-                started = perf_counter()
             walk = jax.random.fold_in(jax.random.fold_in(key, _WALK), i)
             model, optimizer, info = advance(model, optimizer, batch, done, walk)
             overflow = bool(info["overflow"])
-            if new not in compiled:
-                compiling += perf_counter() - started
+            if new not in compiled:  # planning and the first call of a program are not the time of a step
+                compiling = perf_counter() - begun
                 compiled.add(new)
             if not overflow:
                 break
