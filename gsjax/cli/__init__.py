@@ -59,9 +59,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         known = ", ".join(COMMANDS)
         Console(stderr=True).print(f"[bold red]error:[/] no command {command!r}; there are: {known}")
         return 2
-    from gsjax.cli.messages import run_politely
+    from gsjax.cli.interrupts import heard_interrupts
 
-    return run_politely(command, rest, COMMANDS[command])
+    try:
+        with heard_interrupts():
+            from gsjax.cli.messages import run_politely
+
+            return run_politely(command, rest, COMMANDS[command])
+    except KeyboardInterrupt:
+        Console(stderr=True).print("[bold red]stopped:[/] by Ctrl-C; what is on disk stays")
+        return 130
 
 
 def _print_help() -> None:

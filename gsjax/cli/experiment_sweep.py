@@ -191,7 +191,7 @@ def _without_figure(script: str) -> str:
         figures = [f for f in ast.parse(script).body if isinstance(f, ast.FunctionDef) and f.name == "figure"]
     except SyntaxError:
         return script  # loading it says so
-    lines = script.split("\n")  # as Python counts them: others also split at form feeds
+    lines = script.removesuffix("\n").split("\n")  # as Python counts them: others also split at form feeds
     for f in reversed(figures):
         del lines[f.lineno - 1 : f.end_lineno]
     return "\n".join(lines)

@@ -4,22 +4,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, make_dataclass, replace
 from difflib import get_close_matches
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import numpy as np
 import tyro
 from jaxtyping import Float
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsjax.cli.fit_loop import follow, some_of
 from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_parts import parts
-from gsjax.cli.fit_results import Curve, Plans, judge, living, print_results, write_results
-from gsjax.cli.fit_resume import Saver, load
-from gsjax.cli.interrupts import hear, undisturbed
+from gsjax.cli.fit_results import Curve, Plans, Scores, judge, living, print_results, write_results
+from gsjax.cli.fit_resume import load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
 from gsjax.cli.messages import describe as describe_error
@@ -34,19 +34,14 @@ from gsjax.methods.reconstruction import (
     PRESETS,
     FitConfig,
     Model,
-    Problem,
     View,
     as_found,
     begin,
-    fit,
     light_of,
     needed,
 )
 from gsjax.scene.gaussians import Gaussians, take
 
-_SHOWN_EVERY_S = 0.2
-_LOGGED_EVERY = 100  # steps
-_JUDGED_AT_MOST = 4  # held-out views while the fit goes on; all of them at its end
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
 
 HELP = (
@@ -107,6 +102,9 @@ def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
                 f"expected a dataset, or a preset and a dataset, found {arguments[0]!r} and {arguments[1]!r}"
                 f"; presets are {', '.join(PRESETS)}" + (f": did you mean {meant[0]}?" if meant else "")
             )
+        for before, word in pairwise(arguments):
+            if word in PRESETS and not before.startswith("-"):
+                raise ValueError(f"presets are said first: gsjax fit {word} DATASET --out RUN")
         return Options, arguments
     fitted = ("fit", FitConfig, field(default=PRESETS[arguments[0]]))
     return make_dataclass("Options", [fitted], bases=(Options,), frozen=True), arguments[1:]
@@ -148,32 +146,40 @@ def run(options: Options) -> int:
             notes.add(f"Resumed after {state.step} steps of an earlier run.")
         board = TensorBoard(folder.path, curve.rows) if options.tensorboard else None
         judged = [(photographs.names[i], views[i]) for i in held_out]
-        state, stopped = follow(options, problem, state, curve, judged, folder, console, board)
+        state, stopped = follow(
+            problem,
+            state,
+            curve,
+            judged,
+            folder,
+            console,
+            minutes=options.minutes,
+            until_psnr=options.until_psnr,
+            judge_every=options.judge_every,
+            save_every=options.save_every,
+            board=board,
+        )
+        if isinstance(stopped, KeyboardInterrupt):
+            console.print("stopping: what there is is written; Ctrl-C again leaves out the scores")
         seconds = {"fit": curve.seconds, "compile": curve.compile_seconds}
         gaussians, finished, worth = living(state.gaussians)[0], stopped is None, []
         _say_what_was_odd(options, curve, gaussians, finished, notes)
         found_views = as_found(problem, state.model)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
-        light = None
+        aside = Aside(seconds, console, notes)
+        light, plans, scores = None, Plans(), Scores([])
         if finished:  # who pressed Ctrl-C does not wait for this
-            with _timed(seconds, "pruning", console, "leaving out what no photograph needs"):
+            with aside("pruning", "leaving out what no photograph needs"):
                 gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
         write_ply(folder.scene, gaussians)
-        plans: Plans = {}
-        with _timed(seconds, "scores", console, "scoring held-out photographs"):
+        with aside("scores", "scoring held-out photographs"):
             shown = judged or [(photographs.names[i], views[i]) for i in chosen[:1]]
             scores = judge(problem, gaussians, shown, folder, plans)
+        if finished and judged and light is not None and gaussians.num:
+            with aside("parts", "looking at what each part of the scene is worth"):
+                worth = parts(problem, gaussians, light, some_of(judged), curve, plans)
         if finished:
-            with (
-                _dispensable(notes, "table of what each part bought"),
-                _timed(seconds, "parts", console, "looking at what each part of the scene is worth"),
-            ):
-                if judged and gaussians.num:
-                    worth = parts(problem, gaussians, light, some_of(judged), curve, plans)
-            with (
-                _dispensable(notes, "video"),
-                _timed(seconds, "video", console, "drawing a video of the scene"),
-            ):
+            with aside("video", "drawing a video of the scene"):
                 write_orbit(folder, problem._replace(views=found_views), gaussians)
         found = {
             "kind": "fit",
@@ -185,12 +191,16 @@ def run(options: Options) -> int:
             "skipped": curve.skipped,
             "num_gaussians": gaussians.num,
             "sh_degree": gaussians.sh_degree,
-            "photographs": {"fitted": len(chosen), "held_out": len(held_out)},
+            "photographs": {
+                "fitted": len(chosen),
+                "held_out": len(held_out),
+                "looked_at": len(some_of(judged)),
+            },
             "size": photographs.sizes.max(0),
             "start": problem.start,
             "seconds": seconds | {"total": perf_counter() - begun},
             "machine": describe_machine(),
-            "test": scores.mean() if len(held_out) else None,
+            "test": scores.mean() if judged and scores.rows else None,
             "views": scores.rows,
             "parts": worth,
             "curve": curve.rows,
@@ -221,22 +231,23 @@ def _check(options: Options) -> None:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
 
 
-@contextmanager
-def _timed(seconds: dict[str, float], name: str, console: Console, words: str) -> Iterator[None]:
-    """Say what goes on after the fit, and how long it took."""
-    begun = perf_counter()
-    with stage(console, words):
-        yield
-    seconds[name] = perf_counter() - begun
+class Aside:
+    """What is done with a fit after its last step, and what it can do without: Ctrl-C and errors end it, and
+    the run still has its report."""
 
+    def __init__(self, seconds: dict[str, float], console: Console, notes: Notes):
+        self._seconds, self._console, self._notes = seconds, console, notes
 
-@contextmanager
-def _dispensable(notes: Notes, what: str) -> Iterator[None]:
-    """What a fit that is done can go without: Ctrl-C and errors end it, and the run still has its report."""
-    try:
-        yield
-    except (KeyboardInterrupt, OSError, ValueError) as error:
-        notes.warn(f"there is no {what}: {describe_error(error) if str(error) else 'Ctrl-C'}")
+    @contextmanager
+    def __call__(self, name: str, words: str) -> Iterator[None]:
+        """Say what goes on, and how long it took."""
+        begun = perf_counter()
+        try:
+            with stage(self._console, words):
+                yield
+        except (KeyboardInterrupt, OSError, ValueError) as error:
+            self._notes.warn(f"{words} was left out: {describe_error(error) if str(error) else 'Ctrl-C'}")
+        self._seconds[name] = perf_counter() - begun
 
 
 def _say_what_was_odd(
@@ -280,90 +291,3 @@ def without_needless(
         some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
         notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
     return take(gaussians, kept), light[kept]
-
-
-def some_of(judged: list[tuple[str, View]]) -> list[tuple[str, View]]:
-    """The held-out views that are looked at on the way."""
-    return judged[:: max(1, len(judged) // _JUDGED_AT_MOST)][:_JUDGED_AT_MOST]
-
-
-class Budget:
-    """What share of a fit is done: of its steps, or of its minutes, whichever is more."""
-
-    def __init__(self, steps: int, minutes: float | None, curve: Curve):
-        self._steps, self._curve = steps, curve
-        self._seconds = np.inf if minutes is None else 60 * minutes
-
-    def __call__(self, step: int) -> float:
-        return max(step / self._steps, (self._curve.seconds + self._curve.compile_seconds) / self._seconds)
-
-    def steps(self, step: int) -> int:
-        """About how many there will be, at the pace so far."""
-        return max(step, min(self._steps, round(step / max(self(step), 1e-9))))
-
-
-def follow(
-    options: Options,
-    problem: Problem,
-    state: Any,
-    curve: Curve,
-    judged: list[tuple[str, View]],
-    folder: RunFolder,
-    console: Console,
-    board: TensorBoard | None = None,
-) -> tuple[Any, BaseException | None]:
-    """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
-    state, and what stopped it early."""
-    budget, saver = Budget(options.fit.steps, options.minutes, curve), Saver(folder, options.save_every)
-    some = some_of(judged)
-    columns = (
-        TextColumn("[bold]{task.description}"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[told]}"),
-        TimeRemainingColumn(),
-    )
-    drawn, tenths = 0.0, 0
-    with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
-        task = progress.add_task("fitting", total=options.fit.steps, completed=state.step, told="compiling")
-        try:
-            met = options.until_psnr is not None and curve.has_met(options.until_psnr)
-            steps = iter(()) if met else fit(problem, state, share=budget)
-            while (fitted := undisturbed(next, steps, None)) is not None:
-                state, step = fitted.state, fitted.state.step
-                curve.took(fitted.seconds, fitted.compile_seconds)
-                curve.skipped += bool(fitted.info["skipped"])
-                now = perf_counter()
-                last = budget(step) >= 1
-                if now - drawn > _SHOWN_EVERY_S or last:
-                    told = curve.in_words(fitted, len(judged) > 0)
-                    progress.update(task, completed=step, total=budget.steps(step), told=told)
-                    progress.refresh()
-                    drawn = now
-                look = step % options.judge_every == 0 or last
-                if options.minutes is not None and int(10 * budget(step)) > tenths:
-                    look, tenths = True, int(10 * budget(step))
-                if step % _LOGGED_EVERY == 0 or look:
-                    psnr = (
-                        judge(problem, fitted.state.gaussians, some).mean()["psnr"] if look and some else None
-                    )
-                    curve.add(fitted, psnr, folder)
-                    if look:
-                        told = curve.in_words(fitted, len(judged) > 0)
-                        progress.update(task, told=told)
-                        progress.refresh()
-                        if not console.is_terminal:
-                            console.print(f"step {step:,} of {budget.steps(step):,}: {told}", soft_wrap=True)
-                    if board is not None:
-                        board.add(curve.rows[-1])
-                    if options.until_psnr is not None and curve.has_met(options.until_psnr):
-                        break
-                saver(state, curve, last=False)
-                hear()
-            saver(state, curve, last=True)
-        except (KeyboardInterrupt, Exception) as stopped:
-            if any(leaf.is_deleted() for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array)):
-                raise  # a step that failed took it along: what --resume needs was saved before
-            saver(state, curve, last=True)
-            return state, stopped
-    return state, None

@@ -30,6 +30,21 @@ from gsjax.viz.plots import fit_curve, save
 _SHOWN = 8  # views in the report
 _LEAST_SIDE = 11  # of SSIM's window
 _PANEL_HEIGHT = 240  # pixels, at least, so that captions hide little
+_COLUMNS = (  # key, head, unit and decimals, where views have it
+    ("view", "view", "", None),
+    ("psnr", "PSNR", "dB", 2),
+    ("ssim", "SSIM", "", 3),
+    ("depth_mm", "depth is off by", "mm", 1),
+)
+_TIMES = {
+    "fit": "steps",
+    "compile": "compiling them",
+    "pruning": "leaving out what no photograph needs",
+    "scores": "scoring held-out views",
+    "parts": "looking at what each part is worth",
+    "video": "the video",
+    "total": "in all, with reading and the start",
+}
 PANELS = ("photograph", "rendered", "difference")
 """What a picture of a view shows, from left to right."""
 
@@ -95,10 +110,10 @@ class Curve:
     def in_words(self, fitted: Fitted, judged: bool) -> str:
         """For the progress bar."""
         tested = self.looks()
-        test = f", held out {tested[-1]['test_psnr']:.1f} dB" if judged and tested else ""
+        test = f", {tested[-1]['test_psnr']:.1f} dB" if judged and tested else ""
         count = int(fitted.info["alive"])
-        pace = f", {1 / self._rate:.1f} steps/s" if self._rate else ""
-        return f"loss {float(fitted.info['loss']):.3f}{test}, {count:,} Gaussians{pace}"
+        pace = f", {1 / self._rate:.0f}/s" if self._rate else ""
+        return f"loss {float(fitted.info['loss']):.2f}{test}, {count:,} Gaussians{pace}"
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
@@ -248,11 +263,14 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
         if test["ssim"] is not None:
             cards["SSIM, held out"] = f"{test['ssim']:.3f}"
     cards["Gaussians"] = found["num_gaussians"]
-    cards["Fitted for"] = (f"{_minutes(found):.1f}", "minutes")
-    rows = [[row["view"], row["psnr"], row["ssim"], row["depth_mm"]] for row in found["views"]]
-    times = [[name, value] for name, value in found["seconds"].items()]
-    shown = found["views"][:: max(1, len(found["views"]) // _SHOWN)][:_SHOWN]
     photographs = found["photographs"]
+    cards["Fitted for"] = (f"{_minutes(found):.1f}", "minutes")
+    columns = [c for c in _COLUMNS if c[0] == "view" or any(row[c[0]] is not None for row in found["views"])]
+    keys, heads, units, decimals = zip(*columns, strict=True)
+    rows = [[row[key] for key in keys] for row in found["views"]]
+    times = [[_TIMES[name], value] for name, value in found["seconds"].items()]
+    looked = f"of {photographs['looked_at']} held-out views"
+    shown = found["views"][:: max(1, len(found["views"]) // _SHOWN)][:_SHOWN]
     write_report(
         folder.report,
         title=found["dataset"] + ("" if found["complete"] else " (partial run)"),
@@ -260,17 +278,11 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
         summary=cards,
         strips=[Media(folder.path / row["picture"], row["view"]) for row in shown],
         videos=[Media(folder.video(ORBIT), "About the scene")] if folder.video(ORBIT).exists() else (),
-        plots=[Media(plot, "Held-out PSNR, and the number of Gaussians, over minutes")],
+        plots=[Media(plot, f"PSNR {looked} (blue), and the number of Gaussians (grey), over minutes")],
         tables=[
-            Table(
-                "Views",
-                ("view", "PSNR", "SSIM", "depth"),
-                rows,
-                ("", "dB", "", "mm"),
-                decimals=(None, 2, 3, 1),
-            ),
-            *_tables_of_parts(found["parts"]),
-            Table("Time", ("part", "seconds"), times, ("", "s"), decimals=(None, 1)),
+            Table("Views", heads, rows, units, decimals=decimals),
+            *_tables_of_parts(found["parts"], looked),
+            Table("Time", ("what for", "time"), times, ("", "s"), decimals=(None, 1)),
         ],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
@@ -281,13 +293,13 @@ def _minutes(found: dict[str, Any]) -> float:
     return (found["seconds"]["fit"] + found["seconds"]["compile"]) / 60
 
 
-def _tables_of_parts(parts: list[dict[str, Any]]) -> list[Table]:
+def _tables_of_parts(parts: list[dict[str, Any]], looked: str) -> list[Table]:
     """What each part of the scene is worth, where that was looked at."""
     if not parts:
         return []
     rows = [[row["part"], row["gaussians"], row["sh_degree"], row["psnr"]] for row in parts]
     title = "What each part bought: as it is, and with less of it (not fitted again)"
-    heads, units = ("of the scene", "Gaussians", "SH degree", "PSNR, held out"), ("", "", "", "dB")
+    heads, units = ("of the scene", "Gaussians", "SH degree", f"PSNR {looked}"), ("", "", "", "dB")
     return [Table(title, heads, rows, units, decimals=(None, 0, 0, 2))]
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gsjax.cli.info_picture import by_camera, by_split, write_picture
 from gsjax.cli.messages import Notes
-from gsjax.cli.run_folder import is_run
+from gsjax.cli.run_folder import expect_dataset
 from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.open import is_of_photographs
 from gsjax.methods.reconstruction import extent_of
@@ -45,11 +45,7 @@ def run(options: Options) -> int:
         raise ValueError(
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
-    if is_run(Path(options.dataset)):
-        raise ValueError(
-            f"{options.dataset}: expected a dataset, found the folder of a run; open its report.html or look "
-            f"at it with gsjax view {options.dataset}"
-        )
+    expect_dataset(options.dataset)
     if is_of_photographs(options.dataset):
         return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):

@@ -14,7 +14,6 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from gsjax.cli.interrupts import heard_interrupts
 from gsjax.cli.machine import keep_to_cores
 from gsjax.data.errors import DataWarning
 
@@ -58,11 +57,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         compiler.keep_freed_memory()
         if command not in _COMPILE_ANEW:
             compiler.keep_programs()
-        with heard_interrupts():
-            return chosen.run(options)
-    except KeyboardInterrupt:
-        say_error("stopped by Ctrl-C; what is on disk stays", word="stopped")
-        return 130
+        return chosen.run(options)
     except Exception as error:
         if debug:
             raise

@@ -14,6 +14,7 @@ from rich.progress import track
 
 from gsjax.cli.machine import available_mb
 from gsjax.cli.recording import open_recording, parse_frames
+from gsjax.cli.run_folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
@@ -44,8 +45,10 @@ def choose_photographs(
 
     Raises:
         DataError: the dataset cannot be read.
-        ValueError: none is chosen, a camera is not there, or photographs are asked for by camera.
+        ValueError: none is chosen, a camera is not there, or photographs are asked for by camera; it is the
+            folder of a run.
     """
+    expect_dataset(dataset)
     if is_of_photographs(dataset) or not is_recording(dataset):
         photographs = open_photographs(dataset, read)
         for option, ids in (("--cameras", cameras), ("--eval-cameras", eval_cameras)):

@@ -39,6 +39,15 @@ def expect_run(path: Path, made_by: str = "") -> None:
         )
 
 
+def expect_dataset(path: str) -> None:
+    """Raises ValueError where a run's folder stands in place of a dataset."""
+    if is_run(Path(path)):
+        raise ValueError(
+            f"{path}: expected a dataset, found the folder of a run; open its report.html, or look at it by "
+            f"gsjax view {path}"
+        )
+
+
 class RunFolder:
     """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
 
@@ -81,8 +90,11 @@ class RunFolder:
                 has come to something and both are off.
             FileExistsError: something that is not a run is there; nothing of it is touched.
             NotADirectoryError: `path` is a file.
+            ValueError: both `resume` and `overwrite` are on.
         """
         self.path, self._stale = Path(path), False
+        if resume and overwrite:
+            raise ValueError("--resume and --overwrite: one goes on with a run, the other replaces it")
         if resume and not self.config.is_file():
             raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():

@@ -26,7 +26,7 @@ from gsjax.cli.recording import (
 )
 from gsjax.cli.report import format_number
 from gsjax.cli.resume import Saver, load
-from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.run_folder import RunFolder, expect_dataset
 from gsjax.cli.scoring import (
     Scores,
     budget_metrics,
@@ -102,6 +102,7 @@ def run(options: Options) -> int:
         raise ValueError(f"--budget-ms: expected more than 0, found {options.budget_ms}")
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
+        expect_dataset(options.dataset)
         recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = dataclasses.replace(

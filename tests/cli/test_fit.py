@@ -16,7 +16,7 @@ import yaml
 import gsjax.cli.fit
 import gsjax.cli.photographs
 from gsjax.cli import main
-from gsjax.cli.fit import Budget
+from gsjax.cli.fit_loop import Budget
 from gsjax.cli.fit_parts import parts_of_time
 from gsjax.cli.fit_results import Curve
 from gsjax.data.video import describe_video
@@ -48,7 +48,7 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     run = tmp_path / "run"
     found = json.loads((run / "metrics.json").read_text())
     assert found["complete"]
-    assert found["photographs"] == {"fitted": 6, "held_out": 3}
+    assert found["photographs"] == {"fitted": 6, "held_out": 3, "looked_at": 3}
     assert found["steps"] == 24
     assert found["test"]["psnr"] > 8
     assert -1 < found["test"]["ssim"] < 1
@@ -162,6 +162,9 @@ def test_a_preset_is_named_before_the_dataset_and_what_is_given_counts_more(phot
     assert all(name in said for name in PRESETS)
     assert main(["fit", "clasic", str(photographs), "--out", str(run)]) == 2
     said = " ".join(capfd.readouterr().err.split())
+    assert main(["fit", str(photographs), "quick", "--out", str(run)]) == 2
+    assert main(["fit", "--out", str(run), "quick", str(photographs)]) == 2
+    assert "presets are said first: gsjax fit quick DATASET" in capfd.readouterr().err
     assert "presets are quick, classic, depth, published: did you mean classic?" in said
 
 
@@ -171,23 +174,24 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     said = " ".join(said.split())
     assert "compiling took" in said
     assert "s, of 1 given; programs are kept" in said
-    assert "step 1 of 1: loss" in said
+    assert "of 0.01 min, 1 steps: loss" in said
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert "Colours are of degree 0: a degree is added every 100 steps (--fit.sh-every)." in found["notes"]
 
 
-@pytest.mark.parametrize("what", ["parts", "write_orbit"])
+@pytest.mark.parametrize("what", ["judge", "parts", "write_orbit"])
 def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
     gsjax_fit, tmp_path, monkeypatch, what
 ):
-    def stopped(*args):
+    def stopped(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(gsjax.cli.fit, what, stopped)
     code, said = gsjax_fit(*QUICK, "--fit.steps", "8")
     assert code == 0, said
-    lacks = "video" if what == "write_orbit" else "table of what each part bought"
-    assert f"there is no {lacks}: Ctrl-C" in said
+    lacks = {"parts": "looking at", "write_orbit": "drawing a video", "judge": "scoring"}[what]
+    assert f"warning: {lacks}" in said
+    assert "was left out: Ctrl-C" in " ".join(said.split())
     assert (tmp_path / "run" / "report.html").exists()
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["complete"]
 
@@ -227,11 +231,20 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
     assert (found["complete"], found["steps"]) == (True, 8)
 
 
+def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypatch):
+    """On the way a few are looked at, which may be easy ones."""
+    monkeypatch.setattr(Curve, "has_met", lambda self, goal: True)
+    code, said = gsjax_fit(*QUICK, "--until-psnr", "90")
+    assert code == 0, said
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 24
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
         (("--scale", "0"), "--scale: expected above 0"),
         (("--scale", "0.1"), "--scale 0.1: a photograph of 48x36 would be 5x4; expected 8 pixels"),
+        (("--resume", "--overwrite"), "--resume and --overwrite: one goes on with a run"),
         (("--test-every", "1"), "--test-every: expected 0"),
         (("--minutes", "-1"), "--minutes: expected more than 0"),
         (("--until-psnr", "20", "--test-every", "0"), "--until-psnr: nothing is held out"),

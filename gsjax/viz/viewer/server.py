@@ -170,7 +170,7 @@ def free_port(host: str, port: int | None) -> int:
             return probe.getsockname()[1]
     where = f"{asked[0]}" if len(asked) == 1 else f"{asked[0]} to {asked[-1]}"
     raise OSError(
-        f"port {where}: cannot listen there on {host} ({refused.strerror}); name another one"
+        f"port {where}: cannot listen there on {host} ({refused.strerror}); name another, or none"
     ) from refused
 
 
