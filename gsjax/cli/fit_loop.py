@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.fit_results import Curve, Plans, judge
 from gsjax.cli.fit_resume import Saver
@@ -55,7 +55,6 @@ class _Display:
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=None),
             TextColumn("{task.fields[told]}"),
-            TaskProgressColumn(),
             TimeRemainingColumn(compact=True),
         )
         self._bar = Progress(*columns, console=console, expand=True, auto_refresh=False)
