@@ -7,7 +7,7 @@ ims/CAM/FRAME.jpg      named by fn
 seg/CAM/FRAME.png      labels, optional, possibly for some cameras only
 depth/CAM/FRAME.png    uint16 in steps of depth_unit_m, 0 and 65535 = invalid, optional
 truth.npz, meta.json   simulated scenes: T_wo [T,K,4,4] with meta's objects (labels 2.., robot 1), or
-                       T_wp [T,K,4,4] with meta's parts (labels 1..)
+                       T_wp [T,K,4,4] with meta's parts (labels 1..) and joints, whose values are q [T,joints]
 """
 
 import re
@@ -20,12 +20,15 @@ import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
+from gsjax.data.joints import Joint
 from gsjax.data.sequence import Sequence, Truth
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 DEFAULT_RATE_HZ = 30.0
 DEFAULT_DEPTH_UNIT_M = 0.001
+_JOINTS = {"slide": "prismatic", "hinge": "revolute"}
+_JOINT_KEYS = ("axis_world", "point_world")
 META_NAMES = ("train_meta.json", "test_meta.json")
 _ADVICE_META = "Correct the file, or leave that frame or camera out of it."
 
@@ -251,8 +254,31 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
                 expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
                 raise DataError(path, expected, f"{poses.shape}", "Make the truth again.")
             labels = np.arange(first_label, first_label + len(names))
-            return Truth(names=names, label_ids=labels, poses=poses[present], robot=robot)
+            joints = _read_joints(path, described.get("joints", {}), arrays.get("q"), names, frames)
+            truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
+            return truth.select(present)
     return None
+
+
+def _read_joints(
+    path: Path, described: Any, values: np.ndarray | None, names: tuple[str, ...], frames: int
+) -> tuple[Joint | None, ...]:
+    """Of each part: meta.json names those that there are, and q has a column for each."""
+    if not described or values is None:
+        return ()
+    if values.shape != (frames, len(described)):
+        expected = f"q of shape {(frames, len(described))}: frames, joints of meta.json"
+        raise DataError(path, expected, f"{values.shape}", "Make the truth again.")
+    columns = dict(zip(described, np.asarray(values, np.float64).T, strict=True))
+    try:
+        joints = {
+            name: Joint(_JOINTS[how["type"]], *(np.array(how[k], float) for k in _JOINT_KEYS), columns[name])
+            for name, how in described.items()
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        expected = "joints with type (slide or hinge), axis_world and point_world"
+        raise DataError(path.parent / "meta.json", expected, f"{error}", "Make the truth again.") from None
+    return tuple(joints.get(name) for name in names)
 
 
 def _image_path(root: Path, name: str) -> Path:

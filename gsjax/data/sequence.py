@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.joints import Joint
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import Camera
 from gsjax.scene.frame import Frame
@@ -28,6 +29,7 @@ class Truth:
         label_ids: the mask value of each object, [K].
         poses: object-to-world transforms, [T,K,4,4] float64.
         robot: the mask value of the robot, or None where there is none.
+        joints: one for each object, None for one that moves freely; empty where that is not known.
 
     Raises:
         ValueError: shapes disagree, or a pose is not a rigid motion.
@@ -37,12 +39,24 @@ class Truth:
     label_ids: Int[np.ndarray, "..."]
     poses: Float[np.ndarray, "..."]
     robot: int | None = None
+    joints: tuple[Joint | None, ...] = ()
 
     def __post_init__(self):
         check_shape("label_ids", self.label_ids, (len(self.names),))
+        if self.joints:
+            check_shape("joints", np.zeros(len(self.joints)), (len(self.names),))
+        for name, joint in zip(self.names, self.joints, strict=False):
+            if joint is not None:
+                check_shape(f"values of the joint of {name}", joint.values, (len(self.poses),))
         check_shape("poses", self.poses, (len(self.poses), len(self.names), 4, 4))
         advice = "Object poses are object-to-world transforms."
         check_poses("pose", self.poses, lambda t, k: f"object {self.names[k]} in frame {t}", advice)
+
+    def select(self, frames: Indices[int]) -> "Truth":
+        """That of some frames."""
+        chosen = list(frames)
+        joints = tuple(j and replace(j, values=j.values[chosen]) for j in self.joints)
+        return replace(self, poses=self.poses[chosen], joints=joints)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +294,7 @@ class Sequence:
             raise ValueError(f"{self.name} has no camera {unknown[0]}; it has {list(self.camera_ids)}.")
         ts, cs = [int(t) for t in chosen], [self.camera_ids.index(c) for c in ids]
         load_flow, locate = self.load_flow, self.locate
-        truth = self.truth and replace(self.truth, poses=self.truth.poses[ts])
+        truth = self.truth and self.truth.select(ts)
         return replace(
             self,
             camera_ids=ids,

@@ -60,7 +60,7 @@ def test_missing_dataset(refused, tmp_path):
 
 
 def test_unknown_built_in_scene(refused):
-    assert "no built-in scene 'kitchen'; there are: tabletop" in refused("simulated:kitchen")
+    assert "no built-in scene 'kitchen'; there are: tabletop, articulated" in refused("simulated:kitchen")
 
 
 def test_folder_of_several_sequences(refused, tmp_path):

@@ -21,7 +21,7 @@ def fitted(photographs, tmp_path_factory):
     run = tmp_path_factory.mktemp("fitted") / "run"
     options = ("--fit.cap", "120", "--fit.start.count", "100", "--test-every", "4")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gsjax.cli.fit, "follow", lambda options, problem, state, *_: (state, None))
+        patch.setattr(gsjax.cli.fit, "follow", lambda problem, state, *_, **how: (state, None))
         assert main(["fit", str(photographs), "--out", str(run), *options]) == 0
     return run
 

@@ -20,7 +20,7 @@ def test_built_in_scenes_take_arguments():
 @pytest.mark.parametrize(
     ("path", "says"),
     [
-        ("simulated:kitchen", "no built-in scene 'kitchen'; there are: tabletop"),
+        ("simulated:kitchen", "no built-in scene 'kitchen'; there are: tabletop, articulated"),
         ("simulated:tabletop?sed=3", "no argument 'sed'; it has: seed, frames"),
         ("simulated:tabletop?seed=x", "seed must be an integer, got 'x'"),
         ("simulated:tabletop?seed=", "seed must be an integer, got ''"),

@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.data.joints import Joint
 from gsjax.data.sequence import Sequence, Truth
 from gsjax.data.simulated.raycaster import (
     Scene,
@@ -25,6 +26,7 @@ def simulated_sequence(
     times: Float[np.ndarray, "frames"],
     objects: dict[str, int],
     robot: int | None = None,
+    joints: tuple[Joint | None, ...] = (),
 ) -> Sequence:
     """The sequence of a scene. Frames are rendered when asked for; the last few are kept.
 
@@ -34,12 +36,17 @@ def simulated_sequence(
         times: seconds, increasing.
         objects: the body of each object whose pose is reported as truth.
         robot: the mask value of the robot.
+        joints: of each object, as `Truth` has them.
     """
     color = lru_cache(CACHED_IMAGES)(lambda t, c: render_color(scene, t, c))
     hits = lru_cache(CACHED_IMAGES)(lambda t, c: trace(scene, t, c))
     bodies = list(objects.values())
     truth = Truth(
-        names=tuple(objects), label_ids=scene.labels[bodies], poses=scene.poses[:, bodies], robot=robot
+        names=tuple(objects),
+        label_ids=scene.labels[bodies],
+        poses=scene.poses[:, bodies],
+        robot=robot,
+        joints=joints,
     )
     return Sequence(
         name=name,

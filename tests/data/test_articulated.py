@@ -1,0 +1,174 @@
+"""Furniture that opens, and what its joints say of it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsjax.data import DataError, Truth, open_sequence, read_panoptic, write_panoptic
+from gsjax.data.joints import Joint
+from gsjax.data.simulated import articulated, tabletop
+from gsjax.io.atomic import write_json, write_npz
+
+NAMES = ("drawer", "door", "lid", "box", "shut door")
+seeds = st.integers(0, 10_000)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return articulated(width=160, height=120)
+
+
+@given(seeds)
+def test_motions_keep_the_axis_and_go_as_far_as_the_values_say(seed):
+    rng = np.random.default_rng(seed)
+    axis, point, values = (
+        Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]),
+        rng.normal(size=3),
+        rng.normal(size=4),
+    )
+    on_axis = np.append(point + 0.7 * axis, 1.0)
+    turned, slid = (Joint(kind, axis, point, values).motions() for kind in ("revolute", "prismatic"))
+    np.testing.assert_allclose(turned @ on_axis, np.tile(on_axis, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(turned[:, :3, :3]).as_rotvec(), values[:, None] * axis, atol=1e-9
+    )
+    np.testing.assert_allclose(slid[:, :3, 3], values[:, None] * axis, atol=1e-12)
+    np.testing.assert_array_equal(slid[:, :3, :3], np.broadcast_to(np.eye(3), (4, 3, 3)))
+
+
+def test_joints_that_are_none():
+    x, nothing, values = np.array([1.0, 0.0, 0.0]), np.zeros(3), np.zeros(2)
+    with pytest.raises(ValueError, match="kind: expected prismatic or revolute, found 'ball'"):
+        Joint("ball", x, nothing, values)
+    with pytest.raises(ValueError, match="axis: expected a direction of length 1, found length 2"):
+        Joint("revolute", 2 * x, nothing, values)
+    poses = np.tile(np.eye(4), (3, 1, 1, 1))
+    with pytest.raises(ValueError, match="values of the joint of lid"):
+        Truth(("lid",), np.array([1]), poses, joints=(Joint("revolute", x, nothing, values),))
+    with pytest.raises(ValueError, match="joints"):
+        Truth(("lid",), np.array([1]), poses, joints=(None, None))
+
+
+@pytest.mark.parametrize("seed", [0, 3, 11])
+def test_parts_move_as_their_joints_say(seed):
+    truth = articulated(seed, width=8, height=6, cameras=1).truth
+    assert truth.names == NAMES
+    for k, joint in enumerate(truth.joints):
+        if joint is not None:
+            assert joint.values[0] == 0.0
+            np.testing.assert_allclose(joint.motions() @ truth.poses[0, k], truth.poses[:, k], atol=1e-12)
+    drawer, door, lid, box, shut = truth.joints
+    assert box is None
+    assert (drawer.kind, door.kind, lid.kind) == ("prismatic", "revolute", "revolute")
+    assert drawer.values[-1] >= 0.16
+    assert np.rad2deg([door.values[-1], lid.values[-1]]).min() >= 55
+    assert not shut.values.any()
+    assert lid.motions()[-1, 2, 0] > 0  # its front, which is at +x, goes up
+
+
+@given(seeds)
+def test_not_all_begin_at_once_and_steps_are_small(seed):
+    truth = articulated(seed, width=8, height=6, cameras=1).truth
+    moves = np.linalg.norm(np.diff(truth.poses, axis=0), axis=(2, 3))  # [T-1, parts]
+    begins = [int(np.argmax(moves[:, k] > 1e-6)) for k in range(4)]
+    assert sorted(begins) == [0, 4, 9, 16]
+    assert not moves[:, 4].any()
+    assert not moves[36:].any()
+    steps = Rotation.from_matrix(
+        (truth.poses[1:, :, :3, :3] @ truth.poses[:-1, :, :3, :3].swapaxes(2, 3)).reshape(-1, 3, 3)
+    )
+    assert np.rad2deg(steps.magnitude()).max() < 11
+    assert np.linalg.norm(np.diff(truth.poses[..., :3, 3], axis=0), axis=-1).max() < 0.04
+
+
+@pytest.mark.parametrize("t", [0, 39])
+def test_depth_labels_and_poses_agree(scene, t):
+    """What a part shows, taken back to its own frame, lies within its own size."""
+    seen = set()
+    for c in range(0, scene.num_cameras, 3):
+        camera, mask, depth = scene.camera(t, c), scene.mask(t, c), scene.depth(t, c)
+        y, x = np.nonzero(mask > 0)
+        rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(np.asarray(camera.K)).T
+        points = np.concatenate([rays * depth[y, x, None], np.ones((len(x), 1))], 1)
+        world = points @ np.linalg.inv(np.asarray(camera.viewmat, np.float64)).T
+        for k in range(len(NAMES)):
+            mine = mask[y, x] == scene.truth.label_ids[k]
+            local = world[mine] @ np.linalg.inv(scene.truth.poses[t, k]).T
+            if mine.any():
+                seen.add(NAMES[k])
+                assert np.abs(local[:, :3]).max() < 0.27
+        assert {6, 7} & set(np.unique(mask))
+    assert seen == set(NAMES)
+
+
+def test_parts_are_where_their_furniture_is(scene):
+    """Nothing that opens passes through another thing, so no camera sees less of the floor than there is."""
+    truth = scene.truth
+    box, chest_side = truth.poses[:, 3, :3, 3], 0.36 - 0.18
+    assert (box[:, 0] > 0.16 + 0.05).all()  # before the furniture
+    assert (np.abs(truth.poses[0, :3, 1, 3] - [-0.22, -0.09, 0.36]) < 1e-9).all()
+    assert chest_side > truth.poses[0, 1, 1, 3] + 0.13  # the door's hinge stays beside the chest
+
+
+def test_a_selection_keeps_its_joints():
+    some = articulated(width=8, height=6, cameras=1).select(slice(10, 30, 5))
+    assert [joint and len(joint.values) for joint in some.truth.joints] == [4, 4, 4, None, 4]
+
+
+def test_fewer_frames_are_the_beginning_and_still_is_still():
+    long, short = articulated(2, width=32, height=24), articulated(2, frames=8, width=32, height=24)
+    np.testing.assert_array_equal(short.truth.poses, long.truth.poses[:8])
+    np.testing.assert_array_equal(short.image(7, 3), long.image(7, 3))
+    still = articulated(frames=3, width=16, height=12, still=True)
+    np.testing.assert_array_equal(still.truth.poses[2], still.truth.poses[0])
+
+
+def test_it_is_opened_by_name():
+    sequence = open_sequence("simulated:articulated?seed=1&frames=2&width=16&height=12&cameras=4")
+    assert (sequence.num_frames, sequence.num_cameras) == (2, 4)
+    with pytest.raises(ValueError, match="cameras must be at least 1, got 0"):
+        articulated(cameras=0)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A Panoptic folder whose truth is of parts with a joint."""
+    frames, recording = 4, tmp_path / "door"
+    write_panoptic(tabletop(frames=frames, width=16, height=12, cameras=1), recording)
+    how = {"type": "hinge", "axis_world": [0.0, 0.0, 1.0], "point_world": [1.0, 0.0, 0.0]}
+    write_json(recording / "meta.json", {"parts": ["door", "box"], "joints": {"door": how}})
+    poses = np.tile(np.eye(4), (frames, 2, 1, 1))
+    write_npz(recording / "truth.npz", {"T_wp": poses, "q": 0.1 * np.arange(frames)[:, None]})
+    return recording
+
+
+def test_joints_are_read(saved):
+    door, box = read_panoptic(saved).truth.joints
+    assert box is None
+    assert door.kind == "revolute"
+    np.testing.assert_allclose(door.values, 0.1 * np.arange(len(door.values)))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"type": "ball"}, "joints with type (slide or hinge), axis_world and point_world"),
+        ({"axis_world": [0.0, 0.0, 3.0]}, "length 3"),
+        ({"point_world": "here"}, "joints with type"),
+    ],
+)
+def test_joints_that_cannot_be_read(saved, change, says):
+    how = {"type": "hinge", "axis_world": [0.0, 0.0, 1.0], "point_world": [1.0, 0.0, 0.0]} | change
+    write_json(saved / "meta.json", {"parts": ["door", "box"], "joints": {"door": how}})
+    with pytest.raises(DataError) as caught:
+        read_panoptic(saved)
+    assert says in str(caught.value)
+    assert "meta.json" in str(caught.value)
+
+
+def test_values_of_another_length(saved):
+    write_npz(saved / "truth.npz", {"T_wp": np.tile(np.eye(4), (4, 2, 1, 1)), "q": np.zeros((4, 3))})
+    with pytest.raises(DataError, match=r"q of shape \(4, 1\)"):
+        read_panoptic(saved)
