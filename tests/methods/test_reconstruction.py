@@ -82,7 +82,9 @@ def psnr(gaussians, view: View) -> float:
     return -10 * np.log10(np.mean((picture(gaussians, view) - view.image / 255) ** 2))
 
 
-@pytest.mark.parametrize(("source", "steps"), [("depth", 60), ("random", 400)])
+@pytest.mark.parametrize(
+    ("source", "steps"), [pytest.param("depth", 60, marks=pytest.mark.slow), ("random", 400)]
+)
 def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps):
     config = replace(QUICK, steps=steps, start=replace(QUICK.start, source=source))
     problem, state = begin(views[1:], config)
@@ -130,6 +132,7 @@ def test_a_resumed_fit_is_equal_to_the_bit(views, config):
     jax.tree.map(np.testing.assert_array_equal, copied(again.state), copied(fitted.state))
 
 
+@pytest.mark.slow
 def test_splitting_takes_more_slots_as_it_needs_them_up_to_the_cap(views):
     problem, state = begin(without_depth(views), SPLITTING)
     slots = [state.gaussians.num] + [fitted.state.gaussians.num for fitted in fit(problem, state)]

@@ -107,6 +107,7 @@ def test_the_plane_may_lie_any_way_in_the_world(frame):
     assert distance < 12e-3
 
 
+@pytest.mark.slow
 def test_a_scene_from_shapes_is_posed_coloured_and_labelled(frame):
     shapes = [ground(), block(plane=np.array([0, 0, 1.0, 0.0]))]
     assert all(isinstance(shape, Shape) for shape in shapes)

@@ -27,9 +27,33 @@ from gsjax.scene.gaussians import take
 
 
 @pytest.fixture(scope="module")
-def tracked(table, started, quick):
+def quick(quick):
+    return replace(quick, headroom=1.51)  # not one that another module has compiled
+
+
+@pytest.fixture(scope="module")
+def traced(table, started, quick):
+    """The updates of a short recording, and how often one was traced for them."""
     _, frames, _ = table()
-    return list(track(started, frames[0], frames[1:], quick))
+    traces = []
+
+    def counted(*arguments):
+        step = object_tracker(*arguments)
+
+        def update(*args, **kwargs):
+            traces.append(1)
+            return step.update(*args, **kwargs)
+
+        return Step(step.init, update)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracking, "object_tracker", counted)
+        return list(track(started, frames[0], frames[1:], quick)), len(traces)
+
+
+@pytest.fixture(scope="module")
+def tracked(traced):
+    return traced[0]
 
 
 def test_objects_are_followed(table, started, tracked, centroid_errors):
@@ -59,6 +83,7 @@ def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_error
         assert errors[name] < 0.25 * moved[name], (name, errors, moved)
 
 
+@pytest.mark.slow
 def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, quick, centroid_errors):
     sequence, frames, _ = table()
     config = replace(
@@ -172,23 +197,10 @@ def test_an_overflow_changes_nothing_and_track_plans_again(table, started, track
     np.testing.assert_allclose(result.pose.means[own], tracked[0].pose.means[own], atol=2e-3)
 
 
-def test_an_update_is_traced_once(table, started, quick, monkeypatch):
-    _, frames, _ = table()
-    traces = []
-
-    def counted(*arguments):
-        step = object_tracker(*arguments)
-
-        def update(*args, **kwargs):
-            traces.append(1)
-            return step.update(*args, **kwargs)
-
-        return Step(step.init, update)
-
-    monkeypatch.setattr(tracking, "object_tracker", counted)
-    config = replace(quick, headroom=1.51)  # not one that another test has compiled
-    assert len(list(track(started, frames[0], frames[1:], config))) == 3
-    assert len(traces) == 1
+def test_an_update_is_traced_once(traced):
+    updates, traces = traced
+    assert len(updates) == 3
+    assert traces == 1
 
 
 @pytest.mark.parametrize("what", ["images", "depths"])

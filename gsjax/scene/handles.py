@@ -1,0 +1,142 @@
+"""Handles: a few rigid motions that move many Gaussians, each by its own weights (linear blend skinning).
+
+A handle p has a place c_p in the canonical scene, a rotation R_p about it and a translation T_p. A Gaussian
+with weights w moves as MotionSplicer has it (papers/001, section 3.3):
+
+    mean' = sum_p w_p (R_p (mean - c_p) + c_p + T_p)
+
+Its printed orientation, quat(sum_p w_p R_p^T R(q)), turns the wrong way, and a sum of rotations is none; what
+blends them instead is chosen by `Blend`.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from gsjax.geometry.rotations import MIN_SQUARED_NORM, multiply_quats, normalize_quats, quats_to_matrices
+from gsjax.scene.gaussians import Gaussians
+
+Blend = Literal["quaternion", "polar", "dual"]
+"""How rotations are blended: the normalised sum of quaternions, signs aligned with that of the largest
+weight; the rotation nearest to the sum of matrices; or dual quaternions (Kavan et al. 2008), which move the
+means too, along screws instead of straight lines, so that what twists keeps its volume."""
+_POLAR_ITERATIONS = 8  # doubles the digits each time, from errors below 1
+
+
+class HandlePose(eqx.Module):
+    """Where P handles are.
+
+    Attributes:
+        quats: rotations about the handles' own places, [w, x, y, z] of any non-zero length.
+        translations: metres.
+    """
+
+    quats: Float[Array, "P 4"]
+    translations: Float[Array, "P 3"]
+
+
+def at_rest(num: int) -> HandlePose:
+    """The pose of `num` handles that have not moved."""
+    return HandlePose(jnp.zeros((num, 4)).at[:, 0].set(1.0), jnp.zeros((num, 3)))
+
+
+def skin(
+    gaussians: Gaussians,
+    weights: Float[Array, "N P"],
+    centers: Float[Array, "P 3"],
+    pose: HandlePose,
+    blend: Blend = "quaternion",
+) -> Gaussians:
+    """The Gaussians where their handles have moved them; all but means and quats is as it was.
+
+    Args:
+        gaussians: the canonical scene.
+        weights: of each Gaussian; they sum to 1.
+        centers: places of the handles in the canonical scene, metres.
+        pose: where they are.
+        blend: of rotations.
+    """
+    if blend == "dual":
+        turns, means = _dual(gaussians.means, weights, centers, pose)
+    else:
+        turns = blend_quats(weights, pose.quats) if blend == "quaternion" else _polar(weights, pose.quats)
+        means = skin_means(gaussians.means, weights, centers, pose)
+    quats = multiply_quats(turns, normalize_quats(gaussians.quats))
+    return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (means, quats))
+
+
+def skin_means(
+    means: Float[Array, "N 3"],
+    weights: Float[Array, "N P"],
+    centers: Float[Array, "P 3"],
+    pose: HandlePose,
+) -> Float[Array, "N 3"]:
+    """Where linear blend skinning takes points: two products of matrices, nothing of size N x P x 3."""
+    rotations = quats_to_matrices(pose.quats)
+    offsets = centers + pose.translations - jnp.einsum("pij,pj->pi", rotations, centers)
+    blended = jnp.einsum("np,pij->nij", weights, rotations)
+    return jnp.einsum("nij,nj->ni", blended, means) + weights @ offsets
+
+
+def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
+    """Unit quaternions of the blended rotations. The sign of a quaternion means nothing, so each is aligned
+    with that of the largest weight; where the sum vanishes all the same, the latter stands alone."""
+    signed, leading = _aligned(weights, normalize_quats(quats))
+    total = jnp.einsum("np,npi->ni", weights, signed)
+    vanishes = jnp.sum(total * total, axis=-1, keepdims=True) < MIN_SQUARED_NORM
+    return normalize_quats(jnp.where(vanishes, leading, total))
+
+
+def _aligned(
+    weights: Float[Array, "N P"], quats: Float[Array, "P 4"]
+) -> tuple[Float[Array, "N P 4"], Float[Array, "N 4"]]:
+    """The quaternions on the half sphere of that of the largest weight, and the latter."""
+    leading = quats[jnp.argmax(weights, axis=-1)]
+    signs = jnp.where(leading @ quats.T < 0, -1.0, 1.0).astype(quats.dtype)
+    return signs[..., None] * quats, leading
+
+
+def _polar(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
+    """Of the rotations nearest to the blended matrices, by Newton's iteration X <- (X + X^-T) / 2 (Higham
+    1986). Where handles are so far apart that the blended matrix is no longer near any, that of the largest
+    weight stands alone."""
+    rotations = quats_to_matrices(quats)
+    blended = jnp.einsum("np,pij->nij", weights, rotations)
+    lost = (jnp.linalg.det(blended) < 1e-3)[:, None, None]
+    nearest = jnp.where(lost, rotations[jnp.argmax(weights, axis=-1)], blended)
+    for _ in range(_POLAR_ITERATIONS):
+        nearest = (nearest + jnp.swapaxes(_inverse(nearest), -1, -2)) / 2
+    return jax.vmap(lambda matrix: jaxlie.SO3.from_matrix(matrix).wxyz)(nearest)
+
+
+def _inverse(matrices: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
+    """By cofactors: a solver would cost more than all the rest."""
+    a, b, c = jnp.moveaxis(matrices, -2, 0)
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
+    return rows / jnp.sum(a * jnp.cross(b, c), axis=-1)[:, None, None]
+
+
+def _dual(
+    means: Float[Array, "N 3"],
+    weights: Float[Array, "N P"],
+    centers: Float[Array, "P 3"],
+    pose: HandlePose,
+) -> tuple[Float[Array, "N 4"], Float[Array, "N 3"]]:
+    """The turns and the places that blended dual quaternions give."""
+    real = normalize_quats(pose.quats)
+    offsets = centers + pose.translations - jnp.einsum("pij,pj->pi", quats_to_matrices(real), centers)
+    dual = multiply_quats(jnp.pad(offsets, ((0, 0), (1, 0))), real) / 2
+    signed, leading = _aligned(weights, real)
+    signs = jnp.sum(signed * real, axis=-1, keepdims=True)
+    turn, shift = (jnp.einsum("np,npi->ni", weights, part) for part in (signed, signs * dual))
+    squared = jnp.sum(turn * turn, axis=-1, keepdims=True)
+    vanishes = squared < MIN_SQUARED_NORM
+    length = jnp.sqrt(jnp.where(vanishes, 1.0, squared))
+    turn = jnp.where(vanishes, leading, turn / length)
+    shift = jnp.where(vanishes, dual[jnp.argmax(weights, axis=-1)], shift / length)
+    moved = 2 * multiply_quats(shift, turn * jnp.array([1.0, -1.0, -1.0, -1.0], turn.dtype))[:, 1:]
+    return turn, jnp.einsum("nij,nj->ni", quats_to_matrices(turn), means) + moved
