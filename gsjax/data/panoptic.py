@@ -20,9 +20,9 @@ import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
-from gsjax.data.joints import Joint
 from gsjax.data.sequence import Sequence, Truth
 from gsjax.data.validation import check_intrinsics, check_poses
+from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 DEFAULT_RATE_HZ = 30.0

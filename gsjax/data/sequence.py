@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from gsjax.data.errors import DataError, DataWarning
-from gsjax.data.joints import Joint
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import Camera
+from gsjax.geometry.joints import Joint
 from gsjax.scene.frame import Frame
 
 # Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsjax.data import DataError, Truth, open_sequence, read_panoptic, write_panoptic
-from gsjax.data.joints import Joint
 from gsjax.data.simulated import articulated, tabletop
+from gsjax.geometry.joints import Joint, fit_joint
 from gsjax.io.atomic import write_json, write_npz
 
 NAMES = ("drawer", "door", "lid", "box", "shut door")
@@ -20,33 +20,10 @@ def scene():
     return articulated(width=160, height=120)
 
 
-@given(seeds)
-def test_motions_keep_the_axis_and_go_as_far_as_the_values_say(seed):
-    rng = np.random.default_rng(seed)
-    axis, point, values = (
-        Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]),
-        rng.normal(size=3),
-        rng.normal(size=4),
-    )
-    on_axis = np.append(point + 0.7 * axis, 1.0)
-    turned, slid = (Joint(kind, axis, point, values).motions() for kind in ("revolute", "prismatic"))
-    np.testing.assert_allclose(turned @ on_axis, np.tile(on_axis, (4, 1)), atol=1e-12)
-    np.testing.assert_allclose(
-        Rotation.from_matrix(turned[:, :3, :3]).as_rotvec(), values[:, None] * axis, atol=1e-9
-    )
-    np.testing.assert_allclose(slid[:, :3, 3], values[:, None] * axis, atol=1e-12)
-    np.testing.assert_array_equal(slid[:, :3, :3], np.broadcast_to(np.eye(3), (4, 3, 3)))
-
-
-def test_joints_that_are_none():
-    x, nothing, values = np.array([1.0, 0.0, 0.0]), np.zeros(3), np.zeros(2)
-    with pytest.raises(ValueError, match="kind: expected prismatic or revolute, found 'ball'"):
-        Joint("ball", x, nothing, values)
-    with pytest.raises(ValueError, match="axis: expected a direction of length 1, found length 2"):
-        Joint("revolute", 2 * x, nothing, values)
-    poses = np.tile(np.eye(4), (3, 1, 1, 1))
+def test_joints_that_do_not_fit_their_objects():
+    poses, joint = np.tile(np.eye(4), (3, 1, 1, 1)), Joint("revolute", np.eye(3)[0], np.zeros(3), np.zeros(2))
     with pytest.raises(ValueError, match="values of the joint of lid"):
-        Truth(("lid",), np.array([1]), poses, joints=(Joint("revolute", x, nothing, values),))
+        Truth(("lid",), np.array([1]), poses, joints=(joint,))
     with pytest.raises(ValueError, match="joints"):
         Truth(("lid",), np.array([1]), poses, joints=(None, None))
 
@@ -110,6 +87,24 @@ def test_parts_are_where_their_furniture_is(scene):
     assert (box[:, 0] > 0.16 + 0.05).all()  # before the furniture
     assert (np.abs(truth.poses[0, :3, 1, 3] - [-0.22, -0.09, 0.36]) < 1e-9).all()
     assert chest_side > truth.poses[0, 1, 1, 3] + 0.13  # the door's hinge stays beside the chest
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_joints_are_found_in_the_motions(seed):
+    truth = articulated(seed, width=8, height=6, cameras=1).truth
+    rng = np.random.default_rng(seed)
+    for k, joint in enumerate(truth.joints):
+        motions = truth.poses[:, k] @ np.linalg.inv(truth.poses[0, k])
+        points = truth.poses[0, k, :3, 3] + rng.uniform(-0.1, 0.1, (20, 3))
+        found = fit_joint(motions, points)
+        if joint is None or not joint.values.any():
+            assert found.kind == ("free" if joint is None else "fixed")
+            assert found.joint is None
+        else:
+            assert found.kind == joint.kind
+            assert found.joint.axis @ joint.axis > 1 - 1e-9
+            np.testing.assert_allclose(found.joint.values, joint.values, atol=1e-9)
+            assert found.confidence > 0.99
 
 
 def test_a_selection_keeps_its_joints():

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.joints import Joint
 from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.motion import coast, minimum_jerk, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
@@ -13,6 +12,7 @@ from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.simulation import simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.geometry.joints import Joint
 
 RATE_HZ = 15.0
 PARTS = ("drawer", "door", "lid", "box", "shut door")

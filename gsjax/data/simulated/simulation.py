@@ -5,7 +5,6 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.joints import Joint
 from gsjax.data.sequence import Sequence, Truth
 from gsjax.data.simulated.raycaster import (
     Scene,
@@ -15,6 +14,7 @@ from gsjax.data.simulated.raycaster import (
     render_labels,
     trace,
 )
+from gsjax.geometry.joints import Joint
 
 CACHED_IMAGES = 16
 """Rendered images, and traced views, that a simulated sequence keeps."""

@@ -1,0 +1,132 @@
+"""Joints as motions, and found again in motions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsjax.geometry.joints import KINDS, Joint, fit_joint
+
+seeds = st.integers(0, 10_000)
+kinds = st.sampled_from(KINDS)
+
+
+def made_up(kind, seed, frames=12):
+    """A joint that opens by half a metre or a radian and a half, and points of a part beside it."""
+    rng = np.random.default_rng(seed)
+    axis = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0])
+    values = np.cumsum(rng.uniform(0.0, 0.25, frames)) * (0.3 if kind == "prismatic" else 1.0)
+    joint = Joint(kind, axis, rng.normal(size=3), values)
+    return joint, joint.point + rng.uniform(-0.2, 0.2, (30, 3))
+
+
+def shaken(motions, points, noise, seed):
+    """Each frame turned and shifted a little, about the part: `noise` metres and as much of a radian."""
+    rng, middle = np.random.default_rng(seed), points.mean(0)
+    turns = Rotation.from_rotvec(noise * rng.normal(size=(len(motions), 3))).as_matrix()
+    steps = np.broadcast_to(np.eye(4), (len(motions), 4, 4)).copy()
+    steps[:, :3, :3] = turns
+    steps[:, :3, 3] = middle - turns @ middle + noise * rng.normal(size=(len(motions), 3))
+    return motions @ steps
+
+
+@given(seeds)
+def test_motions_keep_the_axis_and_go_as_far_as_the_values_say(seed):
+    rng = np.random.default_rng(seed)
+    axis, point, values = (
+        Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]),
+        rng.normal(size=3),
+        rng.normal(size=4),
+    )
+    on_axis = np.append(point + 0.7 * axis, 1.0)
+    turned, slid = (Joint(kind, axis, point, values).motions() for kind in ("revolute", "prismatic"))
+    np.testing.assert_allclose(turned @ on_axis, np.tile(on_axis, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(turned[:, :3, :3]).as_rotvec(), values[:, None] * axis, atol=1e-9
+    )
+    np.testing.assert_allclose(slid[:, :3, 3], values[:, None] * axis, atol=1e-12)
+    np.testing.assert_array_equal(slid[:, :3, :3], np.broadcast_to(np.eye(3), (4, 3, 3)))
+
+
+def test_joints_that_are_none():
+    x, nothing, values = np.array([1.0, 0.0, 0.0]), np.zeros(3), np.zeros(2)
+    with pytest.raises(ValueError, match="kind: expected prismatic or revolute, found 'ball'"):
+        Joint("ball", x, nothing, values)
+    with pytest.raises(ValueError, match="axis: expected a direction of length 1, found length 2"):
+        Joint("revolute", 2 * x, nothing, values)
+    with pytest.raises(ValueError, match=r"point: expected shape \(3,\), found \(2,\)"):
+        Joint("revolute", x, np.zeros(2), values)
+
+
+@given(kinds, seeds)
+def test_a_joint_is_found_exactly(kind, seed):
+    joint, points = made_up(kind, seed)
+    found = fit_joint(joint.motions(), points)
+    assert found.kind == kind
+    np.testing.assert_allclose(found.joint.axis, joint.axis, atol=1e-7)
+    np.testing.assert_allclose(found.joint.values, joint.values, atol=1e-7)
+    np.testing.assert_allclose(found.joint.motions(), joint.motions(), atol=1e-7)
+    if kind == "revolute":  # any point of the axis says the same
+        np.testing.assert_allclose(np.cross(found.joint.point - joint.point, joint.axis), 0, atol=1e-6)
+    assert found.errors_m[kind] < 1e-7
+    assert found.confidence > 0.99
+
+
+@given(kinds, seeds)
+def test_tracking_noise_costs_as_much_as_it_is(kind, seed):
+    joint, points = made_up(kind, seed)
+    found = fit_joint(shaken(joint.motions(), points, 1e-3, seed), points)
+    assert found.kind == kind
+    assert np.rad2deg(np.arccos(found.joint.axis @ joint.axis)) < 2
+    assert np.abs(found.joint.values - joint.values).max() < 6e-3
+    assert 0.5e-3 < found.errors_m[kind] < 3e-3
+
+
+@given(seeds)
+def test_where_the_world_is_seen_from_does_not_matter(seed):
+    """Another frame turns the axis and moves the point, and changes no error."""
+    joint, points = made_up("revolute", seed)
+    motions = shaken(joint.motions(), points, 5e-4, seed)
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.random(rng=seed).as_matrix()
+    frame[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    here = fit_joint(motions, points)
+    there = fit_joint(frame @ motions @ np.linalg.inv(frame), points @ frame[:3, :3].T + frame[:3, 3])
+    np.testing.assert_allclose(there.joint.axis, frame[:3, :3] @ here.joint.axis, atol=1e-6)
+    np.testing.assert_allclose(there.joint.values, here.joint.values, atol=1e-7)
+    assert there.errors_m == pytest.approx(here.errors_m)
+
+
+def test_what_hardly_moves_is_fixed():
+    points = made_up("revolute", 0)[1]
+    still = shaken(np.tile(np.eye(4), (12, 1, 1)), points, 3e-4, 1)
+    found = fit_joint(still, points)
+    assert (found.kind, found.joint) == ("fixed", None)
+    assert 0.5 < found.confidence <= 1
+
+
+@given(seeds)
+def test_what_slides_and_turns_is_free(seed):
+    rng = np.random.default_rng(seed)
+    turned, points = made_up("revolute", seed)
+    shift = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
+    shift[:, :3, 3] = 0.3 * np.linspace(0, 1, 12)[:, None] * turned.axis + 0.2 * np.sin(
+        np.linspace(0, 9, 12)
+    )[:, None] * np.cross(turned.axis, rng.normal(size=3))
+    found = fit_joint(shift @ turned.motions(), points)
+    assert (found.kind, found.joint) == ("free", None)
+    assert 0 < found.confidence < 1
+
+
+def test_a_turn_too_small_to_tell_is_a_slide():
+    far = Joint("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.0, 8.0, 0.0]), np.linspace(0, 0.03, 9))
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    assert fit_joint(far.motions(), points).kind == "prismatic"
+    assert fit_joint(far.motions(), points, least_turn_rad=0.01).kind == "revolute"
+
+
+def test_more_than_a_turn_is_followed():
+    joint, points = made_up("revolute", 3)
+    wheel = Joint("revolute", joint.axis, joint.point, np.linspace(0, 3 * np.pi, 25))
+    np.testing.assert_allclose(np.ptp(fit_joint(wheel.motions(), points).joint.values), 3 * np.pi, atol=1e-6)
