@@ -13,10 +13,11 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
-_FILES += ("trajectory.npz", "scene.ply", "cameras.npz")
-_FOLDERS = ("renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
+_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz")
+_FOLDERS = ("canonical", "renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
-_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply")  # what a run that was stopped has come to
+# What a run that was stopped has come to.
+_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
@@ -57,7 +58,10 @@ class RunFolder:
           metrics.jsonl           of a fit: loss, PSNR, count of Gaussians while it goes on, a line each
           trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
-          scene.ply               the Gaussians: of a fit, or of the first frame with their labels
+          parts.npz               of `gsjax parts`: anchor, means0 [N,3], weights [N,P], labels [N],
+                                  centres [P,3], R [T,P,3,3], t [T,P,3], times [T]
+          scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
+          canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
           renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
           video_CAM.mp4           input, render, error and labels side by side; of a fit video_orbit.mp4

@@ -139,21 +139,15 @@ def metrics(
             "travelled_mm": _travelled_mm(tracking, values, label),
             "frames_lost": _frames_lost(tracking, values, label),
             "turn_unknown_from": turn_unknown_from(tracking, values, label),
-            **_motion_metrics(motion.get(label)),
+            **motion_metrics(motion.get(label)),
         }
         for label, name in names.items()
-    }
-    cameras = {
-        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
-        for camera, found in scores.cameras.items()
     }
     return {
         "objects": objects,
         "iou": _iou(scores, names, held_out=False),
         "iou_held_out": _iou(scores, names, held_out=True),
-        "cameras": cameras,
-        "tracked": _mean_of(cameras, tracked=True),
-        "held_out": _mean_of(cameras, tracked=False),
+        **camera_metrics(scores),
         "over_frames": {
             "psnr": {str(camera): found.values["psnr"] for camera, found in scores.cameras.items()},
             "centroid_error_mm": {
@@ -161,6 +155,16 @@ def metrics(
             },
         },
     }
+
+
+def camera_metrics(scores: Scores) -> dict[str, Any]:
+    """Each score's mean over frames, by camera, and over the cameras of each kind."""
+    cameras = {
+        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
+        for camera, found in scores.cameras.items()
+    }
+    kinds = {kind: _mean_of(cameras, tracked=kind == "tracked") for kind in ("tracked", "held_out")}
+    return {"cameras": cameras, **kinds}
 
 
 def budget_metrics(chosen: Chosen) -> dict[str, Any]:
@@ -185,7 +189,7 @@ def object_names(
     }
 
 
-def _motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
+def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
     fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
     scored = {name: getattr(score, name, None) for name in fields}
     return scored | {"gaussians_scored": 0 if score is None else score.num_scored}

@@ -99,7 +99,7 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     narrow = tuple(column for column in OBJECT_COLUMNS if column.key not in left_out)
     for columns, rows in ((narrow, object_rows(found)), (CAMERA_COLUMNS, camera_rows(found))):
         if rows:
-            console.print(_grid(columns, rows))
+            console.print(grid(columns, rows))
     for name, scored in found["objects"].items():
         if scored.get("turn_unknown_from") is not None:
             since = f"from frame {scored['turn_unknown_from']} on"
@@ -111,19 +111,20 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
 
 
-def _grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
-    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+def grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
+    """The columns in which something stands, for the terminal."""
+    drawn = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     shown = _shown(columns, rows)
     for column in shown:
         text = any(isinstance(row[column.key], str) for row in rows)
         *first, last = column.head.split(" ", 1)
         head = "\n".join([*first, last] if first else ["", last])
         unit = f"\n[dim]{column.unit}[/]" if any(c.unit for c in shown) else ""
-        grid.add_column(head + unit, justify="left" if text else "right", no_wrap=True)
+        drawn.add_column(head + unit, justify="left" if text else "right", no_wrap=True)
     for row in rows:
-        grid.add_row(*(format_number(row[c.key], c.decimals) for c in shown))
-    grid.add_row()
-    return grid
+        drawn.add_row(*(format_number(row[c.key], c.decimals) for c in shown))
+    drawn.add_row()
+    return drawn
 
 
 def write_run_report(
@@ -143,8 +144,8 @@ def write_run_report(
         plots=[Media(path, text) for path, text in plots],
         images=[Media(first_mask, caption)] if first_mask else [],
         tables=[
-            *_table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
-            *_table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
+            *table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
+            *table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
             _time_table(found["seconds"]),
         ],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
@@ -189,7 +190,7 @@ def _headline(found: dict[str, Any]) -> dict[str, Any]:
     return cards | {"Gaussians": found["gaussians"]["all"], "Frames": found["frames"]["tracked"]}
 
 
-def _table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> list[Table]:
+def table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> list[Table]:
     """The table with the columns in which something stands; none if there are no rows."""
     if not rows:
         return []

@@ -1,7 +1,7 @@
-"""What the tracked scene looks like from each camera, frame by frame, beside what the camera saw."""
+"""What a scene that moves looks like from each camera, frame by frame, beside what the camera saw."""
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -11,11 +11,14 @@ from jaxtyping import Float, Int
 
 from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Prefetched, Recording
+from gsjax.methods.motion_parts import Moment, PartScene, Trajectory, gaussians_at, moment
 from gsjax.methods.object_tracker import place, render_labels
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
-from gsjax.scene.render import plan_render
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.handles import Blend
+from gsjax.scene.render import Rendered, plan_render, render
 
 OPAQUE = 0.5
 """Pixels with less alpha show nothing: they have no label and no depth."""
@@ -51,20 +54,51 @@ def views(tracking: Tracking, recording: Recording, every: int = 1) -> Iterator[
 
     Masks of all frames are opened here, for scoring: call it when tracking has ended.
     """
+    return _views(recording, range(0, tracking.num_frames, every), tracking.at, render_labels, place)
+
+
+def part_views(
+    scene: PartScene, trajectory: Trajectory, recording: Recording, blend: Blend, every: int = 1
+) -> Iterator[list[View]]:
+    """The same of a scene whose parts were found; groups are its parts."""
+
+    def at(t: int) -> tuple[PartScene, Moment]:
+        return scene, moment(trajectory, t)
+
+    def place_parts(scene: PartScene, now: Moment) -> Gaussians:
+        return gaussians_at(scene, now, blend)
+
+    def render_parts(scene: PartScene, now: Moment, frame: Frame, plan: Plan) -> Rendered:
+        labels = jax.nn.one_hot(scene.labels, scene.num_parts)
+        return render(place_parts(scene, now), frame.cameras, plan, features=labels)
+
+    return _views(recording, range(0, len(trajectory.times), every), at, render_parts, place_parts)
+
+
+def _views(
+    recording: Recording, chosen: range, at: Callable, draw: Callable, placed: Callable
+) -> Iterator[list[View]]:
+    """Views of the frames in `chosen`.
+
+    Args:
+        at: frame -> (scene, pose).
+        draw: (scene, pose, frame, plan) -> Rendered, whose features are 1 where a group shows.
+        placed: (scene, pose) -> Gaussians.
+    """
     sequence = recording.judged
     cameras = range(sequence.num_cameras)
+    drawing = jax.jit(partial(_drawn, draw), compiler_options=host_options())
 
     def load(t: int):
         return sequence.frame(t), [sequence.mask(t, c) for c in cameras]
 
     plan: Plan | None = None
-    chosen = range(0, tracking.num_frames, every)
     for t, (frame, masks) in zip(chosen, Prefetched(load, chosen), strict=True):
-        scene, pose = tracking.at(t)
+        scene, pose = at(t)
         if plan is None:
-            plan = plan_render(place(scene, pose), frame.cameras)
+            plan = plan_render(placed(scene, pose), frame.cameras)
         while True:
-            *drawn, overflow, needed = jax.device_get(_draw()(scene, pose, frame, plan))
+            *drawn, overflow, needed = jax.device_get(drawing(scene, pose, frame, plan))
             if not overflow:
                 break
             plan = plan.grown(int(needed))
@@ -87,20 +121,14 @@ def views(tracking: Tracking, recording: Recording, every: int = 1) -> Iterator[
 _DRAWN = ("render", "render_depth", "groups", "covered")
 
 
-@cache
-def _draw() -> Callable:
-    """The jitted render; made late, because its options ask which machine this is."""
-
-    def draw(scene, pose, frame: Frame, plan: Plan):
-        rendered = render_labels(scene, pose, frame, plan)
-        covered = rendered.alphas > OPAQUE
-        return (
-            rendered.colors,
-            jnp.where(covered, rendered.depths, 0.0),
-            jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0),
-            covered,
-            rendered.meta.overflow.any(),
-            rendered.meta.needed.max(),
-        )
-
-    return jax.jit(draw, compiler_options=host_options())
+def _drawn(draw: Callable, scene, pose, frame: Frame, plan: Plan):
+    rendered = draw(scene, pose, frame, plan)
+    covered = rendered.alphas > OPAQUE
+    return (
+        rendered.colors,
+        jnp.where(covered, rendered.depths, 0.0),
+        jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0),
+        covered,
+        rendered.meta.overflow.any(),
+        rendered.meta.needed.max(),
+    )

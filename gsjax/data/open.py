@@ -13,12 +13,12 @@ from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
-from gsjax.data.simulated import articulated, tabletop
+from gsjax.data.simulated import articulated, bar, tabletop
 from gsjax.data.structure_from_motion import SUFFIXES
 from gsjax.data.tum import read_tum
 
 SIMULATED_PREFIX = "simulated:"
-SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated}
+SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated, "bar": bar}
 
 # What only a folder of that layout has (* stands for anything), and its reader.
 _LAYOUTS = {

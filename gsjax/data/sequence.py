@@ -30,6 +30,8 @@ class Truth:
         poses: object-to-world transforms, [T,K,4,4] float64.
         robot: the mask value of the robot, or None where there is none.
         joints: one for each object, None for one that moves freely; empty where that is not known.
+        tracks: material points on the surface of what deforms, followed over time, [T,V,3] float64, metres,
+            world; None where that is not known. What deforms has no pose, and is not among the objects.
 
     Raises:
         ValueError: shapes disagree, or a pose is not a rigid motion.
@@ -40,6 +42,7 @@ class Truth:
     poses: Float[np.ndarray, "..."]
     robot: int | None = None
     joints: tuple[Joint | None, ...] = ()
+    tracks: Float[np.ndarray, "..."] | None = None
 
     def __post_init__(self):
         check_shape("label_ids", self.label_ids, (len(self.names),))
@@ -49,6 +52,8 @@ class Truth:
             if joint is not None:
                 check_shape(f"values of the joint of {name}", joint.values, (len(self.poses),))
         check_shape("poses", self.poses, (len(self.poses), len(self.names), 4, 4))
+        if self.tracks is not None:
+            check_shape("tracks", self.tracks, (len(self.poses), *np.shape(self.tracks)[1:2], 3))
         advice = "Object poses are object-to-world transforms."
         check_poses("pose", self.poses, lambda t, k: f"object {self.names[k]} in frame {t}", advice)
 
@@ -56,7 +61,8 @@ class Truth:
         """That of some frames."""
         chosen = list(frames)
         joints = tuple(j and replace(j, values=j.values[chosen]) for j in self.joints)
-        return replace(self, poses=self.poses[chosen], joints=joints)
+        tracks = None if self.tracks is None else self.tracks[chosen]
+        return replace(self, poses=self.poses[chosen], joints=joints, tracks=tracks)
 
 
 @dataclass(frozen=True, eq=False)

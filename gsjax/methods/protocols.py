@@ -1,4 +1,5 @@
-"""What methods ask of others: who says what belongs together, what a pixel is like, and what words mean.
+"""What methods ask of others: who says what belongs together, what a pixel is like, where it moves, and what
+words mean.
 
 `gsjax.perception` has a default without weights for each, and adapters of foundation models. Nobody needs to
 inherit: whatever can be called like this fits. All of them work on the host, in numpy.
@@ -31,6 +32,23 @@ class Segmenter(Protocol):
 
 
 @runtime_checkable
+class Propagator(Protocol):
+    """Labels of one picture, carried to others."""
+
+    def __call__(
+        self, images: Num[np.ndarray, "V H W 3"], labels: Int[np.ndarray, "H W"]
+    ) -> Int[np.ndarray, "V H W"]:
+        """Labels of all pictures; the same number means the same object, and 0 the background.
+
+        Args:
+            images: RGB, uint8 or floats 0 to 1, in an order in which neighbours are alike: views from side to
+                side, or frames of a video.
+            labels: of the first picture. They come back as they are.
+        """
+        ...
+
+
+@runtime_checkable
 class DenseEncoder(Protocol):
     """A feature for each pixel."""
 
@@ -39,6 +57,21 @@ class DenseEncoder(Protocol):
 
         Args:
             images: RGB, uint8 or floats 0 to 1.
+        """
+        ...
+
+
+@runtime_checkable
+class OpticalFlow(Protocol):
+    """Where each pixel of a picture is in another one."""
+
+    def __call__(
+        self, image: Num[np.ndarray, "H W 3"], other: Num[np.ndarray, "H W 3"]
+    ) -> Float[np.ndarray, "H W 2"]:
+        """Pixels (x, y) that each pixel of `image` moves until `other`; NaN where unknown.
+
+        Args:
+            image, other: RGB, uint8 or floats 0 to 1.
         """
         ...
 

@@ -1,7 +1,8 @@
 """How far tracked Gaussians are from where the true motion of their object would have carried them.
 
 With x_t the Gaussian's centre at frame t and T_t the object's true pose (object to world), a perfect tracker
-has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. In float64, on the host.
+has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. What a method began at another
+frame than 0 is counted from there, its anchor. In float64, on the host.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,8 +26,8 @@ class ObjectScore(NamedTuple):
         centroid_errors_mm: the same, a value a frame.
         point_error_mm: mean over Gaussians and time of || x_t - T_t T_0^-1 x_0 ||.
         median_point_error_mm: the median of the same.
-        moved_mm: the largest distance over time of the true centroid from its start.
-        turned_deg: the largest true rotation from the start, degrees.
+        moved_mm: the largest distance over time of the true centroid from where it was at the anchor.
+        turned_deg: the largest true rotation from the anchor, degrees.
         num_scored: how many Gaussians have this true label.
     """
 
@@ -92,8 +93,8 @@ def _seen_by(
     return mask[rows, columns], np.where(valid, np.abs(there - z), np.inf)
 
 
-def relative_motion(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4 4"]:
-    """T_t T_0^-1: what carries a point of the object from frame 0 to frame t, in the world.
+def relative_motion(poses: Float[np.ndarray, "T 4 4"], anchor: int = 0) -> Float[np.ndarray, "T 4 4"]:
+    """T_t T_0^-1: what carries a point of the object from frame 0 (or `anchor`) to frame t, in the world.
 
     Raises:
         ValueError: a pose is no rigid motion.
@@ -110,20 +111,23 @@ def relative_motion(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4
     if not rigid.all():
         frame = int(np.argmin(rigid))
         raise ValueError(f"poses: frame {frame} holds no rotation (R R^T is off by {gap[frame]:.3g})")
-    return poses @ np.linalg.inv(poses[0])
+    return poses @ np.linalg.inv(poses[anchor])
 
 
-def score_object(means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "poses 4 4"]) -> ObjectScore:
+def score_object(
+    means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "poses 4 4"], anchor: int = 0
+) -> ObjectScore:
     """Score the Gaussians of one object; without any, the errors are NaN.
 
     Args:
         means: centres of the object's Gaussians over time, world, metres.
         poses: the object's true poses, object to world.
+        anchor: the frame from which motion is counted, and in which there is no error.
 
     Raises:
         ValueError: the frame counts differ, or a pose is no rigid motion.
     """
-    means, motion = np.asarray(means, np.float64), relative_motion(poses)
+    means, motion = np.asarray(means, np.float64), relative_motion(poses, anchor)
     if len(means) != len(motion):
         raise ValueError(f"means: got {len(means)} frames, want {len(motion)} like poses")
     cosine = (np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2
@@ -131,7 +135,7 @@ def score_object(means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "po
     if means.shape[1] == 0:
         missing = float("nan")
         return ObjectScore(missing, np.full(len(means), np.nan), missing, missing, missing, turned, 0)
-    expected = np.einsum("tij,nj->tni", motion[:, :3, :3], means[0]) + motion[:, None, :3, 3]
+    expected = np.einsum("tij,nj->tni", motion[:, :3, :3], means[anchor]) + motion[:, None, :3, 3]
     errors = 1000.0 * np.linalg.norm(means - expected, axis=-1)
     centroids = expected.mean(axis=1)
     centroid_errors = 1000.0 * np.linalg.norm(means.mean(axis=1) - centroids, axis=-1)
@@ -140,7 +144,7 @@ def score_object(means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "po
         centroid_errors_mm=centroid_errors,
         point_error_mm=float(errors.mean()),
         median_point_error_mm=float(np.median(errors)),
-        moved_mm=1000.0 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max()),
+        moved_mm=1000.0 * float(np.linalg.norm(centroids - centroids[anchor], axis=-1).max()),
         turned_deg=turned,
         num_scored=means.shape[1],
     )
@@ -150,6 +154,7 @@ def score_tracks(
     means: Float[np.ndarray, "T N 3"],
     labels: Integer[np.ndarray, "labels"],
     poses: Mapping[int, Float[np.ndarray, "poses 4 4"]],
+    anchor: int = 0,
 ) -> dict[int, ObjectScore]:
     """Score each object whose true poses are known.
 
@@ -157,6 +162,7 @@ def score_tracks(
         means: centres over time, world, metres.
         labels: the TRUE label of each Gaussian (see `true_labels`), not the tracker's own.
         poses: of each label, its true poses over the same frames.
+        anchor: the frame from which motion is counted.
 
     Raises:
         ValueError: the shapes do not agree, or a pose is no rigid motion.
@@ -164,4 +170,4 @@ def score_tracks(
     means, labels = np.asarray(means), np.asarray(labels)
     if labels.shape != (means.shape[1],):
         raise ValueError(f"labels: got shape {labels.shape}, want [{means.shape[1]}] to match means")
-    return {label: score_object(means[:, labels == label], poses[label]) for label in sorted(poses)}
+    return {label: score_object(means[:, labels == label], poses[label], anchor) for label in sorted(poses)}

@@ -177,6 +177,36 @@ class PlaneOrRegionSegmenter:
         return self.plane(image, depth, K)
 
 
+@dataclass(frozen=True)
+class PieceSegmenter:
+    """Pieces of things: regions of like colour, where there is depth only of what stands out of the planes.
+
+    For who joins pieces by other evidence, such as that they move together: a door is a piece, and so is each
+    side of a box.
+    """
+
+    plane: PlaneSegmenter = field(default_factory=PlaneSegmenter)
+    region: RegionSegmenter = field(
+        default_factory=lambda: RegionSegmenter(
+            max_fraction=1.0, max_border_fraction=1.0, min_pixels=60, merge_distance=8.0
+        )
+    )
+    min_pixels: int = 40
+    """Smaller pieces are dropped."""
+
+    def __call__(
+        self,
+        image: Num[np.ndarray, "image_H image_W 3"],
+        depth: Num[np.ndarray, "H W"] | None = None,
+        K: Float[np.ndarray, "3 3"] | None = None,
+    ) -> Int[np.ndarray, "image_H image_W"]:
+        """Labels of a picture: 0 background, then 1, 2, ... by size."""
+        regions = self.region(image)
+        if depth is not None and K is not None and np.any(np.nan_to_num(depth) > 0):
+            regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
+        return name_by_size(regions, self.min_pixels)
+
+
 def name_by_size(
     labels: Int[np.ndarray, "H W"], min_pixels: int = 1, background: int = 0
 ) -> Int[np.ndarray, "H W"]:

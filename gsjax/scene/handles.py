@@ -35,8 +35,8 @@ class HandlePose(eqx.Module):
         translations: metres.
     """
 
-    quats: Float[Array, "P 4"]
-    translations: Float[Array, "P 3"]
+    quats: Float[Array, "*t P 4"]
+    translations: Float[Array, "*t P 3"]
 
 
 def at_rest(num: int) -> HandlePose:

@@ -11,10 +11,9 @@ from gsjax.methods.object_tracker.region import (
     near_scene,
     shift_background,
     spread,
-    tiles_to_pixels,
-    touched_tiles,
 )
 from gsjax.rasterize.plan import Plan, rung
+from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render, render
 
 

@@ -128,3 +128,19 @@ def test_views_that_do_not_belong_together_are_named():
         true_labels(np.zeros((1, 3)), [mask, mask], [depth], [np.eye(4)], [K])
     with pytest.raises(ValueError, match=r"masks: got shape \(23, 32\), want \(24, 32\)"):
         true_labels(np.zeros((1, 3)), [mask[1:]], [depth], [np.eye(4)], [K])
+
+
+def test_what_was_begun_later_is_counted_from_there():
+    """Whatever came before the anchor is no excuse: the error is that of the frames in another order."""
+    means, poses = motion()
+    means = means + 0.01 * np.random.default_rng(1).normal(size=means.shape)
+    order = [3, 0, 1, 2, 4, 5, 6]
+    anchored, reordered = score_object(means, poses, anchor=3), score_object(means[order], poses[order])
+    assert anchored.centroid_errors_mm[3] == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(anchored.centroid_errors_mm[order], reordered.centroid_errors_mm)
+    for name in ("point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg"):
+        assert getattr(anchored, name) == pytest.approx(getattr(reordered, name))
+    assert anchored.point_error_mm != pytest.approx(score_object(means, poses).point_error_mm)
+    labels = np.zeros(COUNT, int)
+    assert score_tracks(means, labels, {0: poses}, anchor=3)[0].moved_mm == anchored.moved_mm
+    np.testing.assert_allclose(relative_motion(poses, anchor=3)[3], np.eye(4), atol=1e-12)

@@ -10,6 +10,8 @@ from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
 from gsjax.perception.clip import load_clip
 from gsjax.perception.dinov2 import load_dinov2
 from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
+from gsjax.perception.sam import load_sam
+from gsjax.perception.sam2 import load_sam2
 
 there = all(importlib.util.find_spec(name) for name in ("torch", "transformers"))
 needs_foundation = pytest.mark.skipif(
@@ -244,7 +246,7 @@ def test_of_two_masks_the_smaller_is_on_top_and_doubles_are_dropped():
     assert (labels > 0).sum() == 100
 
 
-LOADERS = [load_clip, load_dinov2, lambda path: load_grounded_sam(path, path)]
+LOADERS = [load_clip, load_dinov2, load_sam, load_sam2, lambda path: load_grounded_sam(path, path)]
 
 
 @pytest.mark.parametrize("load", LOADERS)

@@ -1,13 +1,14 @@
-"""Built-in scenes: a ray-caster of textured, shadowed solids that move rigidly, by seed.
+"""Built-in scenes: a ray-caster of textured, shadowed solids that move rigidly, twist and bend, by seed.
 
 They are no Gaussians, so a reconstruction of them cannot be right by accident; and they need no download.
 """
 
 from gsjax.data.simulated.articulated import articulated
+from gsjax.data.simulated.bar import bar
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.simulation import simulated_sequence
 from gsjax.data.simulated.tabletop import tabletop
 from gsjax.data.simulated.textures import Texture
 
-__all__ = ["Light", "Primitive", "Scene", "Texture", "articulated", "simulated_sequence", "tabletop"]
+__all__ = ["Light", "Primitive", "Scene", "Texture", "articulated", "bar", "simulated_sequence", "tabletop"]

@@ -1,4 +1,4 @@
-"""Convex solids and a plane: where rays enter them, and their normals. All rays are columns, [3,N].
+"""Solids and a plane: where rays enter them, and their normals. All rays are columns, [3,N].
 
 Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; rays
 that miss it, or that start inside, give infinity.
@@ -10,9 +10,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from gsjax.data.simulated.bent_box import BentBox
 from gsjax.data.simulated.textures import Texture
 
 _TINY = 1e-300
+# Rays enter a bent box where they can go on by no more than this, metres. After so many steps one misses it.
+_ON_SURFACE_M = 1e-10
+_MOST_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,14 +24,14 @@ class Primitive:
     """One solid of a body.
 
     Attributes:
-        shape: "box", "sphere", "cylinder" (about z) or "plane" (z = 0, seen from above).
-        size: metres: three half edges; a radius; a radius and half a length; nothing.
-        texture: its colours, in coordinates of the primitive, so that they turn with it.
+        shape: "box", "sphere", "cylinder" (about z), "plane" (z = 0, seen from above) or "bent box".
+        size: metres: three half edges; a radius; a radius and half a length; nothing; what `BentBox` has.
+        texture: its colours, in coordinates of the primitive at rest, so that they turn and bend with it.
         body: index of the body that it moves with.
         pose: primitive to body, [4,4].
     """
 
-    shape: Literal["box", "sphere", "cylinder", "plane"]
+    shape: Literal["box", "sphere", "cylinder", "plane", "bent box"]
     size: tuple[float, ...]
     texture: Texture
     body: int = 0
@@ -43,6 +47,8 @@ class Primitive:
                 return np.full(3, self.size[0])
             case "cylinder":
                 return np.array([self.size[0], self.size[0], self.size[1]])
+            case "bent box":
+                return BentBox(*self.size).half_extents
         return np.array([np.inf, np.inf, 0.0])
 
 
@@ -61,8 +67,11 @@ def intersect(
             low, high = _slabs((0.0, 0.0, half), origin, directions, axes=(2,))
             near, far = np.maximum(near, low), np.minimum(far, high)
         case "plane":
-            down = np.where(directions[2] < 0, directions[2], -_TINY)
-            near = far = -origin[2] / down
+            falls = directions[2] < 0
+            near = far = np.where(falls, -origin[2] / np.where(falls, directions[2], 1.0), np.inf)
+        case "bent box":
+            within = _slabs(primitive.half_extents, origin, directions, axes=(0, 1, 2))
+            near = far = _march(BentBox(*primitive.size), origin, directions, *within)
     return np.where((near <= far) & (near > 0) & np.isfinite(near), near, np.inf)
 
 
@@ -70,8 +79,11 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
     """Outward unit normals at points of the surface, in the primitive's frame."""
     match primitive.shape:
         case "box":
-            axis = np.argmax(np.abs(points) - np.array(primitive.size)[:, None], axis=0)
-            return np.where(np.arange(3)[:, None] == axis, np.sign(points), 0.0)
+            return _box_normals(primitive.size, points)
+        case "bent box":
+            box = BentBox(*primitive.size)
+            rest = box.undo(points)
+            return box.carry_normals(rest, _box_normals(primitive.size[:3], rest))
         case "sphere":
             return points / primitive.size[0]
         case "cylinder":
@@ -81,6 +93,39 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
             side = points * np.array([[1.0], [1.0], [0.0]]) / np.maximum(distance, _TINY)
             return np.where(on_cap, np.array([[0.0], [0.0], [1.0]]) * np.sign(points), side)
     return np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), points.shape)
+
+
+def at_rest(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    """Where points of the primitive, in its frame, are while it is not deformed."""
+    return BentBox(*primitive.size).undo(points) if primitive.shape == "bent box" else points
+
+
+def deformed(primitive: Primitive, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    """Where points of the primitive at rest are in its frame: the inverse of `at_rest`."""
+    return BentBox(*primitive.size).deform(rest) if primitive.shape == "bent box" else rest
+
+
+def _box_normals(half, points):
+    axis = np.argmax(np.abs(points) - np.array(half)[:, None], axis=0)
+    return np.where(np.arange(3)[:, None] == axis, np.sign(points), 0.0)
+
+
+def _march(box, origin, directions, near, far):
+    """Where rays enter a bent box between `near` and `far`; 0 for one that starts inside."""
+    speed = np.linalg.norm(directions, axis=0)
+    unit = directions / speed
+    s, entry = np.maximum(near, 0.0), np.full_like(speed, np.inf)
+    going = np.flatnonzero(s <= far)
+    for _ in range(_MOST_STEPS):
+        if not going.size:
+            break
+        rays = unit[:, going]
+        step = box.advance(origin[:, None] + rays * (s * speed)[going], rays)
+        there = step < _ON_SURFACE_M
+        s[going] += step / speed[going]
+        entry[going[there]] = s[going[there]]
+        going = going[~there & (s[going] <= far[going])]
+    return entry
 
 
 def _slabs(half, origin, directions, axes):

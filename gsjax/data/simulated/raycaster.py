@@ -1,11 +1,12 @@
 """Exact images of moving solids: colour, depth along the optical axis, labels and optical flow."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from gsjax.data.simulated.primitives import Primitive, intersect, normals
+from gsjax.data.simulated.primitives import Primitive, at_rest, deformed, intersect, normals
 from gsjax.data.simulated.textures import GAMMA, albedo
 
 _NEAR_M = 1e-3
@@ -35,7 +36,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Solids on bodies that move rigidly, a light, and cameras.
+    """Solids on bodies that move rigidly, a light, and cameras. Bent boxes may deform besides.
 
     Attributes:
         primitives: the solids; those of one body never move relative to each other.
@@ -46,6 +47,7 @@ class Scene:
         viewmats: world to camera, OpenCV axes, [T,C,4,4].
         width: pixels.
         height: pixels.
+        sizes: of primitives that deform, by index: the size of each frame, [T,n], in place of their own.
     """
 
     primitives: tuple[Primitive, ...]
@@ -56,10 +58,14 @@ class Scene:
     viewmats: Float[np.ndarray, "frames cameras 4 4"]
     width: int
     height: int
+    sizes: Mapping[int, Float[np.ndarray, "frames n"]] = field(default_factory=dict)
 
-    def primitive_poses(self, t: int) -> list[Float[np.ndarray, "4 4"]]:
-        """Primitive-to-world transforms in frame t."""
-        return [self.poses[t, primitive.body] @ primitive.pose for primitive in self.primitives]
+    def solids(self, t: int) -> list[tuple[Primitive, Float[np.ndarray, "4 4"]]]:
+        """The primitives as they are in frame t, each with its transform to the world."""
+        now = list(self.primitives)
+        for i, size in self.sizes.items():
+            now[i] = replace(now[i], size=tuple(size[t]))
+        return [(primitive, self.poses[t, primitive.body] @ primitive.pose) for primitive in now]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +99,7 @@ def trace(scene: Scene, t: int, c: int, subpixel: tuple[float, float] = (0.5, 0.
     origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
     depth = np.full((scene.height, scene.width), np.inf)
     index = np.full((scene.height, scene.width), -1)
-    for i, (primitive, pose) in enumerate(zip(scene.primitives, scene.primitive_poses(t), strict=True)):
+    for i, (primitive, pose) in enumerate(scene.solids(t)):
         window = _window(primitive, viewmat @ pose, K, scene.width, scene.height)
         if window is None:
             continue
@@ -132,15 +138,15 @@ def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.nd
 
     NaN where nothing was met and where the point is behind the camera in frame u.
     """
-    motions = np.stack(
-        [scene.poses[u, b] @ np.linalg.inv(scene.poses[t, b]) for b in range(len(scene.labels))]
-    )
-    bodies = np.array([primitive.body for primitive in scene.primitives])[hits.primitive]
+    index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
+    before, after = scene.solids(t), scene.solids(u)
+    for i in np.unique(index[index >= 0]):
+        here = np.flatnonzero(index == i)
+        (was, from_pose), (becomes, to_pose) = before[i], after[i]
+        local = deformed(becomes, at_rest(was, _to_local(from_pose, points[:, here])))
+        points[:, here] = to_pose[:3, :3] @ local + to_pose[:3, 3:]
     to_pixels = scene.Ks[u, c] @ scene.viewmats[u, c][:3]
-    per_body = (to_pixels @ motions)[bodies]
-    homogeneous = np.einsum("hwij,jhw->ihw", per_body[..., :3], hits.points()) + per_body[..., 3].transpose(
-        2, 0, 1
-    )
+    homogeneous = (to_pixels[:, :3] @ points + to_pixels[:, 3:]).reshape(3, scene.height, scene.width)
     y, x = np.mgrid[: scene.height, : scene.width] + 0.5
     seen = (hits.primitive >= 0) & (homogeneous[2] > _NEAR_M)
     z = np.where(seen, homogeneous[2], np.nan)
@@ -151,29 +157,30 @@ def _radiance(scene: Scene, t: int, hits: Hits, lamp: np.ndarray) -> Float[np.nd
     """Linear RGB that leaves the surfaces towards the camera."""
     flat_index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
     normal, reflectance = np.zeros_like(points), np.zeros_like(points)
-    poses = scene.primitive_poses(t)
+    solids = scene.solids(t)
     for i in np.unique(flat_index[flat_index >= 0]):
         here = np.flatnonzero(flat_index == i)
-        local = _to_local(poses[i], points[:, here])
-        normal[:, here] = poses[i][:3, :3] @ normals(scene.primitives[i], local)
-        reflectance[:, here] = albedo(scene.primitives[i].texture, local)
+        primitive, pose = solids[i]
+        local = _to_local(pose, points[:, here])
+        normal[:, here] = pose[:3, :3] @ normals(primitive, local)
+        reflectance[:, here] = albedo(primitive.texture, at_rest(primitive, local))
     to_lamp = lamp[:, None] - points
     cosine = np.einsum("ij,ij->j", normal, to_lamp) / np.linalg.norm(to_lamp, axis=0)
     lit = np.flatnonzero(cosine > 0)
     direct = np.zeros_like(cosine)
-    direct[lit] = cosine[lit] * ~_shadowed(scene, poses, lamp, points[:, lit])
+    direct[lit] = cosine[lit] * ~_shadowed(solids, lamp, points[:, lit])
     sky = 0.75 + 0.25 * normal[2]
     light = np.array(scene.light.color)[:, None] * direct + np.array(scene.light.ambient)[:, None] * sky
     return (reflectance * light).reshape(3, scene.height, scene.width)
 
 
-def _shadowed(scene: Scene, poses: list[np.ndarray], lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether some solid stands between the lamp and each point."""
     rays = points - lamp[:, None]
     lengths = np.linalg.norm(rays, axis=0)
     unit = rays / lengths
     dark = np.zeros(len(lengths), bool)
-    for primitive, pose in zip(scene.primitives, poses, strict=True):
+    for primitive, pose in solids:
         if primitive.shape == "plane":  # nothing is below it
             continue
         # Only points in the cone of the solid's bounding sphere can lie in its shadow.

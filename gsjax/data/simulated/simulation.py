@@ -27,6 +27,7 @@ def simulated_sequence(
     objects: dict[str, int],
     robot: int | None = None,
     joints: tuple[Joint | None, ...] = (),
+    tracks: Float[np.ndarray, "frames points 3"] | None = None,
 ) -> Sequence:
     """The sequence of a scene. Frames are rendered when asked for; the last few are kept.
 
@@ -37,6 +38,7 @@ def simulated_sequence(
         objects: the body of each object whose pose is reported as truth.
         robot: the mask value of the robot.
         joints: of each object, as `Truth` has them.
+        tracks: of points of what deforms, as `Truth` has them.
     """
     color = lru_cache(CACHED_IMAGES)(lambda t, c: render_color(scene, t, c))
     hits = lru_cache(CACHED_IMAGES)(lambda t, c: trace(scene, t, c))
@@ -47,6 +49,7 @@ def simulated_sequence(
         poses=scene.poses[:, bodies],
         robot=robot,
         joints=joints,
+        tracks=tracks,
     )
     return Sequence(
         name=name,

@@ -28,11 +28,11 @@ from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Motion, first_pose, move
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
-from gsjax.methods.object_tracker.region import tiles_to_pixels, touched_tiles
 from gsjax.methods.object_tracker.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
+from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
 _GRID_STEP, _HEADINGS, _SAMPLES = 0.03, 36, 96  # metres, over the full turn, centres a candidate is scored on

@@ -60,14 +60,13 @@ from gsjax.methods.object_tracker.region import (
     near_scene,
     shift_background,
     spread,
-    tiles_to_pixels,
-    touched_tiles,
 )
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.search import Watch, first_watch, judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
+from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import Rendered, plan_render, render
 
 # Pixels that must show a group for it to be moved: fewer cannot decide six numbers. So many are enough, and

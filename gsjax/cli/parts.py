@@ -1,0 +1,200 @@
+"""`gsjax parts`: from synchronised cameras to the parts of a moving scene."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import tyro
+from rich.console import Console
+
+from gsjax.cli import fit as fit_command
+from gsjax.cli.messages import Notes, stage
+from gsjax.cli.parts_loop import Following, follow_parts
+from gsjax.cli.parts_results import finished, print_results, write_results
+from gsjax.cli.parts_resume import Saver, load
+from gsjax.cli.recording import Recording, located, open_recording, parse_frames
+from gsjax.cli.run_folder import RunFolder, expect_dataset, expect_run, is_run
+from gsjax.data import ReadOptions
+from gsjax.io.ply import read_ply
+from gsjax.methods.motion_parts import (
+    Anchor,
+    PartsConfig,
+    Start,
+    begin,
+    choose_anchor,
+    first_parts,
+    without_needless,
+)
+from gsjax.methods.reconstruction import FitConfig
+from gsjax.perception.segmenters import PieceSegmenter
+from gsjax.scene.gaussians import Gaussians
+
+_EVERYTHING = 0.6  # share of pixels that change
+_OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is found
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax parts` is told."""
+
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+    """Folder of a recording by synchronised cameras, or a built-in scene such as simulated:articulated."""
+    out: Path
+    """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of the cameras to look through. All that are not held out, unless given."""
+    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of cameras that are held out: only judged, in the end."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
+    anchor: int | None = None
+    """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
+    scene: Path | None = None
+    """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Fitted unless
+    given, into RUN/canonical."""
+    resume: bool = False
+    """Go on with the unfinished run in the same folder, given the same options."""
+    overwrite: bool = False
+    """Replace an earlier run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """What the layout of the data leaves open."""
+    fit: FitConfig = field(
+        default_factory=lambda: FitConfig(steps=3_000, cap=40_000, sh_degree=0, depth_weight=0.5)
+    )
+    """How the canonical scene is fitted."""
+    parts: PartsConfig = field(default_factory=PartsConfig)
+    """How parts are found and followed."""
+
+
+def run(options: Options) -> int:
+    """Find the parts of a recording and report on them; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything found before that is on disk.
+    """
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        expect_dataset(options.dataset)
+        recording = open_recording(
+            options.dataset, options.cameras, options.eval_cameras, options.frames, options.read
+        )
+        _check(options, recording)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
+        if options.resume:
+            folder.check_config(settings, but=_OF_NO_BEARING)
+        folder.write_config(settings)
+        seconds: dict[str, float] = {}
+        tracked = recording.tracked
+        with stage(console, "looking for what moves"):
+            anchor = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, options.anchor)
+        notes.add(
+            f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
+        )
+        at = perf_counter()
+        gaussians = _canonical(settings, folder, anchor, recording, console)
+        if gaussians is None:
+            return 130
+        seconds["canonical"], at = perf_counter() - at, perf_counter()
+        with stage(console, "finding what may move, in all views"):
+            key = jax.random.key(options.parts.seed)
+            start = begin(tracked, gaussians, anchor, options.parts, PieceSegmenter(), key)
+        _say_if_odd(start, options, notes)
+        parts = first_parts(start, tracked.num_frames, options.parts)
+        seconds["discovery"] = perf_counter() - at
+        following = Following(parts)
+        if options.resume:
+            following = load(folder.resume, following)
+            notes.add(f"Resumed after {int(following.parts.done.sum())} frames of an earlier run.")
+        following = follow_parts(tracked, start, following, options.parts, Saver(folder.resume), console)
+        seconds |= {"updates": sum(following.update_s), "compile": following.compile_s}
+        parts, at = following.parts, perf_counter()
+        if following.stopped is None:
+            with stage(console, "leaving out parts that no picture needs"):
+                parts, pairs = without_needless(tracked, parts, options.parts)
+                following.joined += pairs
+        seconds["finish"] = perf_counter() - at
+        found = finished(folder, recording, start, parts, following, options.parts, seconds, notes, console)
+        found["seconds"]["total"] = perf_counter() - begun
+        found["notes"] = notes.all
+        folder.write_metrics(found)
+        write_results(folder, found, following)
+        if found["complete"]:
+            folder.forget_resume()
+    print_results(folder, found)
+    if isinstance(following.stopped, KeyboardInterrupt):
+        return 130
+    if following.stopped is not None:
+        raise following.stopped
+    return 0
+
+
+def _check(options: Options, recording: Recording) -> None:
+    sequence = recording.tracked
+    if sequence.num_cameras < 2:
+        raise ValueError(
+            f"--cameras: expected at least 2 that see the scene at once, found {list(sequence.camera_ids)}; "
+            "parts are found in space. One camera and depth: gsjax track"
+        )
+    if sequence.num_frames < 2:
+        raise ValueError(
+            f"--frames: expected at least 2, between which something moves, found 1 of {sequence.name}"
+        )
+    if options.scene is not None and options.anchor is None:
+        raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
+
+
+def _canonical(
+    options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
+) -> Gaussians | None:
+    """The scene at the anchor frame, given or fitted; None where fitting was stopped by Ctrl-C."""
+    path = options.scene
+    if path is None:
+        path = folder.path / "canonical"
+        if not RunFolder(path, overwrite=True).finished:
+            console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
+            code = fit_command.run(_fit_options(options, path, anchor, recording))
+            if code == 130:
+                return None
+    if path.is_dir():
+        expect_run(path, "`gsjax fit`")
+        path = path / "scene.ply"
+    return jax.tree.map(jnp.asarray, read_ply(path)[0])
+
+
+def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Recording) -> fit_command.Options:
+    frame = range(recording.frames_in_data)[parse_frames(options.frames)][anchor.frame]
+    return fit_command.Options(
+        options.dataset,
+        path,
+        frames=f"{frame}:{frame + 1}",
+        cameras=options.cameras,
+        eval_cameras=options.eval_cameras,
+        resume=is_run(path),
+        read=options.read,
+        fit=options.fit,
+    )
+
+
+def _say_if_odd(start: Start, options: Options, notes: Notes) -> None:
+    """Warn of what makes parts doubtful."""
+    moved, pieces = start.moved.mean(), int(start.masks.max())
+    if moved > _EVERYTHING:
+        notes.warn(
+            f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or cameras do; "
+            "what stands still is then badly known"
+        )
+    if pieces >= options.parts.discover.most_parts:
+        notes.warn(
+            f"there are more pieces that changed than --parts.discover.most-parts {pieces}; the smallest "
+            "were left out"
+        )
+    seen = [(start.masks == piece).any((1, 2)).sum() for piece in range(1, pieces + 1)]
+    alone = sum(count == 1 for count in seen)
+    if alone:
+        notes.add(f"{alone} of {pieces} pieces were seen to change by one camera only.")

@@ -1,0 +1,150 @@
+"""Parts that were found: how they moved, which joints explain that, and how both compare to the truth."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.cli.messages import Notes
+from gsjax.cli.recording import Recording
+from gsjax.cli.scoring import motion_metrics
+from gsjax.geometry.joints import FittedJoint, fit_joint
+from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory
+from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
+from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
+from gsjax.scene.handles import HandlePose, skin_means
+
+_POINTS = 500  # of a part, by which its joint is fitted
+_STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
+
+
+def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T P 4 4"]:
+    """The rigid motions of all parts against the canonical scene."""
+    rotations = np.asarray(quats_to_matrices(trajectory.poses.quats), np.float64)
+    centers = np.asarray(scene.centers, np.float64)
+    motions = np.broadcast_to(np.eye(4), (*rotations.shape[:2], 4, 4)).copy()
+    motions[..., :3, :3] = rotations
+    shifts = np.asarray(trajectory.poses.translations, np.float64)
+    motions[..., :3, 3] = centers + shifts - np.einsum("tpij,pj->tpi", rotations, centers)
+    return motions
+
+
+def joints_of(scene: PartScene, trajectory: Trajectory, done: np.ndarray) -> dict[int, FittedJoint]:
+    """The joint that explains the motion of each part best, over the frames that were found."""
+    motions, labels = motions_in_world(scene, trajectory)[done], np.asarray(scene.labels)
+    means = np.asarray(scene.gaussians.means, np.float64)
+    found = {}
+    for part in range(BACKGROUND + 1, scene.num_parts):
+        mine = means[labels == part]
+        found[part] = fit_joint(motions[:, part], mine[:: max(1, len(mine) // _POINTS)])
+    return found
+
+
+def part_rows(
+    scene: PartScene, trajectory: Trajectory, joints: dict[int, FittedJoint]
+) -> list[dict[str, Any]]:
+    """What is known of each part without truth, by the keys of `PART_COLUMNS`."""
+    motions, labels = motions_in_world(scene, trajectory), np.asarray(scene.labels)
+    means = np.asarray(scene.gaussians.means, np.float64)
+    rows = []
+    for part, fitted in joints.items():
+        mine = means[labels == part]
+        moved = np.einsum("tij,nj->tni", motions[:, part, :3, :3], mine) + motions[:, None, part, :3, 3]
+        opens = None if fitted.joint is None else float(np.ptp(fitted.joint.values))
+        turns = fitted.kind == "revolute"
+        rows.append(
+            {
+                "part": part,
+                "name": f"part {part}",
+                "gaussians": len(mine),
+                "moved_mm": 1000 * float(np.linalg.norm(moved - mine, axis=-1).mean(-1).max()),
+                "kind": fitted.kind,
+                "range": None if opens is None else (np.degrees(opens) if turns else 1000 * opens),
+                "axis": None if fitted.joint is None else fitted.joint.axis.tolist(),
+                "point": None if fitted.joint is None else fitted.joint.point.tolist(),
+                "confidence": 100 * fitted.confidence,
+            }
+        )
+    return rows
+
+
+def score_parts(
+    scene: PartScene,
+    trajectory: Trajectory,
+    joints: dict[int, FittedJoint],
+    rows: list[dict[str, Any]],
+    recording: Recording,
+    anchor: int,
+    notes: Notes,
+) -> dict[str, Any]:
+    """Scores of the whole, and in each row those of the part; nothing where the recording has no truth.
+
+    Returns:
+        `ari` (over the Gaussians whose true label is known), `true_parts` (those that move), `missed` (the
+        names of those that no part was matched to).
+    """
+    sequence = recording.tracked
+    truth = sequence.truth
+    if truth is None or not truth.names:
+        return {}
+    if not (sequence.has_masks and sequence.has_depth):
+        notes.add("Parts were not scored: which Gaussian is of which true part takes masks and depth.")
+        return {}
+    labels = _true_labels(scene, recording, anchor)
+    poses = {int(label): truth.poses[:, k] for k, label in enumerate(truth.label_ids)}
+    scores = score_tracks(_tracks(scene, trajectory), labels, poses, anchor)
+    moving = [label for label in poses if _moved_mm(scene, labels, label, poses[label], anchor) > _STILL_MM]
+    still = [truth.names[list(poses).index(label)] for label in poses if label not in moving]
+    if still:
+        notes.add(f"Counted as background, for it does not move: {', '.join(still)}.")
+    known = np.where(np.isin(labels, [-1, *moving]), labels, BACKGROUND)
+    found = np.asarray(scene.labels)
+    match = match_parts(found, known)
+    names = dict(zip(poses, truth.names, strict=True))
+    joint_of = dict(zip(poses, truth.joints or [None] * len(poses), strict=True))
+    for label, part in match.found.items():
+        if label == BACKGROUND or part == BACKGROUND:
+            continue
+        row = rows[part - 1]
+        row |= {"true_name": names[label], "iou": match.ious[label], **motion_metrics(scores[label])}
+        row["moved_mm"] = scores[label].moved_mm
+        joint, fitted = joint_of[label], joints[part]
+        if joint is not None and fitted.joint is not None:
+            middle = np.asarray(scene.gaussians.means)[found == part].mean(0)
+            row |= joint_error(fitted.joint, joint, middle.astype(np.float64), anchor)._asdict()
+            row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
+    matched = {label for label, part in match.found.items() if part != BACKGROUND}
+    return {
+        "ari": adjusted_rand_index(found, known),
+        "true_parts": len(moving),
+        "missed": [names[label] for label in moving if label not in matched],
+    }
+
+
+def _true_labels(scene: PartScene, recording: Recording, anchor: int) -> Int[np.ndarray, "N"]:
+    sequence = recording.tracked
+    seen = [(sequence.mask(anchor, c), sequence.depth(anchor, c), c) for c in range(sequence.num_cameras)]
+    masks, depths, cameras = zip(
+        *(one for one in seen if one[0] is not None and one[1] is not None), strict=True
+    )
+    views = [sequence.viewmats[anchor, c] for c in cameras], [sequence.Ks[anchor, c] for c in cameras]
+    return true_labels(np.asarray(scene.gaussians.means), masks, depths, *views)
+
+
+def _tracks(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T N 3"]:
+    """Where all Gaussians are at all times."""
+    moved = jax.jit(lambda pose: skin_means(scene.gaussians.means, scene.weights, scene.centers, pose))
+    poses = trajectory.poses
+    return np.stack([moved(HandlePose(*one)) for one in zip(poses.quats, poses.translations, strict=True)])
+
+
+def _moved_mm(scene: PartScene, labels: np.ndarray, label: int, poses: np.ndarray, anchor: int) -> float:
+    """How far the true part's Gaussians move at most, on average over them."""
+    points = np.asarray(scene.gaussians.means, np.float64)[labels == label]
+    if not len(points):
+        return 0.0
+    motion = relative_motion(poses, anchor)
+    moved = np.einsum("tij,nj->tni", motion[:, :3, :3], points) + motion[:, None, :3, 3]
+    return 1000 * float(np.linalg.norm(moved - points, axis=-1).mean(-1).max())

@@ -1,0 +1,64 @@
+"""MotionSplicer (papers/001): parts of a moving scene, found by their motion without annotation, and edited.
+
+    anchor = choose_anchor(views.image, views.num_frames, views.num_cameras)
+    start = begin(views, gaussians, anchor, config, segmenter, key)    # gaussians: the scene at the anchor
+    for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
+    parts, _ = without_needless(views, followed.parts, config)
+    scene, trajectory = outcome(start, parts, times)
+
+config.py    what can be set              stream.py   one step of the optimisation
+anchor.py    which frame is canonical     unify.py    which parts are one
+masks.py     what moves in every view     follow.py   the loop over frames
+lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
+weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
+discover.py  all that, before any motion
+"""
+
+from gsjax.methods.motion_parts.anchor import Anchor, choose_anchor, moved_pixels
+from gsjax.methods.motion_parts.config import DiscoverConfig, PartsConfig, StreamConfig, UnifyConfig
+from gsjax.methods.motion_parts.discover import Start, Views, begin
+from gsjax.methods.motion_parts.finish import outcome, without_needless
+from gsjax.methods.motion_parts.follow import Followed, Parts, first_parts, follow
+from gsjax.methods.motion_parts.stream import Canonical, StreamBatch, StreamParams, stream_loss, stream_step
+from gsjax.methods.motion_parts.trajectory import (
+    BACKGROUND,
+    Moment,
+    PartScene,
+    Trajectory,
+    gaussians_at,
+    moment,
+    still,
+    trajectory_of,
+)
+
+__all__ = [
+    "BACKGROUND",
+    "Anchor",
+    "Canonical",
+    "DiscoverConfig",
+    "Followed",
+    "Moment",
+    "PartScene",
+    "Parts",
+    "PartsConfig",
+    "Start",
+    "StreamBatch",
+    "StreamConfig",
+    "StreamParams",
+    "Trajectory",
+    "UnifyConfig",
+    "Views",
+    "begin",
+    "choose_anchor",
+    "first_parts",
+    "follow",
+    "gaussians_at",
+    "moment",
+    "moved_pixels",
+    "outcome",
+    "still",
+    "stream_loss",
+    "stream_step",
+    "trajectory_of",
+    "without_needless",
+]

@@ -1,0 +1,111 @@
+"""Which frame is canonical, and what differs from it: the difference image I_d (papers/001, section 3.2)."""
+
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+Load = Callable[[int, int], np.ndarray]
+"""(frame, camera) -> RGB picture, uint8."""
+
+_WIDTH = 96  # of the pictures by which frames are compared, pixels
+_BLUR = 1.0  # pixels; what a camera's noise and a hard edge's aliasing make is no motion
+_NOISE_FACTOR = 8.0  # a difference of so many noise levels is none of noise's
+_MOST_FRAMES = 16  # compared with the anchor at full size
+LEAST_MOVED = 1e-3
+"""Share of the pixels that must change for anything to have moved."""
+
+
+class Anchor(NamedTuple):
+    """The canonical frame.
+
+    Attributes:
+        frame: its index.
+        farthest: the frame that differs most from it.
+        differences: mean difference of each frame from it, 0 to 1, [T].
+        noise: what pixels differ by where nothing moves, 0 to 1.
+    """
+
+    frame: int
+    farthest: int
+    differences: Float[np.ndarray, "T"]
+    noise: float
+
+
+def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = None) -> Anchor:
+    """The frame with the largest mean I_d to all others, unless one is given.
+
+    Warns with UserWarning where the given one differs from the others by less than half of what the best
+    does: its parts are then hard to tell from what stands still.
+
+    Args:
+        load: pictures.
+        frames, cameras: how many there are.
+        anchor: the frame to take.
+
+    Raises:
+        ValueError: there is one frame only, or no such frame as the one given.
+    """
+    if frames < 2:
+        raise ValueError(f"frames: expected at least 2, between which something moves, found {frames}")
+    if anchor is not None and not 0 <= anchor < frames:
+        raise ValueError(f"anchor: expected a frame from 0 to {frames - 1}, found {anchor}")
+    small = np.stack([[_thumbnail(load(t, c)) for c in range(cameras)] for t in range(frames)])
+    flat = small.reshape(frames, -1, 3)
+    apart = np.stack([np.linalg.norm(flat - one, axis=-1).mean(-1) for one in flat]) / np.sqrt(3)
+    best = int(apart.mean(1).argmax())
+    chosen = best if anchor is None else anchor
+    if apart[chosen].mean() < 0.5 * apart[best].mean():
+        warnings.warn(
+            f"anchor: frame {chosen} differs from the others by {apart[chosen].mean():.3f} on average, frame "
+            f"{best} by {apart[best].mean():.3f}; parts that hardly move from the anchor are found badly",
+            stacklevel=2,
+        )
+    steps = np.linalg.norm(np.diff(flat, axis=0), axis=-1) / np.sqrt(3)
+    return Anchor(chosen, int(apart[chosen].argmax()), apart[chosen], float(np.median(steps)))
+
+
+def moved_pixels(
+    load: Load, anchor: Anchor, cameras: int, *, frames: int | None = None, threshold: float = 0.06
+) -> Bool[np.ndarray, "C H W"]:
+    """Which pixels of the anchor's pictures show something else in another frame: I_d above a threshold, or
+    above eight times the noise where there is more of that.
+
+    Args:
+        load: pictures.
+        anchor: from `choose_anchor`.
+        cameras: how many there are.
+        frames: how many other frames are compared, spread over all; 1 is the one that differs most, as in
+            the paper, in which what comes back to where it was is not seen to move. 16 unless given.
+        threshold: of colours from 0 to 1.
+    """
+    count = len(anchor.differences)
+    spread = np.linspace(0, count - 1, min(count, frames or _MOST_FRAMES)).round().astype(int)
+    others = {anchor.farthest} if frames == 1 else {*spread.tolist(), anchor.farthest} - {anchor.frame}
+    limit = max(threshold, _NOISE_FACTOR * anchor.noise)
+    moved = []
+    for c in range(cameras):
+        here = _blurred(load(anchor.frame, c))
+        largest = np.max([difference_image(_blurred(load(t, c)), here) for t in sorted(others)], axis=0)
+        moved.append(largest > limit)
+    return np.stack(moved)
+
+
+def difference_image(
+    a: Float[np.ndarray, "H W 3"], b: Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "H W"]:
+    """I_d = ||a - b|| over the channels, 0 to 1."""
+    return np.linalg.norm(a - b, axis=-1) / np.sqrt(3)
+
+
+def _thumbnail(picture: np.ndarray) -> Float[np.ndarray, "h w 3"]:
+    height, width = picture.shape[:2]
+    size = (_WIDTH, max(1, round(height * _WIDTH / width)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def _blurred(picture: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    return cv2.GaussianBlur(picture.astype(np.float32) / 255, (0, 0), _BLUR)

@@ -1,0 +1,87 @@
+"""How parts are found and followed. Comments become the command line's help."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gsjax.scene.feature_grid import FeatureGridConfig
+
+
+@dataclass(frozen=True)
+class DiscoverConfig:
+    """How the first masks are made."""
+
+    most_parts: int = 31
+    """How many parts there may be at any time, pieces that are yet to be joined included."""
+    threshold: float = 0.06
+    """What counts as changed: a difference of colours from 0 to 1."""
+    frames: int = 16
+    """With how many frames the anchor is compared; 1 is the paper's: with the one that differs most."""
+    lift_iterations: int = 32
+    """Steps by which masks become logits of Gaussians."""
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """How each frame's pose is found."""
+
+    iterations: int = 60
+    """Steps a frame."""
+    coarse: float = 0.7
+    """Share of them that look at pictures of half the size."""
+    l1_weight: float = 0.8
+    """Lambda: of L1 in the loss; the rest is 1 - SSIM."""
+    depth_weight: float = 0.1
+    """Of the difference in depth, where cameras measure it."""
+    depth_limit: float = 0.05
+    """A difference beyond this is that of another thing, metres."""
+    tear_weight: float = 0.05
+    """Of neighbours that move apart, in a frame's first step; in its last a fifth. What no picture holds goes
+    with what it touches."""
+    hold_weight: float = 0.01
+    """Of weights that change: of parts that have not moved yet pictures tell nothing, and noise much."""
+    tear_scale: float = 0.5
+    """How far apart is torn, pixels."""
+    rate: float = 0.5
+    """Of Adam: how far a part is moved, and its border turned, in a frame's first step, pixels."""
+    final_rate: float = 0.05
+    """Of a frame's last step, over that of its first."""
+    field_rate: float = 1e-3
+    """Of Adam, for the grid that weights are made of."""
+    past: bool = True
+    """Each step looks at a frame of the past too, from which only the grid learns (temporal consistency)."""
+    blend: Literal["quaternion", "polar", "dual"] = "quaternion"
+    """Of rotations, where a Gaussian follows several handles."""
+
+
+@dataclass(frozen=True)
+class UnifyConfig:
+    """When parts become one, or two."""
+
+    every: int = 5
+    """Frames between looks; 0: never."""
+    least_cut: float = 5.0
+    """A part is divided where pictures pull its sides apart by so many times what chance would make."""
+    noise: float = 2.5
+    """What tracking errs by, pixels: what has moved less is not compared yet."""
+    tolerance: float = 0.15
+    """Parts whose motions differ by less than such a share of the lesser motion are one."""
+    least_gain: float = 2e-3
+    """In the end a part joins another, or stands still, where pictures get worse by less than this share."""
+
+
+@dataclass(frozen=True)
+class PartsConfig:
+    """How parts are found and followed."""
+
+    discover: DiscoverConfig = field(default_factory=DiscoverConfig)
+    stream: StreamConfig = field(default_factory=StreamConfig)
+    unify: UnifyConfig = field(default_factory=UnifyConfig)
+    grid: FeatureGridConfig = field(
+        default_factory=lambda: FeatureGridConfig(
+            levels=6, least_resolution=6, most_resolution=96, log2_entries=14, features=4, hidden=32
+        )
+    )
+    """Of skinning weights."""
+    headroom: float = 1.6
+    """How many times as much as it needs a plan holds at first."""
+    seed: int = 0

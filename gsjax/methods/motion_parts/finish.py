@@ -1,0 +1,128 @@
+"""The end of a discovery: parts that no picture needs are given up, and the others are what edits work on."""
+
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
+from gsjax.methods.motion_parts.discover import Start, Views, centers_of
+from gsjax.methods.motion_parts.follow import Parts, joined, seen_at
+from gsjax.methods.motion_parts.stream import Canonical, picture_loss, posed
+from gsjax.methods.motion_parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
+from gsjax.optim.compiler import host_options
+from gsjax.scene.frame import part_of
+from gsjax.scene.gaussians import take
+from gsjax.scene.handles import HandlePose
+from gsjax.scene.render import plan_render, render
+
+_FRAMES, _CAMERAS = 6, 3  # by which parts are judged
+_SHRINK = 2
+
+
+def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[Parts, list[tuple[int, int]]]:
+    """Parts that pictures need: from the smallest on, each joins the part that it touches, or the background,
+    with which pictures get worst by least, if that is less than `unify.least_gain`; and who joined whom.
+
+    What a scene does not require is not modelled. It is decided by what is seen, and not by how motions
+    compare: the motion of a thin piece is badly known, and matters little for the same reason.
+    """
+    judge = _Judge(views, parts, config)
+    pairs: list[tuple[int, int]] = []
+    while True:
+        weights = np.asarray(parts.weights)
+        labels = weights.argmax(-1)
+        here = judge(parts, weights)
+        for part in _smallest_first(labels):
+            ways = {q: judge(parts, given(weights, part, q)) for q in touching(parts, labels, part)}
+            best = min(ways, key=ways.__getitem__)
+            if ways[best] <= (1 + config.unify.least_gain) * here:
+                into = np.arange(weights.shape[1])
+                into[part] = best
+                parts, pair = joined(parts, into)
+                pairs += pair
+                break
+        else:
+            return parts, pairs
+
+
+def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
+    """The weights with those of a part given to another."""
+    changed = weights.copy()
+    changed[:, to] += changed[:, part]
+    changed[:, part] = 0
+    return changed
+
+
+def touching(parts: Parts, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
+    """The parts that a part touches, and the background."""
+    neighbors = np.asarray(parts.canonical.neighbors)[labels == part].ravel()
+    all_ = np.concatenate([labels, np.full(parts.canonical.fixed.num, BACKGROUND)])
+    return sorted({BACKGROUND, *np.unique(all_[neighbors]).tolist()} - {part})
+
+
+def _smallest_first(labels: Int[np.ndarray, "M"]) -> list[int]:
+    names, counts = np.unique(labels[labels != BACKGROUND], return_counts=True)
+    return names[np.argsort(counts, kind="stable")].tolist()
+
+
+class _Judge:
+    """How well parts explain some pictures, spread over frames and cameras."""
+
+    def __init__(self, views: Views, parts: Parts, config: PartsConfig):
+        self._loss = _compiled(config.stream)
+        done = np.flatnonzero(parts.done)
+        frames = done[np.linspace(0, len(done) - 1, min(_FRAMES, len(done))).round().astype(int)]
+        self._seen = []
+        for i, t in enumerate(frames.tolist()):
+            frame = part_of(views.frame(t), (), _SHRINK)
+            cameras = [(i + k * views.num_cameras // _CAMERAS) % views.num_cameras for k in range(_CAMERAS)]
+            seen = seen_at(frame, parts.canonical, parts.weights, parts.pose(t))
+            self._seen += [(t, jax.tree.map(lambda a, c=c: a[c : c + 1], seen)) for c in sorted(set(cameras))]
+        scene = posed(parts.canonical, parts.weights, parts.pose(int(done[0])))
+        self._plan = plan_render(scene, frame.cameras, headroom=2 * config.headroom)
+
+    def __call__(self, parts: Parts, weights: Float[np.ndarray, "M P"]) -> float:
+        arguments = parts.canonical, jnp.asarray(weights)
+        return float(
+            np.mean([self._loss(*arguments, parts.pose(t), seen, self._plan) for t, seen in self._seen])
+        )
+
+
+@lru_cache(maxsize=2)
+def _compiled(config: StreamConfig):
+    @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+    def loss(canonical: Canonical, weights, pose, seen, plan):
+        scene = posed(canonical, weights, pose, config.blend)
+        return picture_loss(render(scene, seen.frame.cameras, plan, roi=seen.counts), seen, config)
+
+    return loss
+
+
+def outcome(start: Start, parts: Parts, times: Float[np.ndarray, "T"]) -> tuple[PartScene, Trajectory]:
+    """The scene with its parts, all Gaussians in the order in which they were given, and where parts were.
+
+    Handles that nothing follows are left out, and the others stand in the middle of what follows them.
+    """
+    weights = np.asarray(parts.weights)
+    labels = weights.argmax(-1)
+    kept = [BACKGROUND, *(p for p in np.unique(labels).tolist() if p != BACKGROUND)]
+    count = len(start.order)
+    full = np.zeros((count, len(kept)), np.float32)
+    full[:, BACKGROUND] = 1
+    full[start.order[: len(weights)]] = weights[:, kept] / weights[:, kept].sum(-1, keepdims=True)
+    before = np.asarray(parts.canonical.centers)[kept]
+    means = np.asarray(parts.canonical.movable.means)
+    after = centers_of(means, labels, weights.shape[1])[kept]
+    quats = jnp.asarray(parts.quats[:, kept])
+    # x -> R (x - c) + c + T is the same motion about any c: T' = T + (R - I)(c' - c) .
+    turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(quats), jnp.asarray(after - before))
+    translations = jnp.asarray(parts.translations[:, kept]) + turned - (after - before)
+    everything = jax.tree.map(
+        lambda a, b: jnp.concatenate([a, b]), parts.canonical.movable, parts.canonical.fixed
+    )
+    scene = PartScene(take(everything, np.argsort(start.order)), jnp.asarray(full), jnp.asarray(after))
+    return scene, trajectory_of(jnp.asarray(times, quats.dtype), HandlePose(quats, translations))

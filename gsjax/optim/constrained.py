@@ -1,0 +1,77 @@
+"""Weights whose rows stay on the probability simplex: no entry below 0, and 1 in sum.
+
+The projection is jaxopt's, which is no longer developed: only this module imports it, and should it go, optax
+has the same. jaxopt's `ProjectedGradient` is not used: it searches along lines and so asks for one loss again
+and again, where ours looks at another view each time. `simplex_descent` is an optimizer like those of optax:
+
+    gradient_step(loss, simplex_descent(0.01))                                                weights alone
+    gradient_step(loss, per_field_adam(rates, others={"weights": simplex_descent(0.01)}))     and other fields
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxopt.projection import projection_simplex
+from jaxtyping import Array, Float, Int, PyTree
+
+_DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as of Adam elsewhere
+
+
+def project_simplex(values: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
+    """The nearest point on the simplex of each row: max(v - tau, 0), with tau such that it sums to 1.
+
+    Its derivative is that of the entries above 0, less their mean, and 0 for the others, also at kinks. An
+    entry of -inf becomes 0; a row with a NaN or +inf becomes NaN, and no other row does.
+    """
+    # A constant added to a row changes nothing, and without one the sum is exact for large values too.
+    offsets = jax.lax.stop_gradient(values.max(axis=-1, keepdims=True))
+    rows = (values - offsets).reshape(-1, values.shape[-1])
+    return jax.vmap(projection_simplex)(rows).reshape(values.shape)
+
+
+class _Moments(NamedTuple):
+    count: Int[Array, ""]
+    mean: PyTree
+    square: PyTree
+
+
+def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
+    """Projected gradient descent with Adam's moments, for arrays [..., P] whose rows lie on the simplex.
+
+    For each row w with gradient g, less its mean, of which the projection takes no notice:
+
+        m <- 0.9 m + 0.1 g,    v <- 0.999 v + 0.001 mean(g^2),    w <- project_simplex(w - rate m / sqrt(v))
+
+    with m and v corrected for their start at 0, as in Adam. Adam itself, with a v for each entry, stops at
+    wrong places: where all entries of a row are pulled the same way, however unequally, it moves them alike,
+    and the projection undoes that. With one v a row, it stops where plain projected descent does.
+
+    Args:
+        rate: about how far entries move in a step, of 1; or a schedule of it.
+    """
+
+    def init(weights):
+        square = jax.tree.map(lambda w: jnp.zeros_like(w[..., :1]), weights)
+        return _Moments(jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, weights), square)
+
+    def update(gradients, state, weights):
+        del weights
+        centered = jax.tree.map(lambda g: g - g.mean(axis=-1, keepdims=True), gradients)
+        squares = jax.tree.map(lambda g: jnp.mean(g**2, axis=-1, keepdims=True), centered)
+        mean = optax.tree_utils.tree_update_moment(centered, state.mean, _DECAY, order=1)
+        square = optax.tree_utils.tree_update_moment(squares, state.square, _SQUARE_DECAY, order=1)
+        count = state.count + 1
+        m = optax.tree_utils.tree_bias_correction(mean, _DECAY, count)
+        v = optax.tree_utils.tree_bias_correction(square, _SQUARE_DECAY, count)
+        return jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + _EPS), m, v), _Moments(count, mean, square)
+
+    def project(updates, weights):
+        return jax.tree.map(lambda u, w: project_simplex(w + u) - w, updates, weights)
+
+    return optax.chain(
+        optax.GradientTransformation(init, update),
+        optax.scale_by_learning_rate(rate),
+        optax.stateless(project),
+    )

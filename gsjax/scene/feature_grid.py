@@ -1,0 +1,214 @@
+"""A field over a box: features in a multiresolution hash grid, and a small network on them (Müller et al.
+2022, "Instant Neural Graphics Primitives", section 3). What it maps a place to is up to its user: logits of
+skinning weights (papers/001, section 3.3), or semantic features (papers/002, section 3.3).
+
+Level l has a resolution N_l, and b is such that they reach from the least to the most (eq. 2, 3):
+
+    N_l = floor(N_min b^l),    b = exp((ln N_max - ln N_min) / (L - 1))
+
+A position x, 0 to 1 within the box, lies at (N_l - 1) x + 1/2 among the vertices 0, 1, ... N_l of each axis,
+and its features are interpolated between the eight around it. Scale and offset are those of tiny-cuda-nn, the
+paper's own code, so that a field is here what it is elsewhere; the offset keeps the cells of all levels from
+beginning together on the faces of the box. Two things differ. tiny-cuda-nn scales by b^l N_min - 1, without
+the floor. And it has entries for N_l vertices an axis, so that the last, which half a cell needs, shares an
+entry with another; here it has its own.
+
+A level of which all vertices, (N_l + 1)^3, fit the table is dense: each has an entry of its own. In finer
+ones they share entries by the paper's hash (eq. 4).
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+
+_PRIMES = (1, 2_654_435_761, 805_459_861)
+_FIRST_FEATURES = 1e-4  # largest at the start, as in the paper
+
+
+@dataclass(frozen=True)
+class FeatureGridConfig:
+    """Sizes of a grid and of its network; the defaults are those of FD-3DGS (papers/002, section 4)."""
+
+    levels: int = 16
+    least_resolution: int = 16
+    """Of the coarsest level."""
+    most_resolution: int = 128
+    """Of the finest level."""
+    log2_entries: int = 20
+    """A level has at most 2 to this power entries; one with more vertices is hashed."""
+    features: int = 8
+    """Numbers in an entry."""
+    hidden: int = 128
+    """Width of the network's hidden layers."""
+    depth: int = 1
+    """How many hidden layers there are."""
+
+    def __post_init__(self):
+        ranges = {
+            "levels": (1, 64),
+            "least_resolution": (2, 2**20),
+            "most_resolution": (self.least_resolution, 2**20),
+            "log2_entries": (3, 24),
+            "features": (1, np.inf),
+            "hidden": (1, np.inf),
+            "depth": (0, np.inf),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                to = "" if high == np.inf else f" and at most {high}"
+                raise ValueError(f"{name}: expected at least {low}{to}, found {value}")
+        if self.levels == 1 and self.least_resolution != self.most_resolution:
+            raise ValueError(
+                f"levels: expected at least 2 from resolution {self.least_resolution} to "
+                f"{self.most_resolution}, found 1; make both resolutions the same, or add levels"
+            )
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """N_l of each level, from the coarsest to the finest.
+
+        In float64, and a little more than the power before the floor: float32 makes 31 of 32.
+        """
+        powers = np.geomspace(self.least_resolution, self.most_resolution, self.levels)
+        return tuple(int(n) for n in np.floor(powers + 1e-6))
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """How many each level has."""
+        return tuple(min((n + 1) ** 3, 2**self.log2_entries) for n in self.resolutions)
+
+    @property
+    def dense(self) -> tuple[bool, ...]:
+        """Whether each vertex of a level has an entry of its own."""
+        return tuple((n + 1) ** 3 <= 2**self.log2_entries for n in self.resolutions)
+
+
+class Located(NamedTuple):
+    """Where N positions lie in the grid: between which entries, and how near to each.
+
+    Attributes:
+        indices: rows of the grid's table, of the eight vertices around the position at each level.
+        weights: of those in the interpolation; 1 in sum, or all 0 where a coordinate is NaN.
+        valid: whether all three coordinates are numbers.
+    """
+
+    indices: Int[Array, "N L 8"]
+    weights: Float[Array, "N L 8"]
+    valid: Bool[Array, "N"]
+
+
+class FeatureGrid(eqx.Module):
+    """A function of the place. All leaves are floats, so `jax.grad` takes the whole.
+
+    Attributes:
+        table: features of all levels' entries, one level after another.
+        layers: of the network, with a ReLU between them.
+        config: sizes.
+        bounds: least and largest coordinates of the box, metres.
+    """
+
+    # All levels in one, so one gather and one scatter-add: a table a level takes 1.4 times as long on a CPU.
+    table: Float[Array, "entries F"]
+    layers: tuple[eqx.nn.Linear, ...]
+    config: FeatureGridConfig = eqx.field(static=True)
+    bounds: tuple[tuple[float, ...], tuple[float, ...]] = eqx.field(static=True)
+
+    def __call__(self, positions: Float[Array, "N 3"]) -> Float[Array, "N outputs"]:
+        """Outputs at positions in metres; those outside the box count as on its surface.
+
+        A position with a NaN gives a row of NaN, and nothing else: gradients of the other rows are as they
+        would be without it.
+        """
+        return self.at(locate(self, positions))
+
+    def at(self, located: Located) -> Float[Array, "N outputs"]:
+        """Outputs at positions that `locate` has found, for those that stay while the grid is trained."""
+        values = self.encode(located)
+        for layer in self.layers[:-1]:
+            values = jax.nn.relu(jax.vmap(layer)(values))
+        values = jax.vmap(self.layers[-1])(values)
+        # Not before: the network's gradient would meet the NaN even where nobody asks for that row.
+        return jnp.where(located.valid[:, None], values, jnp.nan)
+
+    def encode(self, located: Located) -> Float[Array, "N features"]:
+        """What the network is given: the interpolated features of all levels; 0 where a position is NaN."""
+        # As a sum of products, which XLA fuses with the gather, it takes two to nine times as long on a CPU.
+        near = self.table[located.indices]
+        found = jnp.einsum("nlc,nlcf->nlf", located.weights, near, precision="highest")
+        return found.reshape(len(found), -1)
+
+
+def init_feature_grid(
+    key: PRNGKeyArray, config: FeatureGridConfig, outputs: int, bounds: ArrayLike
+) -> FeatureGrid:
+    """A grid of small random features and a network with `outputs` outputs.
+
+    Args:
+        key: for both.
+        config: sizes.
+        outputs: how many numbers a position is mapped to.
+        bounds: [2, 3], least and largest coordinates of the box, metres. They are static: a function that was
+            compiled for a grid is compiled anew for one in another box.
+
+    Raises:
+        ValueError: there are no outputs, or the box is none.
+    """
+    if outputs < 1:
+        raise ValueError(f"outputs: expected at least 1, found {outputs}")
+    box = np.asarray(bounds, np.float32)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise ValueError(
+            f"bounds: expected [2, 3], least and largest coordinates, found {box.tolist()}; the largest must "
+            "be larger, also in float32: give a flat scene a margin"
+        )
+    key, *keys = jax.random.split(key, config.depth + 2)
+    shape = (sum(config.entries), config.features)
+    table = jax.random.uniform(key, shape, minval=-_FIRST_FEATURES, maxval=_FIRST_FEATURES)
+    widths = (config.levels * config.features, *[config.hidden] * config.depth, outputs)
+    layers = [eqx.nn.Linear(*pair, key=one) for *pair, one in zip(widths[:-1], widths[1:], keys, strict=True)]
+    low, high = box.tolist()
+    return FeatureGrid(table, tuple(layers), config, (tuple(low), tuple(high)))
+
+
+def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
+    """Where positions, in metres, lie in the grid; those outside the box count as on its surface.
+
+    Weights have derivatives by the positions, except across faces of cells, where those jump, and outside.
+    """
+    dtype = positions.dtype
+    low, high = jnp.asarray(grid.bounds, dtype)
+    valid = ~jnp.isnan(positions).any(axis=-1)
+    inside = jnp.where(valid[:, None], (positions - low) / (high - low), 0.5)
+    # Not `clip`, which halves the derivative on the surface, where the outermost points of a scene are.
+    inside = jnp.where(inside < 0, 0.0, jnp.where(inside > 1, 1.0, inside))
+
+    edges = jnp.asarray(np.array(grid.config.resolutions) - 1, dtype)
+    scaled = inside[:, None, :] * edges[:, None] + 0.5
+    cells = jnp.floor(scaled)
+    along = [(1 - upper, upper) for upper in jnp.moveaxis(scaled - cells, -1, 0)]
+    weights = jnp.stack([x * y * z for x, y, z in product(*along)], axis=-1)
+    weights = jnp.where(valid[:, None, None], weights, 0.0)
+    return Located(_entries(grid.config, cells.astype(jnp.uint32)), weights, valid)
+
+
+def _entries(config: FeatureGridConfig, cells: UInt32[Array, "N L 3"]) -> Int[Array, "N L 8"]:
+    """Rows of the table of the eight vertices around each level's cell."""
+    dense = np.array(config.dense)
+    edges = np.array(config.resolutions) + 1
+    strides = np.stack([np.ones_like(edges), edges, edges**2], axis=-1)
+    factors = np.where(dense[:, None], strides, np.array(_PRIMES)).astype(np.uint32)
+    # The hash's products are modulo 2^32, as those of uint32 are.
+    begins = jnp.moveaxis(cells * factors, -1, 0)
+    along = [(begin, begin + factor) for begin, factor in zip(begins, factors.T, strict=True)]
+    mask = np.uint32(2**config.log2_entries - 1)
+    rows = [jnp.where(dense, x + y + z, (x ^ y ^ z) & mask) for x, y, z in product(*along)]
+    offsets = np.cumsum([0, *config.entries[:-1]]).astype(np.uint32)
+    return (jnp.stack(rows, axis=-1) + offsets[:, None]).astype(jnp.int32)

@@ -1,0 +1,84 @@
+"""Scenes of parts and trajectories whose edits have known answers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsjax.methods.motion_parts.trajectory import Moment, PartScene, Trajectory, trajectory_of
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.handles import HandlePose
+
+STEP = 0.125  # seconds between moments: all times are told exactly, so moments can be hit to the bit
+
+
+def scene_of(seed, num=7, parts=3):
+    """A scene with soft weights."""
+    rng = np.random.default_rng(seed)
+    shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
+    gaussians = Gaussians(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
+    weights = jnp.asarray(rng.dirichlet(np.ones(parts), num))
+    return PartScene(gaussians, weights, jnp.asarray(rng.normal(size=(parts, 3))))
+
+
+def whole(scene, part):
+    """The scene, all of it one part's."""
+    weights = jnp.zeros_like(scene.weights).at[:, part].set(1.0)
+    return PartScene(scene.gaussians, weights, scene.centers)
+
+
+def moment_of(seed, parts=3):
+    """A moment in which everything has changed."""
+    rng = np.random.default_rng(seed)
+    pose = HandlePose(jnp.asarray(rng.normal(size=(parts, 4))), jnp.asarray(rng.normal(size=(parts, 3))))
+    opacities, scales = rng.uniform(0.1, 0.9, parts), rng.uniform(0.5, 2.0, parts)
+    return Moment(pose, jnp.asarray(opacities), jnp.asarray(scales))
+
+
+def trajectory(seed, moments=9, parts=4):
+    """Parts that go anywhere, by no more than half a radian and 20 cm from moment to moment."""
+    rng = np.random.default_rng(seed)
+    steps = Rotation.from_rotvec(rng.uniform(-0.25, 0.25, (moments * parts, 3)))
+    turns = np.empty((moments, parts, 4))
+    now = [Rotation.random(rng=rng) for _ in range(parts)]
+    for t in range(moments):
+        now = [steps[t * parts + p] * now[p] for p in range(parts)]
+        turns[t] = [turn.as_quat(scalar_first=True) for turn in now]
+    shifts = np.cumsum(rng.uniform(-0.1, 0.1, (moments, parts, 3)), axis=0)
+    opacities, scales = rng.uniform(0.1, 0.9, (moments, parts)), rng.uniform(0.5, 2.0, (moments, parts))
+    poses = HandlePose(jnp.asarray(turns), jnp.asarray(shifts))
+    return Trajectory(STEP * jnp.arange(float(moments)), poses, jnp.asarray(opacities), jnp.asarray(scales))
+
+
+def jointed(joints, centers, times):
+    """The trajectory of handles at `centers` whose parts move by these joints."""
+    motions = np.stack([joint.motions() for joint in joints], axis=1)
+    turns = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    shifts = np.einsum("tpij,pj->tpi", motions[..., :3, :3], centers) + motions[..., :3, 3] - centers
+    poses = HandlePose(jnp.asarray(turns.reshape(*motions.shape[:2], 4)), jnp.asarray(shifts))
+    return trajectory_of(jnp.asarray(times), poses)
+
+
+def motions(trajectory, centers, part):
+    """Where a part's handle takes points of the world, [T, 4, 4]."""
+    quats = np.asarray(trajectory.poses.quats[:, part])
+    turns = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    found = np.tile(np.eye(4), (len(quats), 1, 1))
+    found[:, :3, :3] = turns
+    found[:, :3, 3] = trajectory.poses.translations[:, part] + centers[part] - turns @ centers[part]
+    return found
+
+
+def rows(trajectory, parts, indices):
+    """What parts do at these moments, as one list of arrays."""
+    chosen = (np.asarray(indices)[:, None], np.asarray(parts))
+    leaves = (trajectory.poses, trajectory.opacities, trajectory.scales)
+    return [np.asarray(leaf)[chosen] for leaf in jax.tree.leaves(leaves)]
+
+
+def assert_same(found, expected, atol=0.0):
+    """Two lists of arrays or two trees are equal, to the bit unless a tolerance is given."""
+    if atol:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), found, expected)
+    else:
+        jax.tree.map(np.testing.assert_array_equal, found, expected)

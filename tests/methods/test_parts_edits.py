@@ -1,0 +1,447 @@
+"""Edits compose as functions do, do what they say, and touch nothing else."""
+
+from functools import reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsjax.geometry.joints import Joint, fit_joint
+from gsjax.methods.motion_parts import edits
+from gsjax.methods.motion_parts.trajectory import gaussians_at, moment, still
+from tests.methods.made_up_parts import (
+    STEP,
+    assert_same,
+    jointed,
+    motions,
+    rows,
+    scene_of,
+    trajectory,
+    whole,
+)
+
+seeds = st.integers(0, 10_000)
+seen = jax.jit(lambda scene, film, t: gaussians_at(scene, moment(film, t)))
+TIMES = STEP * np.arange(9.0)  # 0 to 1 s
+ALL = range(4)
+TURN, ARM = jnp.array([0.3, -0.2, 0.5]), jnp.array([0.1, 0.2, -0.3])
+
+
+def hinge(angles, axis=(0.0, 0.0, 1.0), point=(0.0, 0.0, 0.0)):
+    return Joint("revolute", np.array(axis), np.array(point), np.asarray(angles, float))
+
+
+LID = hinge([0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.1, 1.2, 1.25], axis=(1.0, 0.0, 0.0), point=(0.3, -0.2, 0.1))
+DRAWER = Joint("prismatic", np.array([0.0, 1.0, 0.0]), np.zeros(3), 0.4 * TIMES**2)
+CENTERS = np.array([[0.0, 0.0, 0.0], [0.4, 0.1, 0.2], [-0.5, 0.3, 0.0]])
+STILL = hinge(np.zeros(9))
+
+TIME_EDITS = {
+    "speed": lambda t, parts: edits.speed(t, parts, 2.0),
+    "slower": lambda t, parts: edits.speed(t, parts, 0.3, begin=0.2),
+    "backwards": lambda t, parts: edits.speed(t, parts, -1.0, begin=0.25, end=0.75),
+    "loop": lambda t, parts: edits.loop(t, parts, 0.125, 0.5),
+    "bounce": lambda t, parts: edits.loop(t, parts, 0.25, 0.5, times=1, bounce=True),
+    "freeze": lambda t, parts: edits.freeze(t, parts, at=0.5),
+    "pause": lambda t, parts: edits.freeze(t, parts, begin=0.3, end=0.6),
+}
+LOOK_EDITS = {
+    "move": lambda t, parts: edits.move(t, parts, jnp.array([0.1, 0.3, -0.2])),
+    "rotate": lambda t, parts: edits.rotate(t, parts, TURN, ARM),
+    "redirect": lambda t, parts: edits.redirect(t, parts, TURN, at=0.5),
+    "amplify": lambda t, parts: edits.amplify(t, parts, 1.5),
+    "scale": lambda t, parts: edits.scale(t, parts, 0.5),
+    "fade": lambda t, parts: edits.fade(t, parts, 0.3),
+}
+EDITS = TIME_EDITS | LOOK_EDITS
+
+
+@pytest.mark.parametrize("edit", EDITS.values(), ids=EDITS)
+class TestEveryEdit:
+    def test_changes_its_parts_and_leaves_the_others_to_the_bit(self, edit):
+        before = trajectory(1)
+        after = edit(before, [1, 3])
+        assert_same(after.times, before.times)
+        assert_same(rows(after, [0, 2], range(9)), rows(before, [0, 2], range(9)))
+        pairs = zip(rows(after, [1, 3], range(9)), rows(before, [1, 3], range(9)), strict=True)
+        assert any((new != old).any(axis=0).all() for new, old in pairs)  # both of the parts
+
+    def test_does_nothing_to_no_parts(self, edit):
+        assert_same(edit(trajectory(2), []), trajectory(2))
+
+    def test_of_several_parts_is_that_of_each(self, edit):
+        before = trajectory(3)
+        assert_same(edit(before, [3, 1]), edit(edit(before, [1]), [3]), atol=1e-6)
+
+    def test_gives_the_same_under_jit_and_vmap(self, edit):
+        both = [trajectory(4), trajectory(5)]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
+        found = jax.jit(jax.vmap(lambda one: edit(one, [1, 2])))(stacked)
+        for i, one in enumerate(both):
+            assert_same(jax.tree.map(lambda leaf, i=i: leaf[i], found), edit(one, [1, 2]), atol=2e-5)
+
+    def test_gradients_are_finite_also_where_nothing_moves(self, edit):
+        for start in (trajectory(6), still(4, jnp.asarray(TIMES))):
+            slopes = jax.grad(lambda one: sum(x.sum() for x in jax.tree.leaves(edit(one, [1]))))(start)
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+
+    def test_names_a_part_that_is_not_there(self, edit):
+        with pytest.raises(ValueError, match="parts: expected numbers from 0 to 3, found 4"):
+            edit(trajectory(7), [1, 4])
+
+
+@given(seeds, st.permutations(sorted(EDITS)))
+def test_edits_of_different_parts_commute_to_the_bit(seed, order):
+    steps = [(EDITS[name], [part]) for name, part in zip(order, (1, 2, 3), strict=False)]
+    there = reduce(lambda t, step: step[0](t, step[1]), steps, trajectory(seed))
+    back = reduce(lambda t, step: step[0](t, step[1]), steps[::-1], trajectory(seed))
+    assert_same(there, back)
+
+
+class TestAtTimes:
+    @given(seeds)
+    def test_moments_that_are_hit_are_kept_to_the_bit_and_ends_hold(self, seed):
+        order = np.random.default_rng(seed).permutation(9)
+        found = edits.at_times(trajectory(seed), jnp.asarray([*TIMES[order], -0.1, 7.0]))
+        assert_same(rows(found, ALL, range(11)), rows(trajectory(seed), ALL, [*order, 0, 8]))
+
+    @pytest.mark.usefixtures("x64")
+    @given(seeds)
+    def test_between_moments_a_hinge_turns_about_its_axis(self, seed):
+        """A screw, not a chord: half way in time is half way in the angle, at any place of the handle."""
+        rng = np.random.default_rng(seed)
+        axis, point = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]), rng.normal(size=3)
+        angles, centers = np.cumsum(rng.uniform(-1.5, 1.5, 9)), rng.normal(size=(1, 3))
+        seen = jointed([Joint("revolute", axis, point, angles)], centers, TIMES)
+        when = rng.uniform(0, 1, 20)
+        expected = Joint("revolute", axis, point, np.interp(when, TIMES, angles)).motions()
+        found = motions(edits.at_times(seen, jnp.asarray(when)), centers, 0)
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+    @pytest.mark.usefixtures("x64")
+    def test_between_moments_sizes_and_opacities_go_in_proportion_and_signs_mean_nothing(self):
+        one = trajectory(0)
+        flipped = eqx.tree_at(lambda t: t.poses.quats, one, one.poses.quats.at[::2].multiply(-3.0))
+        when = jnp.asarray([0.03, 0.31, 0.9])
+        found, other = edits.at_times(one, when), edits.at_times(flipped, when)
+        assert_same(other.poses.translations, found.poses.translations, atol=1e-12)
+        dots = jnp.abs(jnp.sum(other.poses.quats * found.poses.quats, axis=-1))
+        np.testing.assert_allclose(dots, 1.0, atol=1e-12)
+        for p in ALL:
+            for name in ("opacities", "scales"):
+                expected = np.interp(when, TIMES, getattr(one, name)[:, p])
+                np.testing.assert_allclose(getattr(found, name)[:, p], expected, atol=1e-12)
+
+    def test_one_moment_is_for_ever(self):
+        found = edits.at_times(trajectory(0, moments=1), jnp.asarray([-1.0, 0.0, 3.0]))
+        assert_same(rows(found, ALL, range(3)), rows(trajectory(0, moments=1), ALL, [0, 0, 0]))
+
+
+def plays(edited, seed, indices, parts=(1,)):
+    """Whether parts show these moments of `trajectory(seed)`, to the bit."""
+    assert_same(rows(edited, parts, range(9)), rows(trajectory(seed), parts, indices))
+
+
+class TestTime:
+    @pytest.mark.parametrize(
+        ("edit", "indices"),
+        [
+            (lambda t: edits.speed(t, [1], 2.0), [0, 2, 4, 6, 8, 8, 8, 8, 8]),
+            (lambda t: edits.speed(t, [1], 2.0, 0.25, 0.75), [0, 1, 2, 4, 6, 7, 8, 8, 8]),
+            (lambda t: edits.speed(t, [1], -1.0), [8, 7, 6, 5, 4, 3, 2, 1, 0]),
+            (lambda t: edits.speed(t, [1], -2.0), [8, 6, 4, 2, 0, 0, 0, 0, 0]),
+            (lambda t: edits.speed(t, [1], -2.0, 0.25, 0.75), [0, 1, 6, 4, 2, 7, 8, 8, 8]),
+            (lambda t: edits.loop(t, [1], 0.25, 0.625), [0, 1, 2, 3, 4, 2, 3, 4, 2]),
+            (lambda t: edits.loop(t, [1], 0.125, 0.375, times=2), [0, 1, 2, 1, 2, 3, 4, 5, 6]),
+            (lambda t: edits.loop(t, [1], 0.25, 0.5, bounce=True), [0, 1, 2, 3, 4, 3, 2, 3, 4]),
+            (lambda t: edits.loop(t, [1], 0.0, 0.25, 1, True), [0, 1, 2, 1, 0, 1, 2, 3, 4]),
+            (lambda t: edits.loop(t, [1], 0.0, 0.25, 1, True, stay=True), [0, 1, 2, 1, 0, 0, 0, 0, 0]),
+            (lambda t: edits.loop(t, [1], 0.125, 0.375, 2, stay=True), [0, 1, 2, 1, 2, 3, 3, 3, 3]),
+            (lambda t: edits.speed(t, [1], 2.0, 0.25, 0.75, stay=True), [0, 1, 2, 4, 6, 6, 6, 6, 6]),
+            (lambda t: edits.speed(t, [1], -1.0, 0.0, 0.375, stay=True), [3, 2, 1, 0, 0, 0, 0, 0, 0]),
+            (lambda t: edits.freeze(t, [1], at=0.5), [0, 1, 2, 3, 4, 4, 4, 4, 4]),
+            (lambda t: edits.freeze(t, [1]), [0] * 9),
+            (lambda t: edits.freeze(t, [1], begin=0.25, end=0.625), [0, 1, 2, 2, 2, 2, 3, 4, 5]),
+            (lambda t: edits.freeze(t, [1], at=0.75, begin=0.0), [6] * 9),
+            (lambda t: edits.freeze(t, [1], 0.5, 0.25, 0.5), [0, 1, 4, 4, 4, 5, 6, 7, 8]),
+            (lambda t: edits.freeze(t, [1], begin=5.0), range(9)),
+            (lambda t: edits.speed(t, [1], 3.0, begin=5.0), range(9)),
+        ],
+    )
+    def test_shows_these_moments(self, edit, indices):
+        plays(edit(trajectory(8)), 8, indices)
+
+    @given(seeds)
+    def test_speed_1_and_one_loop_are_nothing_to_the_bit(self, seed):
+        for edited in (
+            edits.speed(trajectory(seed), ALL, 1.0, 0.2, 0.77),
+            edits.loop(trajectory(seed), ALL, 0.2, 0.77, times=1),
+        ):
+            assert_same(edited, trajectory(seed))
+
+    @given(seeds)
+    def test_backwards_twice_is_nothing(self, seed):
+        there = edits.speed(trajectory(seed), ALL, -1.0, 0.25, 0.75)
+        back = edits.speed(there, ALL, -1.0, 0.25, 0.75)
+        assert_same(rows(back, ALL, range(9)), rows(trajectory(seed), ALL, range(9)))
+
+    @pytest.mark.usefixtures("x64")
+    @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0))
+    def test_speeds_multiply(self, a, b):
+        """Of a steady motion, which has no detail between moments, in a film that is long enough for both."""
+        long = edits.at_times(jointed([hinge(TIMES)], CENTERS[1:2], TIMES), STEP * jnp.arange(210.0))
+        both = edits.speed(edits.speed(long, [0], a, 0.0, 1.0), [0], b, 0.0, 1 / a)
+        once = edits.speed(long, [0], a * b, 0.0, 1.0)
+        going = np.asarray(long.times) < 1 / (a * b) - STEP / b
+        assert_same(both.poses.translations[going], once.poses.translations[going], atol=3e-4)
+        # Where it stops between two moments, the corner is cut.
+        assert_same(both.poses.translations, once.poses.translations, atol=0.5 * STEP)
+
+    @given(seeds, st.sampled_from([1.0, 2.0, 4.0]))
+    def test_fast_backwards_is_backwards_and_then_fast(self, seed, factor):
+        there = edits.speed(trajectory(seed), [1], -1.0, 0.25, 0.75)
+        assert_same(
+            edits.speed(there, [1], factor, 0.25, 0.75),
+            edits.speed(trajectory(seed), [1], -factor, 0.25, 0.75),
+        )
+
+    @given(seeds, st.integers(1, 4), st.integers(0, 3))
+    def test_a_loop_has_its_period(self, seed, period, start):
+        begin = start * STEP
+        looped = edits.loop(trajectory(seed), [1], begin, begin + period * STEP)
+        first = rows(looped, [1], range(start, 9 - period))
+        assert_same(rows(looped, [1], range(start + period, 9)), first)
+
+    def test_rounding_of_times_does_not_show_the_wrong_side_of_a_seam(self):
+        """Thirtieths of seconds are told inexactly; a loop of 7 frames shows 7 frames all the same."""
+        times = jnp.arange(200.0) / 30
+        shifts = jnp.arange(200.0)[:, None, None] * jnp.ones(3)
+        counting = eqx.tree_at(lambda t: t.poses.translations, still(1, times), shifts)
+        shown = edits.loop(counting, [0], 3 / 30, 10 / 30).poses.translations[:, 0, 0]
+        expected = [0, 1, 2, *(3 + (i % 7) for i in range(197))]
+        np.testing.assert_allclose(shown, expected, atol=0.01)
+
+    @given(seeds, st.integers(0, 8), st.integers(0, 8))
+    def test_freezing_twice_is_freezing_at_the_earlier(self, seed, a, b):
+        once = edits.freeze(trajectory(seed), [1, 2], at=min(a, b) * STEP)
+        twice = edits.freeze(edits.freeze(trajectory(seed), [1, 2], at=a * STEP), [1, 2], at=b * STEP)
+        assert_same(twice, once)
+
+    def test_isolate_keeps_only_these_moving(self):
+        edited = edits.isolate(trajectory(9), [1, 2])
+        plays(edited, 9, range(9), parts=(1, 2))
+        plays(edited, 9, [0] * 9, parts=(0, 3))
+        assert_same(edits.isolate(edited, [1, 2]), edited)
+
+    def test_isolating_for_a_while_lets_the_others_wait(self):
+        edited = edits.isolate(trajectory(9), [1], begin=0.25, end=0.5)
+        plays(edited, 9, [0, 1, 2, 2, 2, 3, 4, 5, 6], parts=(0, 2, 3))
+
+    @pytest.mark.parametrize(
+        ("edit", "message"),
+        [
+            (lambda t: edits.speed(t, [1], 0.0), "factor: expected a number other than 0"),
+            (
+                lambda t: edits.speed(t, [1], 2.0, 0.5, 0.5),
+                "end: expected a time after begin, 0.5 s, found 0.5",
+            ),
+            (lambda t: edits.loop(t, [1], 0.5, 0.25), "end: expected a time after begin"),
+            (lambda t: edits.loop(t, [1], times=0), "times: expected 1 or more, found 0"),
+            (lambda t: edits.freeze(t, [1], at=0.5, end=0.25), "end: expected a time after begin, 0.5 s"),
+            (lambda t: edits.scale(t, [1], 0.0), "factor: expected more than 0, found 0"),
+            (lambda t: edits.fade(t, [-1]), "parts: expected numbers from 0 to 3, found -1"),
+        ],
+    )
+    def test_what_makes_no_sense_is_said(self, edit, message):
+        with pytest.raises(ValueError, match=message):
+            edit(trajectory(0))
+
+
+class TestDuring:
+    def test_holds_from_begin_until_end(self):
+        share = edits.during(jnp.asarray(TIMES), 0.25, 0.625)
+        np.testing.assert_array_equal(share, [0, 0, 1, 1, 1, 0, 0, 0, 0])
+        np.testing.assert_array_equal(edits.during(jnp.asarray(TIMES)), np.ones(9))
+
+    def test_comes_and_goes_smoothly_within_its_bounds(self):
+        times = jnp.linspace(0, 10, 1001)
+        share = np.asarray(edits.during(times, 2.0, 8.0, ease=2.0))
+        assert (share[times <= 2.0 - 1e-3] == 0).all()
+        assert (share[times >= 8.0] == 0).all()
+        assert (share[(times >= 4.0) & (times <= 6.0 - 1e-3)] == 1).all()
+        np.testing.assert_allclose(share[300], 0.5, atol=1e-3)
+        assert (np.diff(share[200:400]) >= 0).all()
+        assert np.abs(np.diff(share)).max() < 0.01  # steepest in the middle: 1.5 / 2 s
+
+    @pytest.mark.parametrize("name", ["move", "rotate", "redirect", "amplify", "scale", "fade"])
+    def test_outside_its_time_an_edit_changes_nothing_to_the_bit(self, name):
+        arguments = {"move": (ARM,), "rotate": (TURN, ARM), "redirect": (TURN,), "fade": (0.1,)}
+        share = edits.during(jnp.asarray(TIMES), 0.25, 0.75, ease=0.25)
+        edited = getattr(edits, name)(trajectory(3), [1], *arguments.get(name, (2.0,)), share=share)
+        outside, within = [0, 1, 2, 6, 7, 8], [3, 4, 5]
+        assert_same(rows(edited, [1], outside), rows(trajectory(3), [1], outside))
+        fully = getattr(edits, name)(trajectory(3), [1], *arguments.get(name, (2.0,)))
+        assert_same(rows(edited, [1], [4]), rows(fully, [1], [4]))
+        changed = zip(rows(edited, [1], within), rows(trajectory(3), [1], within), strict=True)
+        assert any((new != old).any(axis=-1).all() for new, old in changed)
+
+
+@pytest.fixture
+def room(x64):
+    """A background, a lid and a drawer."""
+    return jointed([STILL, LID, DRAWER], CENTERS, TIMES)
+
+
+class TestPlace:
+    @given(seeds)
+    def test_move_shifts_what_is_seen(self, seed):
+        scene, shift = whole(scene_of(seed, parts=4), 1), jnp.array([0.1, -0.2, 0.3])
+        edited = edits.move(trajectory(seed), [1], shift)
+        before, after = (seen(scene, t, 5) for t in (trajectory(seed), edited))
+        np.testing.assert_allclose(after.means, before.means + shift, atol=1e-5)
+
+    @pytest.mark.usefixtures("x64")
+    @given(seeds)
+    def test_rotate_turns_what_is_seen_about_the_handle_or_another_point_of_the_part(self, seed):
+        scene, turn = whole(scene_of(seed, parts=4), 1), Rotation.from_rotvec(np.asarray(TURN))
+        for arm in (jnp.zeros(3), ARM):
+            point = scene.centers[1] + arm  # of the part: seen as a Gaussian of it would be
+            marked = eqx.tree_at(lambda s: s.gaussians.means, scene, scene.gaussians.means.at[0].set(point))
+            one = trajectory(seed)
+            one = eqx.tree_at(lambda t: t.scales, one, jnp.ones_like(one.scales))
+            edited = edits.rotate(one, [1], TURN, arm)
+            before, after = (seen(marked, t, 5) for t in (one, edited))
+            pivot = np.asarray(before.means[0])
+            expected = pivot + turn.apply(np.asarray(before.means) - pivot)
+            np.testing.assert_allclose(after.means, expected, atol=1e-6)
+            turned = turn * Rotation.from_quat(np.asarray(before.quats), scalar_first=True)
+            found = Rotation.from_quat(np.asarray(after.quats), scalar_first=True)
+            np.testing.assert_allclose((found * turned.inv()).magnitude(), 0, atol=1e-6)
+
+    def test_rotating_about_a_hinge_opens_the_lid_further(self, room):
+        arm = jnp.asarray(LID.point - CENTERS[1])
+        edited = edits.rotate(room, [1], jnp.array([0.4, 0.0, 0.0]), arm)
+        expected = hinge(LID.values + 0.4, LID.axis, LID.point).motions()
+        np.testing.assert_allclose(motions(edited, CENTERS, 1), expected, atol=1e-6)
+
+    def test_turns_about_one_axis_add_up(self, room):
+        twice = edits.rotate(edits.rotate(room, [1], 0.3 * TURN), [1], 0.7 * TURN)
+        assert_same(twice, edits.rotate(room, [1], TURN), atol=1e-6)
+
+    def test_redirect_turns_the_hinge_and_not_the_lid(self, room):
+        """A quarter turn about the vertical through the handle takes the hinge from one edge to another."""
+        edited = edits.redirect(room, [1], jnp.array([0.0, 0.0, np.pi / 2]))
+        found = motions(edited, CENTERS, 1)
+        np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)
+        joint = fit_joint(found, CENTERS[1] + np.asarray(scene_of(0).gaussians.means)).joint
+        np.testing.assert_allclose(joint.axis, [0, 1, 0], atol=1e-5)
+        np.testing.assert_allclose(joint.values, LID.values, atol=1e-5)
+        turned = Rotation.from_rotvec([0, 0, np.pi / 2]).apply(LID.point - CENTERS[1]) + CENTERS[1]
+        np.testing.assert_allclose(np.cross(joint.point - turned, joint.axis), 0, atol=1e-5)
+
+    def test_redirect_about_a_point_of_the_hinge_replaces_its_axis(self, room):
+        arm = jnp.asarray(LID.point - CENTERS[1])
+        edited = edits.redirect(room, [1], jnp.array([0.0, 0.0, np.pi / 2]), arm)
+        expected = hinge(LID.values, (0.0, 1.0, 0.0), LID.point).motions()
+        np.testing.assert_allclose(motions(edited, CENTERS, 1), expected, atol=1e-6)
+
+    def test_redirect_sends_a_drawer_another_way(self, room):
+        edited = edits.redirect(room, [2], jnp.array([0.0, 0.0, -np.pi / 2]))
+        expected = Joint("prismatic", np.array([1.0, 0.0, 0.0]), np.zeros(3), DRAWER.values).motions()
+        np.testing.assert_allclose(motions(edited, CENTERS, 2), expected, atol=1e-6)
+
+    @pytest.mark.usefixtures("x64")
+    @given(seeds, st.integers(0, 8))
+    def test_redirect_and_amplify_leave_the_part_where_it_is_at_one_time(self, seed, index):
+        for edited in (
+            edits.redirect(trajectory(seed), [1], TURN, ARM, at=index * STEP),
+            edits.amplify(trajectory(seed), [1], -3.0, at=index * STEP),
+        ):
+            before = jaxlie.SO3(trajectory(seed).poses.quats[index, 1])
+            apart = (before.inverse() @ jaxlie.SO3(edited.poses.quats[index, 1])).log()
+            np.testing.assert_allclose(apart, 0, atol=1e-6)
+            expected = trajectory(seed).poses.translations[index, 1]
+            np.testing.assert_allclose(edited.poses.translations[index, 1], expected, atol=1e-6)
+
+    @pytest.mark.parametrize("factor", [0.0, 0.3, 1.7, -1.0])
+    def test_amplify_stays_on_hinges_and_rails(self, room, factor):
+        edited = edits.amplify(room, [1, 2], factor)
+        lid = hinge(factor * LID.values, LID.axis, LID.point).motions()
+        drawer = Joint("prismatic", DRAWER.axis, DRAWER.point, factor * DRAWER.values).motions()
+        np.testing.assert_allclose(motions(edited, CENTERS, 1), lid, atol=1e-6)
+        np.testing.assert_allclose(motions(edited, CENTERS, 2), drawer, atol=1e-6)
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_amplify_knows_more_than_half_a_turn(self, sign):
+        """Also when the part returns, and whatever the signs of the quaternions are."""
+        with jax.enable_x64(True):
+            angles = sign * np.array([0.5, 1.5, 2.9, 4.0, 5.5, 4.5, 3.3, 2.0, 0.5])
+            faucet = jointed([hinge(angles, LID.axis, LID.point)], CENTERS[1:2], TIMES)
+            edited = edits.amplify(faucet, [0], 0.5)
+            expected = hinge(angles[0] + 0.5 * (angles - angles[0]), LID.axis, LID.point).motions()
+            np.testing.assert_allclose(motions(edited, CENTERS[1:2], 0), expected, atol=1e-5)
+
+    def test_amplifications_multiply_and_1_is_nothing(self, room):
+        twice = edits.amplify(edits.amplify(room, [1, 2], 0.5), [1, 2], 3.0)
+        once = edits.amplify(room, [1, 2], 1.5)
+        for p in (1, 2):
+            np.testing.assert_allclose(motions(twice, CENTERS, p), motions(once, CENTERS, p), atol=1e-6)
+        assert_same(edits.amplify(room, [1, 2], 1.0), room)
+
+
+class TestLook:
+    def test_scale_and_fade_are_factors(self):
+        one = trajectory(0)
+        edited = edits.fade(edits.scale(edits.scale(one, [1], 2.0), [1], 0.25), [1, 2], 0.5)
+        np.testing.assert_allclose(edited.scales, one.scales * np.array([1, 0.5, 1, 1]), rtol=1e-6)
+        np.testing.assert_allclose(edited.opacities, one.opacities * np.array([1, 0.5, 0.5, 1]), rtol=1e-6)
+
+    def test_scale_grows_by_equal_factors(self):
+        share = jnp.linspace(0, 1, 9)
+        edited = edits.scale(still(2, jnp.asarray(TIMES)), [1], 16.0, share)
+        np.testing.assert_allclose(edited.scales[:, 1], 2 ** np.linspace(0, 4, 9), rtol=1e-5)
+
+    def test_ghost_shows_only_these(self):
+        one = trajectory(1)
+        edited = edits.ghost(one, [1, 2])
+        np.testing.assert_array_equal(edited.opacities[:, [0, 3]], 0)
+        np.testing.assert_array_equal(edited.opacities[:, [1, 2]], one.opacities[:, [1, 2]])
+        assert_same(edits.ghost(edited, [1, 2]), edited)
+        faint = edits.ghost(one, [1], 0.1).opacities
+        np.testing.assert_allclose(faint, one.opacities * np.array([0.1, 1, 0.1, 0.1]), rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("delay", "indices", "there"),
+        [(0.25, [0, 0, 0, 1, 2, 3, 4, 5, 6], slice(2, 9)), (-0.25, [2, 3, 4, 5, 6, 7, 8, 8, 8], slice(0, 9))],
+    )
+    def test_echo_is_a_faint_copy_at_another_time(self, delay, indices, there):
+        one = trajectory(2)
+        copy = edits.echo(one, [1], delay, 0.5)
+        assert_same(copy.times, one.times)
+        assert_same(jax.tree.map(lambda leaf: np.asarray(leaf)[indices], one.poses), copy.poses)
+        assert not copy.opacities[:, [0, 2, 3]].any()
+        expected = np.zeros(9)
+        expected[there] = 0.5 * np.asarray(one.opacities)[indices, 1][there]
+        np.testing.assert_allclose(copy.opacities[:, 1], expected, rtol=1e-6)
+
+
+def test_edits_compose_and_differentiate_as_one_function():
+    """What a user writes: half the speed, twice as far, fainter and elsewhere, for a while."""
+    scene = scene_of(0, parts=4)
+
+    def means(factor, shift):
+        one = edits.speed(trajectory(0), [1], 0.5)
+        one = edits.amplify(one, [1], factor)
+        one = edits.move(one, [1, 2], shift, edits.during(one.times, 0.2, 0.9, 0.1))
+        return jax.vmap(lambda t: gaussians_at(scene, moment(one, t)).means)(jnp.arange(9)).sum()
+
+    slopes = jax.jit(jax.grad(means, argnums=(0, 1)))(1.5, jnp.ones(3))
+    near = [(means(1.5 + h, jnp.ones(3)) - means(1.5 - h, jnp.ones(3))) / (2 * h) for h in (0.05,)]
+    np.testing.assert_allclose(slopes[0], near[0], rtol=2e-2)
+    assert (slopes[1] > 0).all()

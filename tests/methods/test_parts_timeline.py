@@ -1,0 +1,523 @@
+"""Edit scripts: what is written is done, what is wrong is said, and what is saved is read again."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsjax.methods.motion_parts import edits
+from gsjax.methods.motion_parts.film import Layer, film_gaussians
+from gsjax.methods.motion_parts.operations import (
+    OPERATIONS,
+    Amplify,
+    Composite,
+    Echo,
+    Fade,
+    Freeze,
+    Ghost,
+    Isolate,
+    Loop,
+    Move,
+    Place,
+    Redirect,
+    Rotate,
+    Scale,
+    Speed,
+)
+from gsjax.methods.motion_parts.timeline import Script, apply, parse_op, parse_script, to_yaml
+from gsjax.methods.motion_parts.trajectory import PartScene
+from tests.methods.made_up_parts import STEP, assert_same, rows, scene_of, trajectory
+
+NAMES = {"drawer": 1, "lid": 2, "faucet": 3}
+EXAMPLE = """
+fps: 8
+length: 2
+edits:
+  - {op: speed, parts: [drawer], factor: 2}
+  - {op: loop, parts: [2], from: 0.5, to: 1, times: 3}
+  - {op: freeze, parts: lid, at: 1.0}
+  - {op: echo, parts: [3], copies: 2, every: 0.25, fade: 0.5}
+  - {op: rotate, parts: [drawer, 3], axis: [0, 0, 1], degrees: 30, from: 0, to: 2, ease: 0.5}
+  - {op: composite, from_run: other, parts: [cup], place: {to: [1, 2, 3], degrees: 90, scale: 1e-1},
+     edits: [{op: speed, parts: all, factor: -1}]}
+"""
+
+
+def layer_of(seed=0, moments=9, start=0.0):
+    """Four parts, each Gaussian of one of them, from 0 to 1 s unless told."""
+    scene = scene_of(seed, num=8, parts=4)
+    scene = PartScene(scene.gaussians, jnp.eye(4)[jnp.arange(8) % 4], scene.centers)
+    one = trajectory(seed, moments)
+    return Layer(scene, type(one)(one.times + start, one.poses, one.opacities, one.scales))
+
+
+def film_of(*script, layer=None, load_scene=None, **options):
+    return apply(Script(edits=script, **options), layer or layer_of(), NAMES, load_scene)
+
+
+def shows(film, part, indices, layer=None):
+    """Whether a part shows these moments of the recording, to the bit."""
+    found = film[0].trajectory
+    assert len(found.times) == len(indices)
+    assert_same(
+        rows(found, [part], range(len(indices))), rows((layer or layer_of()).trajectory, [part], indices)
+    )
+
+
+class TestScripts:
+    def test_the_example_is_what_it_says(self):
+        script = parse_script(EXAMPLE)
+        assert (script.fps, script.length) == (8.0, 2.0)
+        assert script.edits == (
+            Speed(parts=("drawer",), factor=2.0),
+            Loop(parts=(2,), begin=0.5, end=1.0, times=3),
+            Freeze(parts=("lid",), at=1.0),
+            Echo(parts=(3,), copies=2, every=0.25, fade=0.5),
+            Rotate(parts=("drawer", 3), axis=(0.0, 0.0, 1.0), degrees=30.0, begin=0.0, end=2.0, ease=0.5),
+            Composite(
+                parts=("cup",),
+                from_run="other",
+                place=Place(to=(1.0, 2.0, 3.0), degrees=90.0, scale=0.1),
+                edits=(Speed(parts=("all",), factor=-1.0),),
+            ),
+        )
+
+    def test_nothing_is_a_script_that_changes_nothing(self):
+        assert parse_script("") == parse_script("edits: []") == Script()
+        film = film_of()
+        assert len(film) == 1
+        for part in range(4):
+            shows(film, part, range(9))
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("edits: [", "expected YAML, found a fault in line 1"),
+            ("- {op: speed}", "expected the keys fps, length, edits, found"),
+            ("edit: []", "edit: expected the keys fps, length, edits, found 'edit'; did you mean 'edits'?"),
+            ("fps: fast", "fps: expected frames a second, 0.1 to 1000, found 'fast'"),
+            ("length: 0", "length: expected seconds, 0.01 to 86400, found 0"),
+            ("edits: 3", "edits: expected a list of edits, found 3"),
+            ("edits: [speed]", "edits: edit 1: expected a mapping with the key op, found 'speed'"),
+            ("edits: [{op: fade, parts: 1}, {op: sped}]", "edit 2: op: expected one of isolate, freeze, "),
+            ("edits: [{op: sped, parts: 1}]", "found 'sped'; did you mean 'speed'?"),
+            ("edits: [{op: [1], parts: 1}]", "edit 1: op: expected one of "),
+            ("edits: [{op: speed, parts: 1}]", "edit 1 (speed): factor: expected a factor from 0.01 to 100"),
+            ("edits: [{op: speed, parts: 1}]", ", found nothing"),
+            (
+                "edits: [{op: speed, factor: 2}]",
+                "parts: expected names or numbers of parts, or all, found nothing",
+            ),
+            ("edits: [{op: speed, parts: 1, factor: 0}]", "factor: expected a factor from 0.01 to 100"),
+            ("edits: [{op: speed, parts: 1, factor: yes}]", "factor: expected a factor from 0.01 to 100"),
+            ("edits: [{op: speed, parts: 1, factr: 2}]", "found 'factr'; did you mean 'factor'?"),
+            ("edits: [{op: fade, parts: []}]", "parts: expected names or numbers of parts, or all, found []"),
+            ("edits: [{op: fade, parts: [1.5]}]", "parts: expected names or numbers of parts, or all, found"),
+            ("edits: [{op: fade, parts: [yes]}]", "parts: expected names or numbers of parts, or all, found"),
+            (
+                "edits: [{op: fade, parts: 1, opacity: 2}]",
+                "opacity: expected a factor on opacities, 0 to 1, found 2",
+            ),
+            ("edits: [{op: fade, parts: 1, from: 2, to: 1}]", "to: expected a time after from, 2, found 1"),
+            (
+                "edits: [{op: fade, parts: 1, from: -1}]",
+                "from: expected seconds from the film's start, 0 or more",
+            ),
+            (
+                "edits: [{op: fade, parts: 1, from: .nan}]",
+                "from: expected seconds from the film's start, 0 or more",
+            ),
+            (
+                "edits: [{op: loop, parts: 1, times: 1.5}]",
+                "times: expected a whole number from 1 to 1000, found 1.5",
+            ),
+            ("edits: [{op: loop, parts: 1, bounce: 1}]", "bounce: expected true or false, found 1"),
+            ("edits: [{op: move, parts: 1, by: [1, 2]}]", "by: expected metres as [x, y, z], found [1, 2]"),
+            ("edits: [{op: move, parts: 1, by: abc}]", "by: expected metres as [x, y, z], found 'abc'"),
+            (
+                "edits: [{op: rotate, parts: 1, axis: [0, 0, 0], degrees: 3}]",
+                "edit 1 (rotate): axis: expected a direction of the world as [x, y, z], found [0, 0, 0]",
+            ),
+            ("edits: [{op: echo, parts: 1, every: 0}]", "every: expected seconds other than 0, found 0"),
+            (
+                "edits: [{op: composite, parts: 1, from_run: ''}]",
+                "from_run: expected the folder of a run, found ''",
+            ),
+            (
+                "edits: [{op: composite, parts: 1, from_run: a, place: {too: 1}}]",
+                "edit 1 (composite): place: too: expected the keys to, axis, degrees, scale, found 'too'; "
+                "did you mean 'to'?",
+            ),
+            (
+                "edits: [{op: composite, parts: 1, from_run: a, edits: [{op: scale, parts: 1, factor: 0}]}]",
+                "edit 1 (composite): edits: edit 1 (scale): factor: expected a factor from 0.001 to 1000",
+            ),
+        ],
+    )
+    def test_what_is_wrong_is_said_with_its_place(self, text, message):
+        with pytest.raises(ValueError) as error:  # noqa: PT011
+            parse_script(text)
+        assert message in str(error.value)
+
+    def test_edits_made_in_python_are_checked_too(self):
+        with pytest.raises(ValueError, match=r"factor: expected a factor from 0\.01 to 100"):
+            Speed(parts=(1,), factor=1000.0)
+        with pytest.raises(ValueError, match="to: expected a time after from"):
+            Fade(parts=(1,), begin=1.0, end=1.0)
+
+    @pytest.mark.parametrize(
+        ("line", "edit"),
+        [
+            ("speed:parts=drawer,factor=2", Speed(parts=("drawer",), factor=2)),
+            ("freeze: parts=[1, lid], at=0.5", Freeze(parts=(1, "lid"), at=0.5)),
+            (
+                "rotate:parts=1,axis=[0, 0, 1],degrees=-3e1,from=1",
+                Rotate(parts=(1,), axis=(0, 0, 1), degrees=-30, begin=1),
+            ),
+            (
+                "composite:parts=all,from_run=runs/a=b,place={to: [1, 2, 3]}",
+                Composite(parts=("all",), from_run="runs/a=b", place=Place(to=(1, 2, 3))),
+            ),
+        ],
+    )
+    def test_one_line_is_one_edit(self, line, edit):
+        assert parse_op(line) == edit
+
+    @pytest.mark.parametrize(
+        ("line", "message"),
+        [
+            ("sped:parts=1", "did you mean 'speed'?"),
+            ("speed", "parts: expected names or numbers of parts, or all, found nothing"),
+            ("speed:parts=1,factor=[", "expected YAML, found"),
+            ("", "op: expected one of isolate, freeze"),
+        ],
+    )
+    def test_one_line_that_is_wrong_is_said_too(self, line, message):
+        with pytest.raises(ValueError) as error:  # noqa: PT011
+            parse_op(line)
+        assert message in str(error.value)
+
+
+numbers = st.floats(0.01, 50.0)
+vectors = st.tuples(*[st.floats(-9, -0.1) | st.floats(0.1, 9)] * 3)
+parts = st.lists(st.sampled_from([0, 1, 17, "drawer", "all", "no", "3", "tür: a"]), min_size=1).map(tuple)
+since = st.one_of(st.just({}), st.just({"begin": 0.0}), numbers.map(lambda x: {"begin": x, "end": 2 * x}))
+made = {
+    Isolate: {"at": st.none() | numbers},
+    Freeze: {"at": st.none() | numbers},
+    Speed: {"factor": numbers | numbers.map(lambda x: -x)},
+    Loop: {"times": st.none() | st.integers(1, 9), "bounce": st.booleans()},
+    Ghost: {"opacity": st.floats(0, 1)},
+    Fade: {"opacity": st.floats(0, 1), "ease": numbers},
+    Echo: {"copies": st.integers(1, 9), "every": numbers, "fade": st.floats(0, 1)},
+    Scale: {"factor": numbers},
+    Move: {"by": vectors},
+    Rotate: {"axis": vectors, "degrees": st.floats(-360, 360), "about": st.none() | vectors},
+    Redirect: {"axis": vectors, "degrees": numbers, "about": st.none() | vectors, "at": st.none() | numbers},
+    Amplify: {"factor": numbers, "at": st.none() | numbers},
+}
+entries = st.one_of(
+    st.fixed_dictionaries({"kind": st.just(kind), "parts": parts, "when": since, **keys})
+    for kind, keys in made.items()
+)
+composites = st.fixed_dictionaries(
+    {
+        "kind": st.just(Composite),
+        "parts": parts,
+        "when": since,
+        "from_run": st.text("a/ß: #'\"{", min_size=1),
+        "place": st.fixed_dictionaries(
+            {"to": st.none() | vectors, "axis": vectors, "degrees": numbers, "scale": numbers}
+        ),
+        "edits": st.lists(entries, max_size=2),
+    }
+)
+
+
+def made_up(kind, when, place=None, edits=(), **keys):
+    """An edit of what was drawn."""
+    if kind is Composite:
+        keys |= {"place": Place(**place), "edits": tuple(made_up(**one) for one in edits)}
+    return kind(**when, **keys)
+
+
+@given(st.lists(entries | composites, max_size=4), st.none() | st.floats(0.1, 60.0), st.none() | numbers)
+def test_what_is_saved_is_read_again(drawn, fps, length):
+    script = Script(fps=fps, length=length, edits=tuple(made_up(**one) for one in drawn))
+    assert parse_script(to_yaml(script)) == script
+
+
+def test_every_operation_is_saved_by_the_test_above():
+    assert {*made, Composite} == set(OPERATIONS.values())
+
+
+def test_what_is_as_ever_is_not_written():
+    text = to_yaml(Script(edits=(Loop(parts=(1,), begin=0.5), Fade(parts=("lid",), opacity=0.5))))
+    assert text == (
+        "edits:\n- op: loop\n  parts: [1]\n  from: 0.5\n- op: fade\n  parts: [lid]\n  opacity: 0.5\n"
+    )
+
+
+class TestLength:
+    def test_a_film_begins_at_0_and_lasts_as_long_as_the_recording(self):
+        film = film_of(layer=layer_of(start=7.25))
+        np.testing.assert_array_equal(film[0].trajectory.times, STEP * np.arange(9))
+
+    @pytest.mark.parametrize(
+        ("edit", "moments"),
+        [
+            (Speed(parts=(1,), factor=0.5), 17),  # the last of 1 s is shown at 2 s
+            (Speed(parts=(1,), factor=2.0), 9),  # the others go on
+            (Speed(parts=("all",), factor=2.0), 5),
+            (Speed(parts=("all",), factor=-4.0), 3),
+            (Speed(parts=(1,), factor=0.5, begin=0.5, end=0.75), 11),
+            (Loop(parts=(1,), begin=0.5, end=0.75, times=3), 13),
+            (Loop(parts=(1,), times=2), 17),
+            (Loop(parts=(1,), times=2, bounce=True), 33),
+            (Loop(parts=(1,), begin=0.5, end=0.75, times=1, bounce=True), 13),
+            (Loop(parts=(1,)), 9),
+            (Freeze(parts=(1,), at=0.5), 9),
+            (Freeze(parts=(1,), begin=0.25, end=0.75), 13),
+            (Freeze(parts=(1,), at=0.875, begin=0.25, end=0.75), 9),
+            (Isolate(parts=(1,), begin=0.25, end=0.75), 13),
+            (Echo(parts=(1,)), 9),
+        ],
+    )
+    def test_a_film_is_as_long_as_edits_need_it(self, edit, moments):
+        assert len(film_of(edit)[0].trajectory.times) == moments
+
+    @pytest.mark.parametrize(
+        "edit",
+        [
+            Speed(parts=(1,), factor=0.5),
+            Speed(parts=(1,), factor=-0.5),
+            Loop(parts=(1,), begin=0.25, end=0.5, times=3),
+            Loop(parts=(1,), times=2, bounce=True),
+            Freeze(parts=(1,), begin=0.25, end=0.75),
+        ],
+    )
+    def test_and_no_longer(self, edit):
+        """At the end of the film the part still moves."""
+        before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats[-2:, 1])
+        assert np.abs(last - before).max() > 1e-3
+
+    def test_length_and_fps_say_otherwise(self):
+        for options, times in (
+            ({"length": 0.5}, STEP * np.arange(4)),
+            ({"length": 1.5}, STEP * np.arange(12)),
+            ({"fps": 16}, np.arange(17) / 16),
+            ({"fps": 15, "length": 2}, np.arange(30) / 15),
+        ):
+            film = film_of(**options)
+            np.testing.assert_allclose(film[0].trajectory.times, times, atol=1e-6)
+
+    def test_between_moments_of_the_recording_it_is_as_at_times_has_it(self):
+        found = film_of(fps=15)[0].trajectory
+        assert_same(found, edits.at_times(layer_of().trajectory, found.times), atol=1e-6)
+
+    def test_what_is_slowed_down_and_sped_up_again_has_lost_nothing(self):
+        """Half way it is longer than the film that comes of it."""
+        film = film_of(Speed(parts=(1,), factor=0.5), Speed(parts=(1,), factor=2.0))
+        shows(film, 1, range(9))
+
+    def test_one_moment_needs_fps(self):
+        with pytest.raises(
+            ValueError, match="fps: expected frames a second, as the recording is of one moment"
+        ):
+            film_of(layer=layer_of(moments=1))
+        assert len(film_of(layer=layer_of(moments=1), fps=10, length=1)[0].trajectory.times) == 10
+
+    def test_a_slip_does_not_fill_the_memory(self):
+        with pytest.raises(
+            ValueError, match=r"length: expected at most 100000 moments, .* found 86400 s at 15 "
+        ):
+            film_of(length=86400, fps=15)
+        with pytest.raises(ValueError, match="length: expected at most 100000 moments"):
+            film_of(*[Loop(parts=(1,), times=1000)] * 2, length=1)
+
+    def test_another_length_compiles_nothing_anew(self):
+        def film(factor):
+            return film_of(Speed(parts=(1,), factor=factor), Move(parts=(2,), by=(1, 0, 0)))
+
+        film(0.5)
+        sizes = edits.at_times._cache_size()
+        assert [len(film(factor)[0].trajectory.times) for factor in (0.4, 0.25)] == [21, 33]
+        assert edits.at_times._cache_size() == sizes
+
+
+class TestFilms:
+    def test_time_edits_follow_each_other(self):
+        """The second sees what the first has made of the part, and where its motion now ends."""
+        film = film_of(
+            Freeze(parts=("drawer",), begin=0.25, end=0.5),
+            Speed(parts=("drawer",), factor=-1),
+            Speed(parts=("lid",), factor=-1),
+        )
+        shows(film, 1, [8, 7, 6, 5, 4, 3, 2, 2, 2, 1, 0])
+        shows(film, 2, [8, 7, 6, 5, 4, 3, 2, 1, 0, 0, 0])
+        shows(film, 3, [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8])
+
+    def test_a_loop_fills_the_film(self):
+        shows(film_of(Loop(parts=(2,)), length=2.5), 2, [*range(8), *range(8), *range(4)])
+
+    def test_a_loop_without_a_seam_ends_where_it_began(self):
+        shows(
+            film_of(Loop(parts=(2,), times=1, bounce=True), length=2.5),
+            2,
+            [*range(9), *range(7, -1, -1), 0, 0, 0],
+        )
+
+    def test_isolate_and_ghost_are_of_the_others(self):
+        film = film_of(Isolate(parts=("lid",)), Ghost(parts=("lid", "background"), opacity=0.5))
+        before, after = layer_of().trajectory, film[0].trajectory
+        assert_same(after.poses.quats[:, 2], before.poses.quats[:, 2])
+        for p in (0, 1, 3):
+            assert_same(after.poses.quats[:, p], jnp.tile(before.poses.quats[0, p], (9, 1)))
+        shown = before.opacities[jnp.array([0] * 9), 1] * 0.5
+        np.testing.assert_allclose(after.opacities[:, 1], shown, rtol=1e-6)
+        assert_same(after.opacities[:, 2], before.opacities[:, 2])
+
+    @pytest.mark.parametrize(
+        ("edit", "expected"),
+        [
+            (Fade(parts=(1,), opacity=0.2), lambda t, _: edits.fade(t, [1], 0.2)),
+            (Scale(parts=(1,), factor=3), lambda t, _: edits.scale(t, [1], 3.0)),
+            (Move(parts=(1,), by=(1, 2, 3)), lambda t, _: edits.move(t, [1], jnp.array([1.0, 2.0, 3.0]))),
+            (Amplify(parts=(1,), factor=2, at=0.5), lambda t, _: edits.amplify(t, [1], 2.0, 0.5)),
+            (
+                Rotate(parts=(1, 2), axis=(0, 3, 0), degrees=90, about=(1, 1, 0)),
+                lambda t, arms: edits.rotate(t, [1, 2], jnp.array([0, jnp.pi / 2, 0]), arms),
+            ),
+            (
+                Redirect(parts=(1, 2), axis=(0, 3, 0), degrees=90, about=(1, 1, 0), at=0.25),
+                lambda t, arms: edits.redirect(t, [1, 2], jnp.array([0, jnp.pi / 2, 0]), arms, 0.25),
+            ),
+            (
+                Fade(parts=(1,), begin=0.25, end=0.75, ease=0.25),
+                lambda t, _: edits.fade(t, [1], 0.0, edits.during(t.times, 0.25, 0.75, 0.25)),
+            ),
+        ],
+    )
+    def test_operations_are_the_functions_in_degrees_metres_and_seconds(self, edit, expected):
+        layer = layer_of()
+        arms = jnp.array([1.0, 1.0, 0.0]) - layer.scene.centers[1:3]
+        assert_same(film_of(edit)[0].trajectory, expected(layer.trajectory, arms), atol=1e-5)
+
+    def test_order_matters_where_it_should(self):
+        shift = (0.0, 0.0, 0.5)
+        first = film_of(Move(parts=(1,), by=shift, begin=0.5), Speed(parts=(1,), factor=-1))
+        then = film_of(Speed(parts=(1,), factor=-1), Move(parts=(1,), by=shift, begin=0.5))
+        plain = layer_of().trajectory.poses.translations[::-1, 1, 2]
+        np.testing.assert_allclose(
+            first[0].trajectory.poses.translations[:, 1, 2] - plain, [0.5] * 5 + [0] * 4, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            then[0].trajectory.poses.translations[:, 1, 2] - plain, [0] * 4 + [0.5] * 5, atol=1e-6
+        )
+
+    def test_echo_adds_layers_of_the_part_alone(self):
+        film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5))
+        assert [layer.scene.gaussians.num for layer in film] == [8, 2, 2]
+        opacities = np.asarray(layer_of().trajectory.opacities[:, 3])
+        first, second = (np.asarray(layer.trajectory.opacities[:, 3]) for layer in film[1:])
+        np.testing.assert_allclose(first, [0] * 4 + list(0.5 * opacities[2:7]), rtol=1e-6)
+        np.testing.assert_allclose(second, [0] * 4 + list(0.25 * opacities[0:5]), rtol=1e-6)
+
+    def test_a_part_that_vanishes_costs_nothing(self):
+        film = film_of(Fade(parts=("drawer",)))
+        assert film[0].scene.gaussians.num == 6
+        assert not np.isin(film[0].scene.labels, 1).any()
+
+    @pytest.mark.parametrize(
+        ("edit", "message"),
+        [
+            (
+                Fade(parts=("drawr",)),
+                "edit 2 (fade): parts: expected one of background (0), drawer (1), lid (2), ",
+            ),
+            (Fade(parts=("drawr",)), "found 'drawr'; did you mean 'drawer'?"),
+            (Fade(parts=(4,)), "edit 2 (fade): parts: expected numbers from 0 to 3, found 4"),
+            (
+                Speed(parts=(1,), factor=2, begin=1.5),
+                "edit 2 (speed): from: expected a time before 1, where the motion ends, found 1.5",
+            ),
+            (Loop(parts=(1,), begin=1), "edit 2 (loop): from: expected a time before 1"),
+            (
+                Freeze(parts=(1,), at=0.5, end=0.5),
+                "edit 2 (freeze): to: expected a time after 0.5, when parts stop",
+            ),
+            (Composite(parts=(1,), from_run="x"), "edit 2 (composite): from_run: expected load_scene"),
+        ],
+    )
+    def test_what_does_not_fit_the_scene_is_said_with_its_place(self, edit, message):
+        with pytest.raises(ValueError) as error:  # noqa: PT011
+            film_of(Fade(parts=(1,)), edit)
+        assert message in str(error.value)
+
+
+class TestComposite:
+    def load(self, path):
+        assert path == "elsewhere"
+        return layer_of(5, moments=5, start=3.0), {"cup": 1, "hand": 2}
+
+    def film(self, **keys):
+        return film_of(Composite(parts=("cup",), from_run="elsewhere", **keys), load_scene=self.load)
+
+    def test_parts_of_another_run_are_brought_in(self):
+        film = self.film()
+        assert [layer.scene.gaussians.num for layer in film] == [8, 2]
+        other = self.load("elsewhere")[0].trajectory
+        assert_same(
+            film[1].trajectory.opacities[:, 1], other.opacities[jnp.array([0, 1, 2, 3, 4, 4, 4, 4, 4]), 1]
+        )
+        assert film_gaussians(film, 7).num == 10
+
+    def test_they_are_edited_on_their_own(self):
+        film = self.film(
+            edits=(Speed(parts=("cup",), factor=-1), Echo(parts=("hand",), copies=1, every=0.125))
+        )
+        other = self.load("elsewhere")[0]
+        assert len(film) == 3
+        at = jnp.array([4, 3, 2, 1, 0, 0, 0, 0, 0])
+        np.testing.assert_allclose(
+            film[1].trajectory.opacities[:, 1], other.trajectory.opacities[at, 1], rtol=1e-6
+        )
+        np.testing.assert_array_equal(np.asarray(film[2].scene.labels), 2)
+
+    def test_they_come_to_their_place(self):
+        """The handle at the start is where it was sent; what is 10 cm from it is 5 cm at half the size."""
+        place = Place(to=(1, 2, 3), axis=(0, 0, 1), degrees=90, scale=0.5)
+        plain, there = self.film()[1], self.film(place=place)[1]
+        start = film_gaussians((plain,), 0).means
+        handle = plain.scene.centers[1] + plain.trajectory.poses.translations[0, 1]
+        offset = np.asarray(start - handle)
+        turned = np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], axis=1)
+        found = film_gaussians((there,), 0).means
+        np.testing.assert_allclose(found, np.array([1, 2, 3]) + 0.5 * turned, atol=1e-5)
+
+    def test_they_may_come_for_a_while(self):
+        film = self.film(begin=0.5, end=0.75)
+        shown = np.asarray(film[1].trajectory.opacities[:, 1]) > 0
+        np.testing.assert_array_equal(shown, [0, 0, 0, 0, 1, 1, 0, 0, 0])
+
+    def test_a_part_is_looked_up_there(self):
+        with pytest.raises(
+            ValueError, match=r"edit 1 \(composite\): parts: expected one of background \(0\), cup"
+        ):
+            film_of(Composite(parts=("lid",), from_run="elsewhere"), load_scene=self.load)
+
+    def test_what_is_wrong_there_is_said_with_its_place(self):
+        with pytest.raises(
+            ValueError, match=r"edit 1 \(composite\): edit 1 \(fade\): parts: expected one of"
+        ):
+            self.film(edits=(Fade(parts=("lid",)),))
+
+
+def test_the_example_makes_a_film_that_can_be_drawn():
+    script = parse_script(EXAMPLE)
+    film = apply(script, layer_of(), NAMES, lambda path: (layer_of(5), {"cup": 1}))
+    assert len(film) == 4
+    for t in (0, 15):
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(film_gaussians(film, t)))

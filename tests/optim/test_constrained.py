@@ -1,0 +1,212 @@
+"""Projection on the simplex against all its faces tried in turn, and descent to corners, edges and within."""
+
+import itertools
+import re
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+from jaxtyping import Array, Float
+
+import gsjax
+from gsjax.optim.constrained import project_simplex, simplex_descent
+from gsjax.optim.step import Step, gradient_step, per_field_adam
+
+project = jax.jit(project_simplex)
+entries = st.floats(-3, 3) | st.sampled_from([-1.0, 0.0, 0.25, 1.0])  # ties and kinks among them
+rows = st.integers(1, 5).flatmap(lambda size: st.lists(entries, min_size=size, max_size=size))
+
+
+def nearest(values):
+    """By trying all faces: the nearest point of each one's plane, if it lies on the simplex."""
+    found = []
+    for size in range(1, len(values) + 1):
+        for face in map(list, itertools.combinations(range(len(values)), size)):
+            point = np.zeros(len(values))
+            point[face] = values[face] + (1 - values[face].sum()) / size
+            if (point >= -1e-12).all():
+                found.append(point)
+    return min(found, key=lambda point: np.sum((point - values) ** 2))
+
+
+@pytest.mark.usefixtures("x64")
+class TestProjection:
+    @given(rows)
+    def test_no_point_of_the_simplex_is_nearer(self, values):
+        np.testing.assert_allclose(project(jnp.array(values)), nearest(np.array(values)), atol=1e-12)
+
+    @given(rows)
+    def test_the_conditions_of_karush_kuhn_and_tucker(self, values):
+        point = np.asarray(project(jnp.array(values)))
+        assert (point >= 0).all()
+        np.testing.assert_allclose(point.sum(), 1, atol=1e-12)
+        pull = point - np.array(values)
+        multiplier = pull[point > 0]
+        np.testing.assert_allclose(multiplier, multiplier[0], atol=1e-12)
+        assert (pull >= multiplier[0] - 1e-12).all()
+
+    @given(rows, st.floats(-100, 100))
+    def test_twice_is_once_and_a_constant_changes_nothing(self, values, constant):
+        point = project(jnp.array(values))
+        np.testing.assert_allclose(project(point), point, atol=1e-12)
+        np.testing.assert_allclose(project(jnp.array(values) + constant), point, atol=1e-12)
+
+    @given(rows)
+    def test_optax_has_the_same(self, values):
+        values = jnp.array(values)
+        np.testing.assert_allclose(project(values), optax.projections.projection_simplex(values), atol=1e-12)
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_derivatives_away_from_kinks(self, seed):
+        values = np.random.default_rng(seed).normal(size=(3, 5))
+        point = np.asarray(project(jnp.asarray(values)))
+        taken = np.max(values - point, axis=1, keepdims=True, where=point > 0, initial=-np.inf)
+        assert (np.abs(values - taken) > 1e-3).all()  # none is about to come to 0 or to leave it
+        check_grads(project, (values,), order=1, modes=["fwd", "rev"], eps=1e-5)
+
+    def test_a_batch_is_a_loop(self):
+        values = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 4)))
+        loop = jnp.stack([jnp.stack([project_simplex(row) for row in rows]) for rows in values])
+        np.testing.assert_allclose(project(values), loop, atol=1e-15)
+        np.testing.assert_allclose(jax.vmap(project_simplex)(values), loop, atol=1e-15)
+
+
+def test_large_values_lose_nothing_in_float32():
+    """Where float32 has only halves, a sum of two values has only whole numbers."""
+    point = project(jnp.array([0.5, 0.0, -5.0], jnp.float32) + 2.0**22)
+    assert point.dtype == jnp.float32
+    np.testing.assert_allclose(point, [0.75, 0.25, 0.0], atol=1e-6)
+
+
+def test_what_is_not_finite_stays_in_its_row():
+    values = jnp.array([[0.2, jnp.nan, 0.1], [0.3, 0.5, -jnp.inf], [jnp.inf, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    point = np.asarray(project(values))
+    assert np.isnan(point[[0, 2]]).all()
+    np.testing.assert_allclose(point[[1, 3]], [[0.4, 0.6, 0.0], [0.0, 1.0, 0.0]], atol=1e-6)
+
+
+def least_squares(seed, num=20, parts=4):
+    """|A w - b|^2 / 2 a row, where the best w of the simplex are known: on its corners, edges, faces, within.
+
+    b is chosen such that the gradient there is what Karush, Kuhn and Tucker ask for: one number on the
+    entries above 0, and more on the others. That number is large, as where all handles err the same way.
+    """
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(num, parts, parts)) + 2 * np.eye(parts)
+    best, gradient = np.zeros((num, parts)), np.full((num, parts), 5.0)
+    for row in range(num):
+        order = rng.permutation(parts)
+        above, zero = np.split(order, [1 + row % parts])
+        best[row, above] = rng.dirichlet(np.ones(len(above)))
+        gradient[row, zero] += rng.uniform(0.5, 3.0, len(zero))
+    residual = np.linalg.solve(A.swapaxes(1, 2), gradient[..., None])[..., 0]
+    b = np.einsum("npq,nq->np", A, best) - residual
+    return *(jnp.asarray(a, jnp.float32) for a in (A, b)), best
+
+
+def misfit(weights, batch, *, step, key):
+    A, b, scale = batch
+    return jnp.sum((scale * (jnp.einsum("npq,nq->np", A, weights) - b)) ** 2) / 2, {}
+
+
+def run(step: Step, weights, batch, count):
+    def body(carry, i):
+        *carry, info = step.update(*carry, batch, step=i, key=None)
+        return tuple(carry), (carry[0], info["skipped"])
+
+    return jax.jit(lambda c: jax.lax.scan(body, c, jnp.arange(count)))((weights, step.init(weights)))[1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_descends_to_the_best_weights_and_never_leaves_the_simplex(seed):
+    """However unlike the rows' scales are: some Gaussians cover few pixels and some many."""
+    A, b, best = least_squares(seed)
+    scale = 10 ** jnp.linspace(-2.0, 2.0, len(best))[:, None]
+    step = gradient_step(misfit, simplex_descent(optax.cosine_decay_schedule(0.1, 500)))
+    path, skipped = run(step, jnp.full(best.shape, 1 / best.shape[1]), (A, b, scale), 500)
+    assert not skipped.any()
+    assert (path >= 0).all()
+    np.testing.assert_allclose(path.sum(-1), 1, atol=1e-6)
+    np.testing.assert_allclose(path[-1], best, atol=2e-3)
+    assert ((np.asarray(path[-1]) == 0) == (best == 0)).mean() > 0.95
+
+
+def test_adam_alone_before_the_projection_stops_at_wrong_places():
+    """Why `simplex_descent` has one second moment a row: see its docstring."""
+    A, b, best = least_squares(0)
+    onto = optax.stateless(lambda u, w: project_simplex(w + u) - w)
+    adam = gradient_step(misfit, optax.chain(optax.adam(optax.cosine_decay_schedule(0.1, 500)), onto))
+    path, _ = run(adam, jnp.full(best.shape, 1 / best.shape[1]), (A, b, 1.0), 500)
+    assert np.abs(path[-1] - best).max() > 0.1
+
+
+def test_what_depends_on_sums_of_rows_alone_does_not_matter():
+    A, b, best = least_squares(1)
+    start = jnp.full(best.shape, 1 / best.shape[1])
+
+    def other(weights, batch, *, step, key):
+        loss, aux = misfit(weights, batch, step=step, key=key)
+        return loss + 3 * jnp.sum(weights), aux
+
+    plain, shifted = (
+        run(gradient_step(loss, simplex_descent(0.01)), start, (A, b, 1.0), 20)[0] for loss in (misfit, other)
+    )
+    np.testing.assert_allclose(plain[-1], shifted[-1], atol=1e-5)
+
+
+def test_the_first_step_is_of_the_rate_and_from_weights_off_the_simplex_it_comes_to_it():
+    step = gradient_step(lambda w, batch, *, step, key: (1e-6 * w[0, 0], {}), simplex_descent(0.01))
+    weights = jnp.full((1, 2), 0.5)
+    new, _, _ = step.update(weights, step.init(weights), None, step=0, key=None)
+    np.testing.assert_allclose(new, [[0.49, 0.51]], atol=1e-6)
+    new, _, _ = step.update(3 * weights, step.init(weights), None, step=0, key=None)
+    np.testing.assert_allclose(new.sum(), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf])
+def test_a_step_that_is_not_finite_changes_no_bit(bad):
+    A, b, best = least_squares(2)
+    step = gradient_step(misfit, simplex_descent(0.05))
+    weights = jnp.full(best.shape, 0.25)
+    weights, state, _ = step.update(weights, step.init(weights), (A, b, 1.0), step=0, key=None)
+    new, new_state, info = jax.jit(step.update)(weights, state, (A, b.at[3].set(bad), 1.0), step=1, key=None)
+    assert info["skipped"]
+    jax.tree.map(np.testing.assert_array_equal, (new, new_state), (weights, state))
+
+
+class Scene(eqx.Module):
+    weights: Float[Array, "n p"]
+    places: Float[Array, "p"]
+
+
+def test_it_serves_one_field_among_others():
+    def loss(scene, batch, *, step, key):
+        return jnp.sum((scene.weights @ scene.places - batch) ** 2), {}
+
+    optimizer = per_field_adam({"places": 0.01}, others={"weights": simplex_descent(0.05)})
+    step = gradient_step(loss, optimizer)
+    scene = Scene(jnp.full((3, 2), 0.5), jnp.array([0.0, 1.0]))
+    state = step.init(scene)
+    update = jax.jit(step.update)
+    for i in range(60):
+        scene, state, info = update(scene, state, jnp.array([0.1, 0.5, 1.2]), step=i, key=None)
+    assert info["loss"] < 1e-3
+    assert scene.places[1] > 1.1  # no weights reach what lies beyond all places
+    np.testing.assert_allclose(scene.weights.sum(1), 1, atol=1e-6)
+
+
+def test_no_other_module_imports_jaxopt():
+    package = Path(gsjax.__file__).parent
+    users = [
+        file
+        for file in package.rglob("*.py")
+        if re.search(r"^\s*(import|from) jaxopt", file.read_text(encoding="utf-8"), re.M)
+    ]
+    assert [file.relative_to(package).as_posix() for file in users] == ["optim/constrained.py"]
