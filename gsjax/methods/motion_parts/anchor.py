@@ -13,7 +13,7 @@ Load = Callable[[int, int], np.ndarray]
 
 _WIDTH = 96  # of the pictures by which frames are compared, pixels
 _BLUR = 1.0  # pixels; what a camera's noise and a hard edge's aliasing make is no motion
-_NOISE_FACTOR = 8.0  # a difference of so many noise levels is none of noise's
+_NOISE_FACTOR = 4.0  # a difference of so many times the noise is none of noise's
 _MOST_FRAMES = 16  # compared with the anchor at full size
 LEAST_MOVED = 1e-3
 """Share of the pixels that must change for anything to have moved."""
@@ -72,7 +72,7 @@ def moved_pixels(
     load: Load, anchor: Anchor, cameras: int, *, frames: int | None = None, threshold: float = 0.06
 ) -> Bool[np.ndarray, "C H W"]:
     """Which pixels of the anchor's pictures show something else in another frame: I_d above a threshold, or
-    above eight times the noise where there is more of that.
+    above four times the noise where there is more of that.
 
     Args:
         load: pictures.

@@ -42,7 +42,9 @@ class StreamConfig:
     tear_scale: float = 0.5
     """How far apart is torn, pixels."""
     rate: float = 0.5
-    """Of Adam: how far a part is moved, and its border turned, in a frame's first step, pixels."""
+    """Of Adam: how far a part is moved in a frame's first step, pixels."""
+    turn_rate: float = 0.25
+    """Of Adam: how far its border is turned, pixels. Faster, what looks the same all around goes astray."""
     final_rate: float = 0.05
     """Of a frame's last step, over that of its first."""
     field_rate: float = 1e-3
@@ -59,13 +61,13 @@ class UnifyConfig:
 
     every: int = 5
     """Frames between looks; 0: never."""
-    least_cut: float = 5.0
+    least_cut: float = 8.0
     """A part is divided where pictures pull its sides apart by so many times what chance would make."""
     noise: float = 2.5
     """What tracking errs by, pixels: what has moved less is not compared yet."""
     tolerance: float = 0.15
     """Parts whose motions differ by less than such a share of the lesser motion are one."""
-    least_gain: float = 2e-3
+    least_gain: float = 0.01
     """In the end a part joins another, or stands still, where pictures get worse by less than this share."""
 
 

@@ -68,7 +68,7 @@ def begin(
     gaussians: Gaussians,
     anchor: Anchor,
     config: PartsConfig,
-    segmenter: Segmenter,
+    segmenter: Segmenter | None,
     key: PRNGKeyArray,
     masks: Int[np.ndarray, "C H W"] | None = None,
 ) -> Start:
@@ -79,9 +79,9 @@ def begin(
         gaussians: the scene at the anchor frame, as `gsjax.methods.reconstruction` fits it.
         anchor: from `choose_anchor`.
         config: how.
-        segmenter: what belongs together in a picture.
+        segmenter: what belongs together in a picture; not asked where masks are given.
         key: of the grid.
-        masks: of the pieces in every view, where they are known; found unless given.
+        masks: of the pieces in every view, where they are known.
 
     Raises:
         ValueError: there is one camera only, or nothing moves.
@@ -103,6 +103,8 @@ def begin(
             f"{anchor.frame} to change in others; choose other frames, or lower discover.threshold"
         )
     if masks is None:
+        if segmenter is None:
+            raise ValueError("segmenter, masks: expected one of them, found none")
         masks = find_masks(views, gaussians, frame, plan, anchor, moved, config, segmenter)
     slots = config.discover.most_parts + 1
     logits, lifting = lift_masks(

@@ -19,7 +19,8 @@ from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import plan_render, render
 
-_FRAMES, _CAMERAS = 6, 3  # by which parts are judged
+_FRAMES, _CAMERAS = 6, 2  # by which parts are judged
+_LEAST_CONTACT = 0.05  # share of a part's neighbours
 _SHRINK = 2
 
 
@@ -31,22 +32,19 @@ def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[P
     compare: the motion of a thin piece is badly known, and matters little for the same reason.
     """
     judge = _Judge(views, parts, config)
-    pairs: list[tuple[int, int]] = []
-    while True:
-        weights = np.asarray(parts.weights)
-        labels = weights.argmax(-1)
-        here = judge(parts, weights)
-        for part in _smallest_first(labels):
-            ways = {q: judge(parts, given(weights, part, q)) for q in touching(parts, labels, part)}
-            best = min(ways, key=ways.__getitem__)
-            if ways[best] <= (1 + config.unify.least_gain) * here:
-                into = np.arange(weights.shape[1])
-                into[part] = best
-                parts, pair = joined(parts, into)
-                pairs += pair
-                break
-        else:
-            return parts, pairs
+    weights, into = np.asarray(parts.weights), np.arange(len(parts.canonical.alive))
+    before = None
+    while before is None or (into != before).any():
+        before = into.copy()
+        for part in _smallest_first(weights.argmax(-1)):
+            labels, here = weights.argmax(-1), judge(parts, weights)
+            ways = {q: given(weights, part, q) for q in touching(parts, labels, part)}
+            losses = {q: judge(parts, changed) for q, changed in ways.items()}
+            best = min(losses, key=losses.__getitem__)
+            if losses[best] <= (1 + config.unify.least_gain) * here:
+                weights = ways[best]
+                into[into == part] = best
+    return joined(parts, into)
 
 
 def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
@@ -58,10 +56,12 @@ def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.nda
 
 
 def touching(parts: Parts, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
-    """The parts that a part touches, and the background."""
+    """The parts to which a share of a part's neighbours belongs, and the background."""
     neighbors = np.asarray(parts.canonical.neighbors)[labels == part].ravel()
     all_ = np.concatenate([labels, np.full(parts.canonical.fixed.num, BACKGROUND)])
-    return sorted({BACKGROUND, *np.unique(all_[neighbors]).tolist()} - {part})
+    names, counts = np.unique(all_[neighbors], return_counts=True)
+    near = names[counts >= _LEAST_CONTACT * len(neighbors)]
+    return sorted({BACKGROUND, *near.tolist()} - {part})
 
 
 def _smallest_first(labels: Int[np.ndarray, "M"]) -> list[int]:

@@ -226,8 +226,9 @@ def stream_step(config: StreamConfig) -> Step:
         moves, pose_state = poses.update(slope.pose, state.pose)
         fall = config.final_rate**step
         free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]
-        shift = jnp.where(free, config.rate * batch.canonical.pixel * fall, 0.0)
-        turn = shift / (2 * batch.canonical.radii[:, None])  # a quaternion turns by twice its change
+        unit = jnp.where(free, batch.canonical.pixel * fall, 0.0)
+        shift = config.rate * unit
+        turn = config.turn_rate * unit / (2 * batch.canonical.radii[:, None])  # half the angle
         quats = params.pose.quats + turn * moves.quats
         shifts = shift * moves.translations
         pose = HandlePose(normalize_quats(quats), params.pose.translations + shifts)

@@ -1,0 +1,203 @@
+"""One step of the stream: its loss, its derivatives, and what it may change."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.methods.motion_parts.config import StreamConfig
+from gsjax.methods.motion_parts.stream import (
+    Canonical,
+    Seen,
+    StreamBatch,
+    StreamParams,
+    posed,
+    skinning_weights,
+    stream_loss,
+    stream_step,
+    tearing,
+)
+from gsjax.methods.motion_parts.weights import new_grid
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.feature_grid import FeatureGridConfig, locate
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import take
+from gsjax.scene.handles import HandlePose, at_rest
+from gsjax.scene.render import plan_render, render
+from tests.methods.moving_boxes import Box, MovingBoxes
+
+CONFIG = StreamConfig()
+PARTS = 4  # slots: the background, two boxes, and one that is free
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    still = np.zeros((2, 3)), np.zeros((2, 3))
+    first, second = (
+        Box((-0.1, 0, 0.04), (0.08, 0.08, 0.08), *still),
+        Box((0.1, 0, 0.03), (0.08, 0.06, 0.06), *still),
+    )
+    return MovingBoxes([first, second], cameras=2)
+
+
+def canonical_of(boxes, field=None, dtype=jnp.float32):
+    means = np.asarray(boxes.gaussians.means)
+    order = np.argsort(boxes.bodies == 0, kind="stable")
+    count = int((boxes.bodies > 0).sum())
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a, dtype), take(boxes.gaussians, order))
+    movable, fixed = (
+        jax.tree.map(lambda a: a[:count], gaussians),
+        jax.tree.map(lambda a: a[count:], gaussians),
+    )
+    centers = np.stack([means[boxes.bodies == k].mean(0) if k < 3 else np.zeros(3) for k in range(PARTS)])
+    gaps = np.linalg.norm(means[order][:count, None] - means[order][None], axis=-1)
+    return Canonical(
+        movable,
+        fixed,
+        None if field is None else locate(field, movable.means),
+        jnp.asarray(centers, dtype),
+        jnp.full(PARTS, 0.05, dtype),
+        jnp.asarray(0.01, dtype),
+        jnp.array([True, True, True, False]),
+        jnp.asarray(np.argsort(gaps, axis=1)[:, 1:5]),
+    ), boxes.bodies[order][:count]
+
+
+def batch_of(boxes, dtype=jnp.float32, past=True):
+    """Frame 0's pictures, for a scene that is then moved by the test."""
+    canonical, bodies = canonical_of(boxes, dtype=dtype)
+    weights = jax.nn.one_hot(bodies, PARTS, dtype=dtype)
+    frame = jax.tree.map(lambda a: jnp.asarray(a, dtype)[:1], boxes.frame(0))
+    seen = Seen(frame, jnp.ones(frame.images.shape[:3], bool))
+    plan = plan_render(boxes.gaussians, frame.cameras, headroom=3)
+    rest = jax.tree.map(lambda a: a.astype(dtype), at_rest(PARTS))
+    then = (seen, rest) if past else None
+    return StreamBatch(canonical, seen, plan, weights, then, plan if past else None), bodies
+
+
+def soft(bodies, sureness=2.0, dtype=jnp.float32):
+    return sureness * jax.nn.one_hot(bodies, PARTS, dtype=dtype)
+
+
+def shifted(by, dtype=jnp.float32):
+    rest = at_rest(PARTS)
+    shifts = jnp.zeros((PARTS, 3), dtype).at[1:3].set(jnp.asarray(by, dtype))
+    return HandlePose(rest.quats.astype(dtype), shifts)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("of", ["pose", "field"])
+def test_derivatives_are_those_of_finite_differences(boxes, of):
+    """Of the field without what tears, from which it is not to learn."""
+    batch, bodies = batch_of(boxes, jnp.float64)
+    moved = shifted(0.01, jnp.float64)
+    quats = moved.quats.at[1].set(jnp.array([1.0, 0.02, -0.03, 0.05]))
+    params = StreamParams(HandlePose(quats, moved.translations), soft(bodies, dtype=jnp.float64))
+    config = StreamConfig(tear_weight=0.3 if of == "pose" else 0.0)
+
+    @jax.jit
+    def loss(one):
+        return stream_loss(config)(params._replace(**{of: one}), batch, step=0.0, key=None)[0]
+
+    here, step, rng = getattr(params, of), 1e-6, np.random.default_rng(0)
+    slope = jax.grad(loss)(here)
+    for _ in range(3):
+        way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), here)
+        ahead, behind = (loss(jax.tree.map(lambda a, b, s=s: a + s * b, here, way)) for s in (step, -step))
+        expected = sum(jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (slope, way)), strict=True))
+        assert float(ahead - behind) / (2 * step) == pytest.approx(float(expected), rel=1e-3)
+
+
+def test_the_past_teaches_the_field_alone(boxes):
+    batch, bodies = batch_of(boxes)
+    params = StreamParams(shifted(0.02), soft(bodies))
+
+    def of_past(params):
+        told = stream_loss(CONFIG)(
+            params, batch._replace(past=(batch.now, shifted(0.01))), step=0.0, key=None
+        )[1]
+        return told["past"]
+
+    slope = jax.grad(of_past)(params)
+    assert all((leaf == 0).all() for leaf in jax.tree.leaves(slope.pose))
+    assert jnp.abs(slope.field).max() > 0
+
+
+def test_what_a_step_may_change(boxes):
+    """The background's handle and empty slots stay, whatever pictures say; quaternions stay of length 1."""
+    batch, bodies = batch_of(boxes)
+    params = StreamParams(shifted(0.02), soft(bodies))
+    step = stream_step(CONFIG)
+    state = step.init(params, len(bodies))
+    for i in range(3):
+        params, state, info = step.update(params, state, batch, step=i / 3, key=None)
+    assert not info["skipped"]
+    np.testing.assert_array_equal(params.pose.translations[0], 0)
+    np.testing.assert_array_equal(params.pose.translations[3], shifted(0.02).translations[3])
+    np.testing.assert_allclose(np.linalg.norm(params.pose.quats, axis=1), 1, rtol=1e-6)
+    assert np.linalg.norm(params.pose.translations[1]) < np.linalg.norm(shifted(0.02).translations[1])
+    weights = skinning_weights(params.field, batch.canonical)
+    assert (weights[:, 3] == 0).all()
+    assert jnp.abs(state.pulls).max() > 0
+
+
+def test_a_nan_changes_nothing(boxes):
+    batch, bodies = batch_of(boxes)
+    params = StreamParams(shifted(0.02), soft(bodies))
+    step = stream_step(CONFIG)
+    state = step.init(params, len(bodies))
+    broken = eqx.tree_at(lambda b: b.now.frame.images, batch, batch.now.frame.images.at[0, 5, 5].set(jnp.nan))
+    new, new_state, info = step.update(params, state, broken, step=0.0, key=None)
+    assert info["skipped"]
+    for a, b in zip(jax.tree.leaves((params, state)), jax.tree.leaves((new, new_state)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_small_plan_changes_nothing_and_says_what_it_takes(boxes):
+    batch, bodies = batch_of(boxes)
+    params = StreamParams(shifted(0.0), soft(bodies))
+    step = stream_step(CONFIG)
+    small = Plan(batch.plan.width, batch.plan.height, 64, render_mode="RGB+ED", sh_degree=0)
+    state = step.init(params, len(bodies))
+    new, _, info = step.update(params, state, batch._replace(plan=small), step=0.0, key=None)
+    assert info["skipped"]
+    assert info["overflow"]
+    assert info["needed"] > 64
+    np.testing.assert_array_equal(new.field, params.field)
+
+
+def test_depth_tells_what_colour_does_not(boxes):
+    batch, bodies = batch_of(boxes, past=False)
+    frame = batch.now.frame
+    drawn = render(posed(batch.canonical, batch.weights, at_rest(PARTS)), frame.cameras, batch.plan)
+    seen = batch.now._replace(frame=Frame(frame.images, drawn.depths, frame.cameras))
+    params = StreamParams(shifted(0.02), soft(bodies))
+    without, with_depth = (
+        stream_loss(CONFIG)(params, batch._replace(now=now), step=0.0, key=None)[0]
+        for now in (batch.now, seen)
+    )
+    assert with_depth > without
+    right = StreamParams(at_rest(PARTS), 20 * soft(bodies))
+    _, told = stream_loss(CONFIG)(right, batch._replace(now=seen), step=0.0, key=None)
+    assert told["now"] < 0.05 * (with_depth - without) + 5e-3
+
+
+def test_what_moves_together_is_not_torn(boxes):
+    canonical, bodies = canonical_of(boxes)
+    weights = jax.nn.one_hot(bodies, PARTS)
+    scale = jnp.float32(0.005)
+    assert tearing(canonical, weights, at_rest(PARTS), scale) == 0
+    apart = tearing(canonical, weights, shifted(0.05), scale)
+    # Of the neighbours those on the floor stay behind, those on the same box do not.
+    floor = np.asarray(canonical.neighbors) >= len(bodies)
+    assert apart == pytest.approx(floor.mean() * 300 / 301, rel=1e-3)
+    assert tearing(canonical, weights, shifted(0.5), scale) < 1.02 * apart
+
+
+def test_a_grid_and_a_table_of_logits_serve_alike(boxes):
+    canonical, _ = canonical_of(boxes)
+    grid = new_grid(jax.random.key(0), FeatureGridConfig(3, 4, 16, 8, 2, 8), canonical.movable.means, PARTS)
+    canonical = canonical._replace(located=locate(grid, canonical.movable.means))
+    table = grid.at(canonical.located)
+    np.testing.assert_array_equal(skinning_weights(grid, canonical), skinning_weights(table, canonical))
