@@ -21,9 +21,10 @@ from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Motion, group_means, move, place
 from gsjax.methods.object_tracker.points import Points
 from gsjax.methods.object_tracker.refine import RefineBatch
-from gsjax.methods.object_tracker.region import near_background, near_scene, tiles_to_pixels, touched_tiles
+from gsjax.methods.object_tracker.region import near_background, near_scene
 from gsjax.metrics.tracking import ObjectScore, score_object, true_labels
 from gsjax.rasterize.plan import rung
+from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
 # Lighter than the tracker's own, for what is compared is one update. A robot is one group here: each group

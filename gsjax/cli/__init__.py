@@ -16,6 +16,7 @@ COMMANDS = {
     "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
     "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs, and report on it"),
     "parts": ("gsjax.cli.parts", "find the parts of a moving scene from several cameras, and their joints"),
+    "edit": ("gsjax.cli.edit", "change when, where and how parts of a run move, and film it"),
     "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),
     "compare": ("gsjax.cli.compare", "set runs side by side: scores, curves, pictures, settings"),
     "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for gsjax fit"),

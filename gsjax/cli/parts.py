@@ -26,6 +26,7 @@ from gsjax.methods.motion_parts import (
     begin,
     choose_anchor,
     first_parts,
+    moved_pixels,
     without_needless,
 )
 from gsjax.methods.reconstruction import FitConfig
@@ -93,6 +94,14 @@ def run(options: Options) -> int:
         tracked = recording.tracked
         with stage(console, "looking for what moves"):
             anchor = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, options.anchor)
+            discover = options.parts.discover
+            moved = moved_pixels(
+                tracked.image,
+                anchor,
+                tracked.num_cameras,
+                frames=discover.frames,
+                threshold=discover.threshold,
+            )
         notes.add(
             f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
         )
@@ -103,8 +112,8 @@ def run(options: Options) -> int:
         seconds["canonical"], at = perf_counter() - at, perf_counter()
         with stage(console, "finding what may move, in all views"):
             key = jax.random.key(options.parts.seed)
-            start = begin(tracked, gaussians, anchor, options.parts, PieceSegmenter(), key)
-        _say_if_odd(start, options, notes)
+            start = begin(tracked, gaussians, anchor, moved, options.parts, PieceSegmenter(), key)
+        _say_if_odd(start, moved.mean(), options, notes)
         parts = first_parts(start, tracked.num_frames, options.parts)
         seconds["discovery"] = perf_counter() - at
         following = Following(parts)
@@ -143,7 +152,7 @@ def _check(options: Options, recording: Recording) -> None:
         )
     if sequence.num_frames < 2:
         raise ValueError(
-            f"--frames: expected at least 2, between which something moves, found 1 of {sequence.name}"
+            f"--frames: expected 2 or more, between which something moves, found {options.frames}"
         )
     if options.scene is not None and options.anchor is None:
         raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
@@ -181,9 +190,9 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
     )
 
 
-def _say_if_odd(start: Start, options: Options, notes: Notes) -> None:
-    """Warn of what makes parts doubtful."""
-    moved, pieces = start.moved.mean(), int(start.masks.max())
+def _say_if_odd(start: Start, moved: float, options: Options, notes: Notes) -> None:
+    """Warn of what makes parts doubtful; `moved` is the share of pixels that change."""
+    pieces = int(start.masks.max())
     if moved > _EVERYTHING:
         notes.warn(
             f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or cameras do; "

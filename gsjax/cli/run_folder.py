@@ -14,7 +14,7 @@ from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
 _FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz")
-_FOLDERS = ("canonical", "renders", "plots", "query", "grasp", "eval", "tensorboard", "resume")
+_FOLDERS = ("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "tensorboard", "resume")
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
 _OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply")
@@ -70,6 +70,7 @@ class RunFolder:
           screenshots/            what was saved from `gsjax view`; --overwrite keeps it
           resume/                 what an unfinished run goes on from; a finished one has none
           query/, grasp/, eval/   what `gsjax query`, `gsjax grasp` and `gsjax eval` found afterwards
+          edit/NAME/              of `gsjax edit`: video.mp4, edit.yaml, metrics.json, perhaps ply/FRAME.ply
           tensorboard/            of a fit with --tensorboard: its event files
 
     A run is finished when it has its report, and metrics.json does not say that it was stopped.

@@ -19,6 +19,7 @@ from gsjax.methods.motion_parts import (
     follow,
     gaussians_at,
     moment,
+    moved_pixels,
     outcome,
     without_needless,
 )
@@ -50,7 +51,8 @@ def boxes():
 
 def discovered(views, pieces, config=CONFIG, anchor=0):
     found = choose_anchor(views.image, views.num_frames, views.num_cameras, anchor)
-    start = begin(views, views.gaussians, found, config, None, jax.random.key(0), views.masks(pieces))
+    moved = moved_pixels(views.image, found, views.num_cameras)
+    start = begin(views, views.gaussians, found, moved, config, None, jax.random.key(0), views.masks(pieces))
     return start, list(follow(views, start, first_parts(start, views.num_frames, config), config))
 
 

@@ -174,7 +174,8 @@ def test_a_start_knows_its_pieces(boxes):
     )
     anchor = choose_anchor(boxes.image, FRAMES, 3, 0)
     masks = boxes.masks(boxes.bodies)
-    start = begin(boxes, boxes.gaussians, anchor, config, None, jax.random.key(0), masks)
+    moved = moved_pixels(boxes.image, anchor, 3)
+    start = begin(boxes, boxes.gaussians, anchor, moved, config, None, jax.random.key(0), masks)
     order, count = start.order, start.canonical.movable.num
     np.testing.assert_array_equal(np.sort(order), np.arange(boxes.gaussians.num))
     means = np.concatenate([start.canonical.movable.means, start.canonical.fixed.means])
@@ -196,14 +197,16 @@ def test_a_start_knows_its_pieces(boxes):
 
 
 def test_one_camera_and_stillness_are_refused(boxes):
-    config = PartsConfig()
     anchor = choose_anchor(boxes.image, FRAMES, 3, 0)
     one = MovingBoxes(boxes.boxes, cameras=1)
+    moved = moved_pixels(one.image, anchor, 1)
     with pytest.raises(ValueError, match="cameras: expected at least 2, synchronised, found 1"):
-        begin(one, one.gaussians, anchor, config, None, jax.random.key(0))
-    stands = MovingBoxes([Box((0.0, 0.0, 0.05), (0.1, 0.1, 0.1), np.zeros((2, 3)), np.zeros((2, 3)))])
-    anchor = choose_anchor(stands.image, 2, 3, 0)
+        begin(one, one.gaussians, anchor, moved, PartsConfig(), None, jax.random.key(0))
+    two = MovingBoxes(boxes.boxes, cameras=2)
+    with pytest.raises(ValueError, match="segmenter, masks: expected one of them, found none"):
+        begin(two, two.gaussians, anchor, np.repeat(moved, 2, 0), PartsConfig(), None, jax.random.key(0))
+    load = pictures([3, 3, 3])
     with pytest.raises(
-        ValueError, match=r"frames: expected something that moves, found 0.000% of the pixels"
+        ValueError, match=r"expected something that moves, found 0.000% of the pixels of frame 0"
     ):
-        begin(stands, stands.gaussians, anchor, config, None, jax.random.key(0))
+        moved_pixels(load, choose_anchor(load, 3, 1), 1)

@@ -1,7 +1,8 @@
 """MotionSplicer (papers/001): parts of a moving scene, found by their motion without annotation, and edited.
 
     anchor = choose_anchor(views.image, views.num_frames, views.num_cameras)
-    start = begin(views, gaussians, anchor, config, segmenter, key)    # gaussians: the scene at the anchor
+    moved = moved_pixels(views.image, anchor, views.num_cameras)
+    start = begin(views, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
     for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
     parts, _ = without_needless(views, followed.parts, config)
     scene, trajectory = outcome(start, parts, times)

@@ -81,6 +81,9 @@ def moved_pixels(
         frames: how many other frames are compared, spread over all; 1 is the one that differs most, as in
             the paper, in which what comes back to where it was is not seen to move. 16 unless given.
         threshold: of colours from 0 to 1.
+
+    Raises:
+        ValueError: nothing moves.
     """
     count = len(anchor.differences)
     spread = np.linspace(0, count - 1, min(count, frames or _MOST_FRAMES)).round().astype(int)
@@ -91,6 +94,12 @@ def moved_pixels(
         here = _blurred(load(anchor.frame, c))
         largest = np.max([difference_image(_blurred(load(t, c)), here) for t in sorted(others)], axis=0)
         moved.append(largest > limit)
+    share = np.mean(moved)
+    if share < LEAST_MOVED:
+        raise ValueError(
+            f"frames: expected something that moves, found {share:.3%} of the pixels of frame {anchor.frame} "
+            f"to change by {limit:.2g} of the range or more; choose other frames, or a lower threshold"
+        )
     return np.stack(moved)
 
 

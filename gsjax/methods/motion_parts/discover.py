@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.motion_parts.anchor import LEAST_MOVED, Anchor, moved_pixels
+from gsjax.methods.motion_parts.anchor import Anchor
 from gsjax.methods.motion_parts.config import PartsConfig
 from gsjax.methods.motion_parts.lift import label_votes, lift_masks
 from gsjax.methods.motion_parts.masks import order_of_views, propagated_masks
@@ -50,7 +50,6 @@ class Start(NamedTuple):
         canonical: the scene in that order.
         grid: skinning weights, warmed up.
         masks: pieces that changed, in every view of the anchor frame, [C,H,W].
-        moved: pixels that changed, [C,H,W].
         losses: of lifting and of the warm-up.
     """
 
@@ -59,7 +58,6 @@ class Start(NamedTuple):
     canonical: Canonical
     grid: FeatureGrid
     masks: Int[np.ndarray, "C H W"]
-    moved: Bool[np.ndarray, "C H W"]
     losses: dict[str, np.ndarray]
 
 
@@ -67,6 +65,7 @@ def begin(
     views: Views,
     gaussians: Gaussians,
     anchor: Anchor,
+    moved: Bool[np.ndarray, "C H W"],
     config: PartsConfig,
     segmenter: Segmenter | None,
     key: PRNGKeyArray,
@@ -78,30 +77,19 @@ def begin(
         views: what the cameras saw.
         gaussians: the scene at the anchor frame, as `gsjax.methods.reconstruction` fits it.
         anchor: from `choose_anchor`.
+        moved: from `moved_pixels`.
         config: how.
         segmenter: what belongs together in a picture; not asked where masks are given.
         key: of the grid.
         masks: of the pieces in every view, where they are known.
 
     Raises:
-        ValueError: there is one camera only, or nothing moves.
+        ValueError: there is one camera only.
     """
     if views.num_cameras < 2:
         raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in space")
     frame = views.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
-    moved = moved_pixels(
-        views.image,
-        anchor,
-        views.num_cameras,
-        frames=config.discover.frames,
-        threshold=config.discover.threshold,
-    )
-    if moved.mean() < LEAST_MOVED:
-        raise ValueError(
-            f"frames: expected something that moves, found {moved.mean():.3%} of the pixels of frame "
-            f"{anchor.frame} to change in others; choose other frames, or lower discover.threshold"
-        )
     if masks is None:
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
@@ -134,7 +122,7 @@ def begin(
         jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
     )
     losses = {"lifting": lifting, "warming": np.asarray(warming)}
-    return Start(anchor, order, canonical, grid, masks, moved, losses)
+    return Start(anchor, order, canonical, grid, masks, losses)
 
 
 def find_masks(

@@ -19,13 +19,18 @@ _LEAST_ALPHA = 0.5  # a pixel in which less of the scene shows tells nothing
 _SURE = 10.0  # the logit by which what all pixels agree on begins above the others
 
 
-@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
 def votes(
     gaussians: Gaussians, cameras: Camera, plan: Plan, values: Float[Array, "C H W K"]
 ) -> Float[Array, "N K"]:
     """What each Gaussian gets of the pixels in which it shows: sum over pixels of its weight in compositing,
     w_i = alpha_i T_i, times their values. It is the transpose of rendering features."""
     nothing = jnp.zeros((gaussians.num, values.shape[-1]), gaussians.means.dtype)
+    return _votes(nothing, gaussians, cameras, plan, values)
+
+
+@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+def _votes(nothing, gaussians: Gaussians, cameras: Camera, plan: Plan, values):
+    # Zeros made in here would be followed through the whole render by the compiler, for many seconds.
     _, transpose = jax.vjp(lambda f: render(gaussians, cameras, plan, features=f).features, nothing)
     return transpose(values)[0]
 

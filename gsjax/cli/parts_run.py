@@ -1,0 +1,157 @@
+"""A run of `gsjax parts` read back: the scene, where its parts went, and the recording that it came from."""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import yaml
+
+from gsjax.cli.recording import Recording, open_recording
+from gsjax.cli.run_folder import expect_run
+from gsjax.data import ReadOptions
+from gsjax.data.errors import DataError
+from gsjax.io.ply import read_ply
+from gsjax.methods.motion_parts import PartScene, trajectory_of
+from gsjax.methods.motion_parts.film import Layer
+from gsjax.methods.motion_parts.follow import order_of_frames
+from gsjax.methods.motion_parts.timeline import Names
+from gsjax.scene.handles import Blend, HandlePose
+
+_FILES = ("parts.npz", "scene.ply", "metrics.json")
+_ARRAYS = ("anchor", "weights", "centres", "R", "t", "times")
+_AGAIN = "run gsjax parts again with this version of gsjax, or name another folder"
+
+
+@dataclass(frozen=True, eq=False)
+class PartsRun:
+    """What `gsjax parts` left.
+
+    Attributes:
+        path: the folder.
+        layer: the scene, and its parts at the frames that were followed.
+        names: of the parts, with their numbers: "part 1", and what it truly is where that is known.
+        complete: whether all frames were followed.
+        recording: the same frames and cameras as then.
+        blend: how rotations were blended then.
+    """
+
+    path: Path
+    layer: Layer
+    names: Names
+    complete: bool
+    recording: Recording
+    blend: Blend
+
+    def camera(self, camera: int | None) -> int:
+        """The id of a camera of the run; the first held out one, else the first, unless given.
+
+        Raises:
+            ValueError: the run had no such camera.
+        """
+        known = list(self.recording.judged.camera_ids)
+        if camera is None:
+            return [*self.recording.held_out, *known][0]
+        if camera not in known:
+            raise ValueError(f"--camera: {self.path} has no camera {camera}; it has {known}.")
+        return camera
+
+
+def open_parts_run(path: Path) -> PartsRun:
+    """Read the folder of a run, and open its recording.
+
+    Raises:
+        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+    """
+    layer, names, complete = _read(path)
+    recording, blend = _reopen(path / "config.yml")
+    return PartsRun(path, layer, names, complete, recording, blend)
+
+
+def read_parts(path: str | Path) -> tuple[Layer, Names]:
+    """The scene of a run with its parts, and their names. Its recording need not be there.
+
+    Raises:
+        FileNotFoundError, ValueError: as `open_parts_run`.
+    """
+    layer, names, _ = _read(Path(path))
+    return layer, names
+
+
+def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
+    expect_run(path, made_by="`gsjax parts`")
+    missing = [name for name in _FILES if not (path / name).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
+        )
+    arrays = _arrays(path / "parts.npz")
+    names, followed = _of_metrics(path / "metrics.json")
+    gaussians, report = read_ply(path / "scene.ply")
+    num, parts = arrays["weights"].shape
+    if gaussians.num != num or report.stored != num:
+        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
+        raise ValueError(f"{path}: expected {num} Gaussians as in parts.npz, found {found}; {_AGAIN}")
+    anchor, frames = int(arrays["anchor"]), len(arrays["times"])
+    # The others stand there as at the anchor, which they were not.
+    done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
+    R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
+    weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
+    poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
+    names = {name: part for name, part in names.items() if part < parts}
+    layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
+    return layer, names, len(done) == frames
+
+
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            arrays = dict(saved)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{file}: expected plain arrays, found a file that cannot be read; {_AGAIN}"
+        ) from error
+    missing = [name for name in _ARRAYS if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
+    return arrays
+
+
+def _of_metrics(file: Path) -> tuple[dict[str, int], int]:
+    """Parts by name, and how many frames were followed."""
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+        rows, followed = metrics["parts"], int(metrics["frames"]["followed"])
+        names = {row["name"]: int(row["part"]) for row in rows}
+        true = {row["true_name"]: int(row["part"]) for row in rows if row.get("true_name")}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
+    # The true names last: of two names, messages say the last.
+    return names | {name.lower().replace(" ", "_"): part for name, part in true.items()}, followed
+
+
+def _reopen(config: Path) -> tuple[Recording, Blend]:
+    """The recording of a run, by what its config.yml says, and how it blended rotations."""
+    names = ("dataset", "cameras", "eval_cameras", "frames")
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        blend = settings["parts"]["stream"]["blend"]
+        read = _read_options(settings.get("read") or {})
+        return open_recording(*(settings[name] for name in names), read), blend
+    except (yaml.YAMLError, KeyError, TypeError) as error:
+        listed = ", ".join((*names, "parts"))
+        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {_AGAIN}") from error
+    except DataError as error:
+        raise ValueError(f"{config}: its recording cannot be opened: {error}") from error
+
+
+def _read_options(stored: Mapping[str, Any]) -> ReadOptions:
+    known = {field.name for field in fields(ReadOptions)}
+    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
+    return ReadOptions(**{name: value for name, value in plain.items() if name in known})

@@ -1,0 +1,139 @@
+"""`gsjax parts` from a built-in scene to a report; stopped in the middle it goes on to the same bits."""
+
+import json
+
+import numpy as np
+import pytest
+
+import gsjax.cli.parts_loop
+from gsjax.cli import main
+from gsjax.data.video import describe_video
+from gsjax.io.ply import read_ply
+
+SCENE = "simulated:articulated?width=96&height=72&cameras=4"
+QUICK = ("--frames", "0:24:8", "--eval-cameras", "3", "--fit.steps", "30", "--fit.cap", "1500")
+QUICK += (
+    "--fit.start.count",
+    "1500",
+    "--parts.stream.iterations",
+    "4",
+    "--parts.discover.lift-iterations",
+    "3",
+)
+QUICK += ("--parts.discover.most-parts", "6")
+
+
+@pytest.fixture
+def gsjax_parts(tmp_path, capfd):
+    """Runs `gsjax parts` in this process, into tmp_path/NAME; returns the exit code and what was said."""
+
+    def call(*options: str, name: str = "run", dataset=SCENE) -> tuple[int, str]:
+        code = main(["parts", str(dataset), "--out", str(tmp_path / name), *options])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err
+
+    return call
+
+
+def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
+    code, said = gsjax_parts(*QUICK)
+    assert code == 0, said
+    run = tmp_path / "run"
+    found = json.loads((run / "metrics.json").read_text())
+    assert found["complete"]
+    assert found["frames"]["followed"] == 3
+    assert found["held_out"]["psnr"] > 8
+    assert -1 <= found["ari"] <= 1
+    assert {"drawer", "shut door"} & set(" ".join(found["notes"]).replace(",", " ").split()) or found[
+        "missed"
+    ]
+    arrays = dict(np.load(run / "parts.npz"))
+    count, parts = arrays["weights"].shape
+    shapes = {name: array.shape for name, array in arrays.items()}
+    assert shapes == {
+        "anchor": (),
+        "means0": (count, 3),
+        "weights": (count, parts),
+        "labels": (count,),
+        "centres": (parts, 3),
+        "R": (3, parts, 3, 3),
+        "t": (3, parts, 3),
+        "times": (3,),
+    }
+    np.testing.assert_allclose(arrays["weights"].sum(-1), 1, rtol=1e-5)
+    np.testing.assert_array_equal(arrays["labels"], arrays["weights"].argmax(-1))
+    np.testing.assert_allclose(
+        arrays["R"][int(arrays["anchor"])], np.tile(np.eye(3), (parts, 1, 1)), atol=1e-6
+    )
+    np.testing.assert_array_equal(arrays["t"][:, 0], 0)
+    np.testing.assert_allclose(arrays["times"], np.array([0, 8, 16]) / 15)
+    assert parts == found["num_parts"] + 1
+    gaussians, _ = read_ply(run / "scene.ply")
+    np.testing.assert_allclose(gaussians.means, arrays["means0"], atol=1e-6)
+    for camera in range(4):
+        assert describe_video(run / f"video_{camera}.mp4").frames == 3
+    assert (run / "canonical" / "report.html").is_file()
+    assert not (run / "resume").exists()
+    page = (run / "report.html").read_text()
+    assert "Parts found from motion" in page
+    assert "Camera 3, held out" in page
+
+    code, said = gsjax_parts(*QUICK)
+    assert code == 2
+    assert "holds a finished run" in said
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, monkeypatch):
+    code, said = gsjax_parts(*QUICK)
+    assert code == 0, said
+    run = tmp_path / "run"
+    arrays = dict(np.load(run / "parts.npz"))
+    follow = gsjax.cli.parts_loop.follow
+
+    def stopped_after_one(*arguments):
+        yield next(follow(*arguments))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gsjax.cli.parts_loop, "follow", stopped_after_one)
+    given = ("--scene", str(run / "canonical"), "--anchor", str(int(arrays["anchor"])))
+    code, said = gsjax_parts(*QUICK, *given, name="stopped")
+    assert code == 130
+    partial = json.loads((tmp_path / "stopped" / "metrics.json").read_text())
+    assert not partial["complete"]
+    assert partial["frames"]["followed"] == 2
+    assert "partial run" in said
+    assert "not complete" in " ".join(partial["notes"])
+    monkeypatch.undo()
+    code, said = gsjax_parts(*QUICK, *given, "--resume", name="stopped")
+    assert code == 0, said
+    again = dict(np.load(tmp_path / "stopped" / "parts.npz"))
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(again[name], array, err_msg=name)
+
+
+def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
+    code, said = gsjax_parts("--cameras", "1", "--frames", "0:3")
+    assert code == 2
+    assert "--cameras: expected at least 2 that see the scene at once, found [1]" in said
+    code, said = gsjax_parts("--frames", "3:4")
+    assert code == 2
+    assert "--frames: expected 2 or more, between which something moves, found 3:4" in said
+    code, said = gsjax_parts("--frames", "0:3", "--scene", str(tmp_path))
+    assert code == 2
+    assert "--scene: expected --anchor too" in said
+    code, said = gsjax_parts("--frames", "0:24:8", "--scene", str(tmp_path), "--anchor", "0")
+    assert code == 2
+    assert "expected the folder of a run of `gsjax fit`" in said
+    code, said = gsjax_parts("--frames", "0:3", "--anchor", "7")
+    assert code == 2
+    assert "anchor: expected a frame from 0 to 2, found 7" in said
+    assert not (tmp_path / "run" / "parts.npz").exists()
+
+
+def test_a_scene_in_which_nothing_moves(gsjax_parts, tmp_path):
+    still = "simulated:articulated?width=48&height=36&cameras=2&still=true"
+    code, said = gsjax_parts("--frames", "0:3", "--fit.steps", "4", "--fit.cap", "300", dataset=still)
+    assert code == 2
+    assert "expected something that moves, found 0.000% of the pixels" in said
