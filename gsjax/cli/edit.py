@@ -112,7 +112,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "edit",
             "dataset": sequence.name,
-            "run": str(saved.path),
+            "run": str(saved.path.absolute()),
             "complete": not stopped,
             "camera": camera,
             "frames": len(seconds),

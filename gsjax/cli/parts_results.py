@@ -65,7 +65,7 @@ def finished(
     scene, trajectory = outcome(start, parts, recording.tracked.times)
     write_parts(folder.path / "parts.npz", scene, trajectory, start.anchor.frame)
     write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
-    joints = joints_of(scene, trajectory, parts.done)
+    joints = joints_of(scene, trajectory, parts.done, float(parts.canonical.pixel))
     scores = Scores(None, None)
     if complete:
         colors = np.arange(scene.num_parts)

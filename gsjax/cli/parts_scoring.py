@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gsjax.cli.messages import Notes
 from gsjax.cli.recording import Recording
@@ -31,14 +31,17 @@ def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarr
     return motions
 
 
-def joints_of(scene: PartScene, trajectory: Trajectory, done: np.ndarray) -> dict[int, FittedJoint]:
-    """The joint that explains the motion of each part best, over the frames that were found."""
+def joints_of(
+    scene: PartScene, trajectory: Trajectory, done: Bool[np.ndarray, "T"], noise_m: float
+) -> dict[int, FittedJoint]:
+    """The joint that explains the motion of each part best, over the frames that were found; what following
+    errs by is `noise_m`, metres."""
     motions, labels = motions_in_world(scene, trajectory)[done], np.asarray(scene.labels)
     means = np.asarray(scene.gaussians.means, np.float64)
     found = {}
     for part in range(BACKGROUND + 1, scene.num_parts):
         mine = means[labels == part]
-        found[part] = fit_joint(motions[:, part], mine[:: max(1, len(mine) // _POINTS)])
+        found[part] = fit_joint(motions[:, part], mine[:: max(1, len(mine) // _POINTS)], noise_m=noise_m)
     return found
 
 

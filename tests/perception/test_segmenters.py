@@ -6,6 +6,7 @@ import pytest
 from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.metrics.segmentation import iou_of_masks
 from gsjax.perception.segmenters import (
+    PieceSegmenter,
     PlaneOrRegionSegmenter,
     PlaneSegmenter,
     RegionSegmenter,
@@ -138,6 +139,27 @@ def test_the_segmenter_is_chosen_by_what_there_is():
     assert best_iou(segment(image, depth, K), boxes == 1) > 0.9
     assert best_iou(segment(image), true == 1) > 0.9
     assert best_iou(segment(image, np.zeros_like(depth), K), true == 1) > 0.9
+
+
+def test_pieces_are_the_colours_of_what_stands_out():
+    """The left box is red and green: two pieces; the floor's colours are none, unless depth is not known."""
+    depth, true = ray_cast(TWO_BOXES)
+    image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    image[90:, :40] = (30, 60, 200)  # a carpet
+    columns = np.indices(true.shape)[1]
+    middle = int(np.median(columns[true == 1]))
+    image[(true == 1) & (columns < middle)], image[(true == 1) & (columns >= middle)] = (
+        (200, 40, 40),
+        (40, 170, 60),
+    )
+    image[true == 2] = (220, 200, 40)
+    pieces = PieceSegmenter()(image, depth, K)
+    assert (np.bincount(pieces.ravel())[1:] > 150).sum() == 3
+    assert best_iou(pieces, (true == 1) & (columns < middle)) > 0.8
+    assert best_iou(pieces, (true == 1) & (columns >= middle)) > 0.8
+    assert (pieces[95:, :30] == 0).all()
+    flat = PieceSegmenter()(image)
+    assert (flat[95:, :30] > 0).all()
 
 
 def test_names_go_by_size_and_specks_are_dropped():
