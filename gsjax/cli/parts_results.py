@@ -38,6 +38,7 @@ PART_COLUMNS = (
     Column("median", "median_point_error_mm", "mm", 1),
     Column("IoU", "iou", "", 2),
 )
+_WIDE = ("gaussians", "confidence", "line_mm", "point_error_mm", "iou")  # what 80 columns have no room for
 _PART_NOTE = (
     "Joints are fitted to the motion since the canonical frame, in the world. 'Off' is against the true part "
     "that most of the Gaussians are of; points off is over the Gaussians that are truly of it, whatever part "
@@ -176,7 +177,7 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     console = Console(highlight=False)
     console.print()
     if found["parts"]:
-        narrow = tuple(c for c in PART_COLUMNS if c.key not in ("median_point_error_mm", "iou", "gaussians"))
+        narrow = tuple(column for column in PART_COLUMNS if column.key not in _WIDE)
         console.print(grid(narrow, _full(found["parts"])))
     words = [f"[bold]{found['num_parts']}[/] parts of {found['pieces']} pieces"]
     if found["ari"] is not None:
