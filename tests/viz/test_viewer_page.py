@@ -223,7 +223,7 @@ def test_a_page_of_a_plain_scene_offers_no_more_than_it_has(scene):
         assert page._shots is None
         assert not hasattr(page, "_slider")
         assert len(page._splats._nodes["still"].centers) == 100
-        until(lambda: "all 300 Gaussians" in page._status.content)  # which is said after the picture is sent
+        assert "all 300 Gaussians" in page._status.content
 
 
 def test_two_browsers_have_pages_of_their_own_and_leave_nothing(scene):

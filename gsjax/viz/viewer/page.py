@@ -279,13 +279,14 @@ class Page:
                 colors = self._palette(shown, np.asarray(gaussians.means), rows, None, None)
                 gaussians = recolored(gaussians, colors)
             drawn = self._shared.drawer(gaussians, camera)
-            self._picture = picture_of(drawn, shown, depths)
-            self._image.image = self._picture
+            picture = picture_of(drawn, shown, depths)
+            self._image.image = picture
             told = f"{camera.width} x {camera.height} pixels, all {gaussians.num:,} Gaussians"
             if shown == "depth" and depths is not None:
                 near, far = (words.length(value, self._scene.unit) for value in depths)
                 told += f"; bright: {near} away, dark: {far}"
             self._status.content = told
+            self._picture = picture  # once all is said of it
             self._show_photograph()
         except Exception as error:  # in a thread of its own nobody else would hear of it
             self._status.content = f"This cannot be drawn: {error}"
