@@ -20,7 +20,7 @@ QUICK += (
     "--parts.discover.lift-iterations",
     "3",
 )
-QUICK += ("--parts.discover.most-parts", "6")
+QUICK += ("--parts.discover.most-parts", "6", "--parts.stream.coarse", "0", "--fit.coarse-until", "0")
 
 
 @pytest.fixture
