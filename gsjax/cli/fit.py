@@ -21,8 +21,7 @@ from gsjax.cli.fit_parts import parts
 from gsjax.cli.fit_results import Curve, Plans, Scores, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import load
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.messages import Notes, stage
-from gsjax.cli.messages import describe as describe_error
+from gsjax.cli.messages import Notes, reason, stage
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
 from gsjax.cli.recording import located
 from gsjax.cli.run_folder import RunFolder
@@ -186,7 +185,7 @@ def run(options: Options) -> int:
             "dataset": photographs.name,
             "complete": finished,
             "report": True,
-            "stopped": None if finished else describe_error(stopped) or "Ctrl-C",
+            "stopped": None if stopped is None else reason(stopped),
             "steps": state.step,
             "skipped": curve.skipped,
             "num_gaussians": gaussians.num,
@@ -246,7 +245,7 @@ class Aside:
             with stage(self._console, words):
                 yield
         except (KeyboardInterrupt, OSError, ValueError) as error:
-            self._notes.warn(f"{words} was left out: {describe_error(error) if str(error) else 'Ctrl-C'}")
+            self._notes.warn(f"{words} was left out: {reason(error)}")
         self._seconds[name] = perf_counter() - begun
 
 

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import resident_mb
-from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
-from gsjax.cli.messages import describe as describe_error
+from gsjax.cli.messages import FITTING, MEASURING, Notes, reason, stage
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import budget_metrics
@@ -99,7 +98,7 @@ def run(options: Options) -> int:
             "source": options.source,
             "complete": stopped is None,
             "report": False,  # a stream has none
-            "stopped": None if stopped is None else describe_error(stopped) or "Ctrl-C",
+            "stopped": None if stopped is None else reason(stopped),
             "notes": notes.all,
             "machine": describe_machine(),
         }

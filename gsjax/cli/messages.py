@@ -103,6 +103,11 @@ def say_error(text: str, word: str = "error") -> None:
     console.print(line, soft_wrap=not console.is_terminal)
 
 
+def reason(stopped: BaseException) -> str:
+    """What stopped a run, in words."""
+    return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
+
+
 class Notes:
     """Collects what a run has to say for itself, and shows each kind of warning once.
 

@@ -8,15 +8,15 @@ from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
-from gsjax.cli.messages import Notes, describe
+from gsjax.cli.messages import Notes, reason
 from gsjax.cli.outputs import Film
 from gsjax.cli.parts_loop import Following
 from gsjax.cli.parts_scoring import joints_of, part_rows, score_parts
 from gsjax.cli.recording import Recording
-from gsjax.cli.report import Media, Table, format_number, write_report
+from gsjax.cli.report import Media, format_number, write_report
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.scoring import Scores, camera_metrics
-from gsjax.cli.summary import CAMERA_COLUMNS, Column, camera_rows, grid, table
+from gsjax.cli.summary import CAMERA_COLUMNS, Column, camera_rows, grid, table, time_table
 from gsjax.cli.views import part_views
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
@@ -59,10 +59,11 @@ def finished(
 ) -> dict[str, Any]:
     """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes."""
     frames = np.flatnonzero(parts.done)
-    complete = following.stopped is None
-    if not complete:
-        reason = describe(following.stopped) if str(following.stopped) else "Ctrl-C"
-        notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {reason}.")
+    stopped = following.stopped
+    complete = stopped is None
+    if stopped is not None:
+        why = reason(stopped).rstrip(".")
+        notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {why}.")
     scene, trajectory = outcome(start, parts, recording.tracked.times)
     write_parts(folder.path / "parts.npz", scene, trajectory, start.anchor.frame)
     write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
@@ -81,9 +82,7 @@ def finished(
                         scores.add(view)
                         film.add(view)
         except (KeyboardInterrupt, OSError) as error:
-            notes.warn(
-                f"scoring was stopped after {scores.num_frames} frames by {describe(error) or 'Ctrl-C'}"
-            )
+            notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
     rows = part_rows(scene, trajectory, joints)
     told = (
         score_parts(scene, trajectory, joints, rows, recording, start.anchor.frame, notes) if complete else {}
@@ -93,7 +92,7 @@ def finished(
         "kind": "parts",
         "dataset": sequence.name,
         "complete": complete,
-        "stopped": None if complete else notes.all[-1],
+        "stopped": None if stopped is None else reason(stopped),
         "anchor": start.anchor.frame,
         "frames": {
             "followed": len(frames),
@@ -164,9 +163,9 @@ def write_results(folder: RunFolder, found: dict[str, Any], following: Following
             for camera, scored in found["cameras"].items()
         ],
         tables=[
-            *table("Parts", PART_COLUMNS, _full(found["parts"]), _PART_NOTE),
+            *table("Parts", PART_COLUMNS, found["parts"], _PART_NOTE),
             *table("Cameras", CAMERA_COLUMNS, camera_rows(found), ""),
-            _times(found["seconds"]),
+            time_table(_TIMES, found["seconds"]),
         ],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
@@ -178,7 +177,7 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     console.print()
     if found["parts"]:
         narrow = tuple(column for column in PART_COLUMNS if column.key not in _WIDE)
-        console.print(grid(narrow, _full(found["parts"])))
+        console.print(grid(narrow, found["parts"]))
     words = [f"[bold]{found['num_parts']}[/] parts of {found['pieces']} pieces"]
     if found["ari"] is not None:
         words.append(f"adjusted Rand index [bold]{found['ari']:.3f}[/], {found['true_parts']} true parts")
@@ -191,11 +190,6 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     part = "" if found["complete"] else " [bold yellow](partial run)[/]"
     console.print(f"{found['frames']['followed']} frames in {seconds['total'] / 60:.1f} min{pace}{part}")
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
-
-
-def _full(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with all keys of the columns."""
-    return [{column.key: row.get(column.key) for column in PART_COLUMNS} for row in rows]
 
 
 def _headline(found: dict[str, Any]) -> dict[str, Any]:
@@ -220,8 +214,3 @@ _TIMES = (
     ("finish", "leaving out parts that no picture needs"),
     ("total", "all of it"),
 )
-
-
-def _times(seconds: dict[str, float]) -> Table:
-    rows = [[says, seconds.get(name)] for name, says in _TIMES]
-    return Table("Time", ("what", "time"), rows, ("", "s"), decimals=(None, 1))

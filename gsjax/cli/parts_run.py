@@ -1,22 +1,16 @@
 """A run of `gsjax parts` read back: the scene, where its parts went, and the recording that it came from."""
 
 import json
-import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-import yaml
 
-from gsjax.cli.recording import Recording, open_recording
+from gsjax.cli.recording import Recording
+from gsjax.cli.run_files import chosen_camera, read_arrays, read_scene, reopen
 from gsjax.cli.run_folder import expect_run
-from gsjax.data import ReadOptions
-from gsjax.data.errors import DataError
-from gsjax.io.ply import read_ply
 from gsjax.methods.motion_parts import PartScene, trajectory_of
 from gsjax.methods.motion_parts.film import Layer
 from gsjax.methods.motion_parts.follow import order_of_frames
@@ -54,12 +48,7 @@ class PartsRun:
         Raises:
             ValueError: the run had no such camera.
         """
-        known = list(self.recording.judged.camera_ids)
-        if camera is None:
-            return [*self.recording.held_out, *known][0]
-        if camera not in known:
-            raise ValueError(f"--camera: {self.path} has no camera {camera}; it has {known}.")
-        return camera
+        return chosen_camera(self.recording, camera, self.path)
 
 
 def open_parts_run(path: Path) -> PartsRun:
@@ -70,7 +59,9 @@ def open_parts_run(path: Path) -> PartsRun:
         ValueError: a file holds something else than a run writes, or its recording cannot be opened.
     """
     layer, names, complete = _read(path)
-    recording, blend = _reopen(path / "config.yml")
+    recording, blend = reopen(
+        path / "config.yml", _AGAIN, lambda settings: settings["parts"]["stream"]["blend"]
+    )
     return PartsRun(path, layer, names, complete, recording, blend)
 
 
@@ -91,13 +82,10 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
         raise FileNotFoundError(
             f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
         )
-    arrays = _arrays(path / "parts.npz")
+    arrays = read_arrays(path / "parts.npz", _ARRAYS, _AGAIN)
     names, followed = _of_metrics(path / "metrics.json")
-    gaussians, report = read_ply(path / "scene.ply")
     num, parts = arrays["weights"].shape
-    if gaussians.num != num or report.stored != num:
-        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
-        raise ValueError(f"{path}: expected {num} Gaussians as in parts.npz, found {found}; {_AGAIN}")
+    gaussians = read_scene(path, num, "parts.npz", _AGAIN)
     anchor, frames = int(arrays["anchor"]), len(arrays["times"])
     # The others stand there as at the anchor, which they were not.
     done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
@@ -107,20 +95,6 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     names = {name: part for name, part in names.items() if part < parts}
     layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
     return layer, names, len(done) == frames
-
-
-def _arrays(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file, allow_pickle=False) as saved:
-            arrays = dict(saved)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{file}: expected plain arrays, found a file that cannot be read; {_AGAIN}"
-        ) from error
-    missing = [name for name in _ARRAYS if name not in arrays]
-    if missing:
-        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
-    return arrays
 
 
 def _of_metrics(file: Path) -> tuple[dict[str, int], int]:
@@ -134,24 +108,3 @@ def _of_metrics(file: Path) -> tuple[dict[str, int], int]:
         raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
     # The true names last: of two names, messages say the last.
     return names | {name.lower().replace(" ", "_"): part for name, part in true.items()}, followed
-
-
-def _reopen(config: Path) -> tuple[Recording, Blend]:
-    """The recording of a run, by what its config.yml says, and how it blended rotations."""
-    names = ("dataset", "cameras", "eval_cameras", "frames")
-    try:
-        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
-        blend = settings["parts"]["stream"]["blend"]
-        read = _read_options(settings.get("read") or {})
-        return open_recording(*(settings[name] for name in names), read), blend
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        listed = ", ".join((*names, "parts"))
-        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {_AGAIN}") from error
-    except DataError as error:
-        raise ValueError(f"{config}: its recording cannot be opened: {error}") from error
-
-
-def _read_options(stored: Mapping[str, Any]) -> ReadOptions:
-    known = {field.name for field in fields(ReadOptions)}
-    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
-    return ReadOptions(**{name: value for name, value in plain.items() if name in known})

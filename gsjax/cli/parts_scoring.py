@@ -12,6 +12,7 @@ from gsjax.cli.scoring import motion_metrics
 from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory
+from gsjax.methods.motion_parts.unify import motions_of
 from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
 from gsjax.scene.handles import HandlePose, skin_means
@@ -22,12 +23,16 @@ _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, an
 
 def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T P 4 4"]:
     """The rigid motions of all parts against the canonical scene."""
-    rotations = np.asarray(quats_to_matrices(trajectory.poses.quats), np.float64)
-    centers = np.asarray(scene.centers, np.float64)
+    rotations, shifts, centers = (
+        np.asarray(array, np.float64)
+        for array in (
+            quats_to_matrices(trajectory.poses.quats),
+            trajectory.poses.translations,
+            scene.centers,
+        )
+    )
     motions = np.broadcast_to(np.eye(4), (*rotations.shape[:2], 4, 4)).copy()
-    motions[..., :3, :3] = rotations
-    shifts = np.asarray(trajectory.poses.translations, np.float64)
-    motions[..., :3, 3] = centers + shifts - np.einsum("tpij,pj->tpi", rotations, centers)
+    motions[..., :3, :3], motions[..., :3, 3] = motions_of(rotations, shifts, centers)
     return motions
 
 
@@ -54,7 +59,6 @@ def part_rows(
     rows = []
     for part, fitted in joints.items():
         mine = means[labels == part]
-        moved = np.einsum("tij,nj->tni", motions[:, part, :3, :3], mine) + motions[:, None, part, :3, 3]
         opens = None if fitted.joint is None else float(np.ptp(fitted.joint.values))
         turns = fitted.kind == "revolute"
         rows.append(
@@ -62,7 +66,7 @@ def part_rows(
                 "part": part,
                 "name": f"part {part}",
                 "gaussians": len(mine),
-                "moved_mm": 1000 * float(np.linalg.norm(moved - mine, axis=-1).mean(-1).max()),
+                "moved_mm": _farthest_mm(motions[:, part], mine),
                 "kind": fitted.kind,
                 "range": None if opens is None else (np.degrees(opens) if turns else 1000 * opens),
                 "axis": None if fitted.joint is None else fitted.joint.axis.tolist(),
@@ -98,7 +102,9 @@ def score_parts(
     labels = _true_labels(scene, recording, anchor)
     poses = {int(label): truth.poses[:, k] for k, label in enumerate(truth.label_ids)}
     scores = score_tracks(_tracks(scene, trajectory), labels, poses, anchor)
-    moving = [label for label in poses if _moved_mm(scene, labels, label, poses[label], anchor) > _STILL_MM]
+    means = np.asarray(scene.gaussians.means, np.float64)
+    far = {k: _farthest_mm(relative_motion(pose, anchor), means[labels == k]) for k, pose in poses.items()}
+    moving = [label for label in poses if far[label] > _STILL_MM]
     still = [truth.names[list(poses).index(label)] for label in poses if label not in moving]
     if still:
         notes.add(f"Counted as background, for it does not move: {', '.join(still)}.")
@@ -115,8 +121,8 @@ def score_parts(
         row["moved_mm"] = scores[label].moved_mm
         joint, fitted = joint_of[label], joints[part]
         if joint is not None and fitted.joint is not None:
-            middle = np.asarray(scene.gaussians.means)[found == part].mean(0)
-            row |= joint_error(fitted.joint, joint, middle.astype(np.float64), anchor)._asdict()
+            middle = means[found == part].mean(0)
+            row |= joint_error(fitted.joint, joint, middle, anchor)._asdict()
             row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
     matched = {label for label, part in match.found.items() if part != BACKGROUND}
     return {
@@ -138,16 +144,15 @@ def _true_labels(scene: PartScene, recording: Recording, anchor: int) -> Int[np.
 
 def _tracks(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T N 3"]:
     """Where all Gaussians are at all times."""
-    moved = jax.jit(lambda pose: skin_means(scene.gaussians.means, scene.weights, scene.centers, pose))
-    poses = trajectory.poses
-    return np.stack([moved(HandlePose(*one)) for one in zip(poses.quats, poses.translations, strict=True)])
+    moved, poses = jax.jit(skin_means), trajectory.poses
+    known = scene.gaussians.means, scene.weights, scene.centers
+    every = zip(poses.quats, poses.translations, strict=True)
+    return np.stack([moved(*known, HandlePose(*one)) for one in every])
 
 
-def _moved_mm(scene: PartScene, labels: np.ndarray, label: int, poses: np.ndarray, anchor: int) -> float:
-    """How far the true part's Gaussians move at most, on average over them."""
-    points = np.asarray(scene.gaussians.means, np.float64)[labels == label]
+def _farthest_mm(motions: Float[np.ndarray, "T 4 4"], points: Float[np.ndarray, "n 3"]) -> float:
+    """How far motions take points at most, on average over these; 0 without points."""
     if not len(points):
         return 0.0
-    motion = relative_motion(poses, anchor)
-    moved = np.einsum("tij,nj->tni", motion[:, :3, :3], points) + motion[:, None, :3, 3]
+    moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
     return 1000 * float(np.linalg.norm(moved - points, axis=-1).mean(-1).max())

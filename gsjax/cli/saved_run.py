@@ -1,20 +1,16 @@
 """A run folder read back: the scene, where it went, and the recording that it came from."""
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-import yaml
 
 from gsjax.cli.loop import Tracking
-from gsjax.cli.recording import Recording, open_recording
+from gsjax.cli.recording import Recording
+from gsjax.cli.run_files import chosen_camera, read_arrays, read_scene, reopen
 from gsjax.cli.run_folder import expect_run
-from gsjax.data.errors import DataError
-from gsjax.io.ply import read_ply
 from gsjax.methods.object_tracker import Pose, TrackedScene
 
 _AGAIN = "track again with this version of gsjax, or name another folder"
@@ -44,11 +40,7 @@ class SavedRun:
         Raises:
             ValueError: the run had no such camera.
         """
-        known = list(self.recording.judged.camera_ids)
-        if camera is None:
-            camera = [*self.recording.held_out, *known][0]
-        if camera not in known:
-            raise ValueError(f"--camera: {self.path} has no camera {camera}; it has {known}.")
+        camera = chosen_camera(self.recording, camera, self.path)
         one = self.recording.judged.select(cameras=[camera])
         return Recording(one, one, self.recording.frames_in_data, self.recording.simulated)
 
@@ -65,7 +57,7 @@ def open_run(path: Path) -> SavedRun:
     if missing:
         raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
     tracking = read_tracking(path)
-    recording = _reopen(path / "config.yml")
+    recording, _ = reopen(path / "config.yml", _AGAIN)
     if recording.tracked.num_frames < tracking.num_frames:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
         raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")
@@ -77,24 +69,13 @@ def open_run(path: Path) -> SavedRun:
 
 def read_tracking(path: Path) -> Tracking:
     """The scene of scene.ply with the poses of trajectory.npz."""
-    file = path / "trajectory.npz"
-    try:
-        with np.load(file, allow_pickle=False) as saved:
-            arrays = dict(saved)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{file}: expected plain arrays, found a file that cannot be read; {_AGAIN}"
-        ) from error
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
-    missing = [name for name in wanted if name not in arrays]
-    if missing:
-        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {_AGAIN}")
+    arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
-    gaussians, report = read_ply(path / "scene.ply")
     count, moving = means.shape[1], quats.shape[1]
-    if gaussians.num != count or report.stored != count or len(labels) != count:
-        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
-        raise ValueError(f"{path}: expected {count} Gaussians as in trajectory.npz, found {found}; {_AGAIN}")
+    gaussians = read_scene(path, count, "trajectory.npz", _AGAIN)
+    if len(labels) != count:
+        raise ValueError(f"{path}: expected {count} labels in trajectory.npz, found {len(labels)}; {_AGAIN}")
     scene = TrackedScene(
         gaussians=gaussians,
         normals=jnp.asarray(arrays["normals"]),
@@ -106,22 +87,6 @@ def read_tracking(path: Path) -> Tracking:
         [Pose(jnp.asarray(m[:moving]), jnp.asarray(q)) for m, q in zip(means, quats, strict=True)]
     )
     return Tracking(scene, poses, lost=[*arrays["lost"][1:]], turn_known=[*arrays["turn_known"][1:]])
-
-
-def _reopen(config: Path) -> Recording:
-    """The recording of a run, by what its config.yml says."""
-    names = ("dataset", "cameras", "eval_cameras", "frames")
-    try:
-        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
-        return open_recording(*(settings[name] for name in names))
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        listed = ", ".join(names)
-        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {_AGAIN}") from error
-    except DataError as error:
-        raise ValueError(
-            f"{config}: its recording cannot be opened: {error} A path that is not absolute is looked for "
-            "from the folder you are in."
-        ) from error
 
 
 def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:

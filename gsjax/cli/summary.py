@@ -87,7 +87,7 @@ def camera_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _shown(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> list[Column]:
     """The columns in which something stands."""
-    return [column for column in columns if any(row[column.key] is not None for row in rows)]
+    return [column for column in columns if any(row.get(column.key) is not None for row in rows)]
 
 
 def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
@@ -116,13 +116,13 @@ def grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
     drawn = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     shown = _shown(columns, rows)
     for column in shown:
-        text = any(isinstance(row[column.key], str) for row in rows)
+        text = any(isinstance(row.get(column.key), str) for row in rows)
         *first, last = column.head.split(" ", 1)
         head = "\n".join([*first, last] if first else ["", last])
         unit = f"\n[dim]{column.unit}[/]" if any(c.unit for c in shown) else ""
         drawn.add_column(head + unit, justify="left" if text else "right", no_wrap=True)
     for row in rows:
-        drawn.add_row(*(format_number(row[c.key], c.decimals) for c in shown))
+        drawn.add_row(*(format_number(row.get(c.key), c.decimals) for c in shown))
     drawn.add_row()
     return drawn
 
@@ -146,7 +146,7 @@ def write_run_report(
         tables=[
             *table("Objects", OBJECT_COLUMNS, object_rows(found), _OBJECT_NOTE),
             *table("Cameras", CAMERA_COLUMNS, camera_rows(found), _CAMERA_NOTE),
-            _time_table(found["seconds"]),
+            time_table(TIMES, found["seconds"]),
         ],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
@@ -195,13 +195,14 @@ def table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], n
     if not rows:
         return []
     shown = _shown(columns, rows)
-    cells = [[row[c.key] for c in shown] for row in rows]
+    cells = [[row.get(c.key) for c in shown] for row in rows]
     heads, units = [c.head for c in shown], [c.unit for c in shown]
     return [Table(title, heads, cells, units, note, [c.decimals for c in shown])]
 
 
-def _time_table(seconds: dict[str, float]) -> Table:
-    rows = [[says, seconds.get(name)] for name, says in TIMES]
+def time_table(times: tuple[tuple[str, str], ...], seconds: dict[str, float]) -> Table:
+    """Where time went: `times` has the name of each stage, and what it does."""
+    rows = [[says, seconds.get(name)] for name, says in times]
     return Table("Time", ("what", "time"), rows, ("", "s"), decimals=(None, 2))
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gsjax.cli.loop import Tracking, begin, follow
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.messages import FITTING, Notes, describe, say_error, stage
+from gsjax.cli.messages import FITTING, Notes, reason, say_error, stage
 from gsjax.cli.outputs import Film, write_first_mask, write_plots, write_tracking
 from gsjax.cli.recording import (
     FirstMask,
@@ -216,7 +216,7 @@ def _judge(
                     film.add(view)
     except (KeyboardInterrupt, Exception) as error:
         scored = f"{scores.num_frames} of {tracking.num_frames} frames"
-        notes.warn(f"scoring was stopped after {scored} by {_reason(error)}")
+        notes.warn(f"scoring was stopped after {scored} by {reason(error)}")
         failed = error if isinstance(error, Exception) else None
     motion = score_motion(tracking, recording)
     names = object_names(tracking, recording, mask, values)
@@ -253,7 +253,7 @@ def _what_ran(
     return {
         "dataset": recording.tracked.name,
         "complete": stopped is None and scores.num_frames == tracking.num_frames,
-        "stopped": None if stopped is None else _reason(stopped),
+        "stopped": None if stopped is None else reason(stopped),
         "frames": {
             "tracked": tracking.num_frames,
             "asked": recording.tracked.num_frames,
@@ -291,16 +291,12 @@ def _seconds(tracking: Tracking) -> dict[str, float]:
     return parts | {"loop_rest": tracking.loop_s - sum(parts.values()), "loop_wall": tracking.loop_s}
 
 
-def _reason(stopped: BaseException) -> str:
-    return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
-
-
 def _say_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> None:
     if tracking.stopped is None:
         return
     after = f"after {tracking.num_frames} of {recording.tracked.num_frames} frames"
-    reason = _reason(tracking.stopped).rstrip(".")
-    notes.add(f"This run is not complete: it was stopped {after} by {reason}.")
+    why = reason(tracking.stopped).rstrip(".")
+    notes.add(f"This run is not complete: it was stopped {after} by {why}.")
     if isinstance(tracking.stopped, KeyboardInterrupt):
         say_error(f"by Ctrl-C {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
 

@@ -1,7 +1,7 @@
 """What a scene that moves looks like from each camera, frame by frame, beside what the camera saw."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +16,6 @@ from gsjax.methods.object_tracker import place, render_labels
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
-from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend
 from gsjax.scene.render import Rendered, plan_render, render
 
@@ -65,14 +64,17 @@ def part_views(
     def at(t: int) -> tuple[PartScene, Moment]:
         return scene, moment(trajectory, t)
 
-    def place_parts(scene: PartScene, now: Moment) -> Gaussians:
-        return gaussians_at(scene, now, blend)
+    placed = partial(gaussians_at, blend=blend)
+    return _views(recording, range(0, len(trajectory.times), every), at, _renders_parts(blend), placed)
 
+
+@cache
+def _renders_parts(blend: Blend) -> Callable:
     def render_parts(scene: PartScene, now: Moment, frame: Frame, plan: Plan) -> Rendered:
         labels = jax.nn.one_hot(scene.labels, scene.num_parts)
-        return render(place_parts(scene, now), frame.cameras, plan, features=labels)
+        return render(gaussians_at(scene, now, blend), frame.cameras, plan, features=labels)
 
-    return _views(recording, range(0, len(trajectory.times), every), at, render_parts, place_parts)
+    return render_parts
 
 
 def _views(
@@ -87,7 +89,7 @@ def _views(
     """
     sequence = recording.judged
     cameras = range(sequence.num_cameras)
-    drawing = jax.jit(partial(_drawn, draw), compiler_options=host_options())
+    drawing = _compiled(draw)
 
     def load(t: int):
         return sequence.frame(t), [sequence.mask(t, c) for c in cameras]
@@ -121,14 +123,20 @@ def _views(
 _DRAWN = ("render", "render_depth", "groups", "covered")
 
 
-def _drawn(draw: Callable, scene, pose, frame: Frame, plan: Plan):
-    rendered = draw(scene, pose, frame, plan)
-    covered = rendered.alphas > OPAQUE
-    return (
-        rendered.colors,
-        jnp.where(covered, rendered.depths, 0.0),
-        jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0),
-        covered,
-        rendered.meta.overflow.any(),
-        rendered.meta.needed.max(),
-    )
+@cache
+def _compiled(draw: Callable) -> Callable:
+    """The jitted render; made late, because its options ask which machine this is, and once."""
+
+    def drawn(scene, pose, frame: Frame, plan: Plan):
+        rendered = draw(scene, pose, frame, plan)
+        covered = rendered.alphas > OPAQUE
+        return (
+            rendered.colors,
+            jnp.where(covered, rendered.depths, 0.0),
+            jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0),
+            covered,
+            rendered.meta.overflow.any(),
+            rendered.meta.needed.max(),
+        )
+
+    return jax.jit(drawn, compiler_options=host_options())

@@ -1,5 +1,7 @@
 """What a set of cameras sees at one moment, as arrays."""
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,14 @@ class Frame(eqx.Module):
     images: Float[Array, "c height width 3"]
     depths: Float[Array, "c height width"] | None
     cameras: Camera
+
+
+Seen = TypeVar("Seen")
+
+
+def one_camera(seen: Seen, c: int) -> Seen:
+    """Of a pytree of which every array has a camera axis in front, camera `c` alone, with that axis."""
+    return jax.tree.map(lambda a: a[c : c + 1], seen)
 
 
 def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Frame:

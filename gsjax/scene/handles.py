@@ -69,6 +69,14 @@ def skin(
     return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (means, quats))
 
 
+def rigid_motions(
+    centers: Float[Array, "P 3"], pose: HandlePose
+) -> tuple[Float[Array, "P 3 3"], Float[Array, "P 3"]]:
+    """What each handle does to the canonical scene: x -> R x + offset, with R and offset."""
+    rotations = quats_to_matrices(pose.quats)
+    return rotations, centers + pose.translations - jnp.einsum("pij,pj->pi", rotations, centers)
+
+
 def skin_means(
     means: Float[Array, "N 3"],
     weights: Float[Array, "N P"],
@@ -76,8 +84,7 @@ def skin_means(
     pose: HandlePose,
 ) -> Float[Array, "N 3"]:
     """Where linear blend skinning takes points: two products of matrices, nothing of size N x P x 3."""
-    rotations = quats_to_matrices(pose.quats)
-    offsets = centers + pose.translations - jnp.einsum("pij,pj->pi", rotations, centers)
+    rotations, offsets = rigid_motions(centers, pose)
     blended = jnp.einsum("np,pij->nij", weights, rotations)
     return jnp.einsum("nij,nj->ni", blended, means) + weights @ offsets
 
@@ -127,8 +134,7 @@ def _dual(
     pose: HandlePose,
 ) -> tuple[Float[Array, "N 4"], Float[Array, "N 3"]]:
     """The turns and the places that blended dual quaternions give."""
-    real = normalize_quats(pose.quats)
-    offsets = centers + pose.translations - jnp.einsum("pij,pj->pi", quats_to_matrices(real), centers)
+    real, (_, offsets) = normalize_quats(pose.quats), rigid_motions(centers, pose)
     dual = multiply_quats(jnp.pad(offsets, ((0, 0), (1, 0))), real) / 2
     signed, leading = _aligned(weights, real)
     signs = jnp.sum(signed * real, axis=-1, keepdims=True)

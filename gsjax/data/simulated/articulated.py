@@ -9,9 +9,9 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.motion import coast, minimum_jerk, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
-from gsjax.data.simulated.simulation import simulated_sequence
+from gsjax.data.simulated.simulation import expect_counts, simulated_sequence, viewmats_around
 from gsjax.data.simulated.textures import Texture
-from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.geometry.cameras import intrinsics
 from gsjax.geometry.joints import Joint
 
 RATE_HZ = 15.0
@@ -71,9 +71,7 @@ def articulated(
     Raises:
         ValueError: a count is below 1.
     """
-    for name, value in (("frames", frames), ("width", width), ("height", height), ("cameras", cameras)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
     motion = _draw_motion(seed)
     poses, joints = _poses(motion, np.zeros(frames) if still else np.arange(frames, dtype=np.float64))
     scene = Scene(
@@ -82,7 +80,7 @@ def articulated(
         poses=poses,
         light=_LIGHT,
         Ks=np.broadcast_to(intrinsics(0.95 * width, width, height), (frames, cameras, 3, 3)),
-        viewmats=np.broadcast_to(_viewmats(cameras), (frames, cameras, 4, 4)),
+        viewmats=np.broadcast_to(viewmats_around(_TARGET, 1.45, cameras, low=24.0), (frames, cameras, 4, 4)),
         width=width,
         height=height,
     )
@@ -146,14 +144,6 @@ def _poses(
     centers = np.concatenate([motion.box_from + gone[:, None] * motion.box_way, 0 * gone[:, None]], axis=1)
     poses[:, _BOX] = rigid(turn(_UP, gone * motion.box_turn), centers + rest[_BOX])
     return poses, (drawer, door, lid, None, shut)
-
-
-def _viewmats(cameras: int) -> Float[np.ndarray, "c 4 4"]:
-    azimuths = 2 * np.pi * np.arange(cameras) / cameras
-    heights = np.deg2rad(np.where(np.arange(cameras) % 2 == 0, 24.0, 42.0))
-    flat = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1) * np.cos(heights)[:, None]
-    eyes = _TARGET + 1.45 * np.concatenate([flat, np.sin(heights)[:, None]], axis=1)
-    return np.array([look_at(eye, _TARGET) for eye in eyes])
 
 
 def _solids(seed: int) -> list[Primitive]:

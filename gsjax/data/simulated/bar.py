@@ -10,9 +10,9 @@ from gsjax.data.simulated.bent_box import BentBox
 from gsjax.data.simulated.motion import along_keyframes, coast, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
-from gsjax.data.simulated.simulation import simulated_sequence
+from gsjax.data.simulated.simulation import expect_counts, simulated_sequence, viewmats_around
 from gsjax.data.simulated.textures import Texture
-from gsjax.geometry.cameras import intrinsics, look_at
+from gsjax.geometry.cameras import intrinsics
 
 RATE_HZ = 15.0
 
@@ -75,9 +75,7 @@ def bar(
     Raises:
         ValueError: a count is below 1.
     """
-    for name, value in (("frames", frames), ("width", width), ("height", height), ("cameras", cameras)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
     moments = np.zeros(frames) if still else np.arange(frames, dtype=np.float64)
     motion = _draw_motion(seed)
     poses, sizes = _poses(motion, moments), _sizes(motion, moments)
@@ -87,7 +85,7 @@ def bar(
         poses=poses,
         light=_LIGHT,
         Ks=np.broadcast_to(intrinsics(0.95 * width, width, height), (frames, cameras, 3, 3)),
-        viewmats=np.broadcast_to(_viewmats(cameras), (frames, cameras, 4, 4)),
+        viewmats=np.broadcast_to(viewmats_around(_TARGET, 1.08, cameras, low=26.0), (frames, cameras, 4, 4)),
         width=width,
         height=height,
         sizes={_BAR: sizes},
@@ -153,14 +151,6 @@ def _middles(half: float) -> Float[np.ndarray, "n"]:
     """The middles of equal pieces of -half to half."""
     count = max(round(2 * half / _TRACKS_M), 1)
     return half * ((2 * np.arange(count) + 1) / count - 1)
-
-
-def _viewmats(cameras: int) -> Float[np.ndarray, "c 4 4"]:
-    azimuths = 2 * np.pi * np.arange(cameras) / cameras
-    heights = np.deg2rad(np.where(np.arange(cameras) % 2 == 0, 26.0, 42.0))
-    flat = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1) * np.cos(heights)[:, None]
-    eyes = _TARGET + 1.08 * np.concatenate([flat, np.sin(heights)[:, None]], axis=1)
-    return np.array([look_at(eye, _TARGET) for eye in eyes])
 
 
 def _solids(seed: int) -> tuple[Primitive, ...]:

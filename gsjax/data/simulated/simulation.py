@@ -14,10 +14,29 @@ from gsjax.data.simulated.raycaster import (
     render_labels,
     trace,
 )
+from gsjax.geometry.cameras import look_at
 from gsjax.geometry.joints import Joint
 
 CACHED_IMAGES = 16
 """Rendered images, and traced views, that a simulated sequence keeps."""
+
+
+def expect_counts(**counts: int) -> None:
+    """Raises ValueError for a count below 1."""
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def viewmats_around(
+    target: Float[np.ndarray, "3"], distance: float, cameras: int, *, low: float, high: float = 42.0
+) -> Float[np.ndarray, "c 4 4"]:
+    """Cameras in a circle around `target`, `distance` metres away, by turns `low` and `high` degrees up."""
+    azimuths = 2 * np.pi * np.arange(cameras) / cameras
+    heights = np.deg2rad(np.where(np.arange(cameras) % 2 == 0, low, high))
+    flat = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1) * np.cos(heights)[:, None]
+    eyes = target + distance * np.concatenate([flat, np.sin(heights)[:, None]], axis=1)
+    return np.array([look_at(eye, target) for eye in eyes])
 
 
 def simulated_sequence(

@@ -11,7 +11,7 @@ from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene, render_labels, trace
 from gsjax.data.simulated.robot import BODIES as ROBOT_BODIES
 from gsjax.data.simulated.robot import robot_poses, robot_primitives
-from gsjax.data.simulated.simulation import simulated_sequence
+from gsjax.data.simulated.simulation import expect_counts, simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 
@@ -86,9 +86,7 @@ def tabletop(
     Raises:
         ValueError: a count is below 1, or both `leave` and `hide` are set.
     """
-    for name, value in (("frames", frames), ("width", width), ("height", height), ("cameras", cameras)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
     if leave and hide:
         raise ValueError("leave and hide are two fates of the one can; set at most one")
     times = np.arange(frames) / RATE_HZ

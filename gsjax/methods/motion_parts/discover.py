@@ -19,7 +19,7 @@ from gsjax.methods.motion_parts.weights import new_grid, warmed_up
 from gsjax.methods.protocols import Segmenter
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGrid, locate
-from gsjax.scene.frame import Frame
+from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
@@ -136,7 +136,7 @@ def find_masks(
     segmenter: Segmenter,
 ) -> Int[np.ndarray, "C H W"]:
     """Masks of what changed, by the same numbers in all views; see `masks`."""
-    drawn = [render(gaussians, _one(frame.cameras, c), plan) for c in range(views.num_cameras)]
+    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(views.num_cameras)]
     depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
     pictures = [views.image(anchor.frame, c) for c in range(views.num_cameras)]
     first = int(moved.mean((1, 2)).argmax())
@@ -149,10 +149,10 @@ def find_masks(
     def known(c: int, last: int, mask: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "H W"]:
         """What earlier views, of which the last is new, tell of view c."""
         nonlocal total
-        total += label_votes(gaussians, _one(frame.cameras, last), plan, mask[None], room)
+        total += label_votes(gaussians, one_camera(frame.cameras, last), plan, mask[None], room)
         sums = total.sum(-1, keepdims=True)
         shares = jnp.asarray(np.where(sums > 1e-2, total / np.maximum(sums, 1e-6), 0.0))
-        drawn = render(gaussians, _one(frame.cameras, c), plan, features=shares).features
+        drawn = render(gaussians, one_camera(frame.cameras, c), plan, features=shares).features
         assert drawn is not None
         shown = np.asarray(drawn[0])
         return np.where(shown.max(-1) > _LEAST_SHOWN, shown.argmax(-1), -1)
@@ -208,7 +208,3 @@ def _movable_first(
     near = tree.query(means)[0] < _NEAR * spacing if moves.any() else moves
     may = (weights[:, BACKGROUND] < _SURELY_FIXED) | near
     return np.concatenate([np.flatnonzero(may), np.flatnonzero(~may)]), int(may.sum())
-
-
-def _one(cameras: Camera, c: int) -> Camera:
-    return jax.tree.map(lambda a: a[c : c + 1], cameras)

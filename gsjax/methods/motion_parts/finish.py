@@ -14,7 +14,7 @@ from gsjax.methods.motion_parts.follow import Parts, joined, seen_at
 from gsjax.methods.motion_parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.motion_parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
 from gsjax.optim.compiler import host_options
-from gsjax.scene.frame import part_of
+from gsjax.scene.frame import one_camera, part_of
 from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import plan_render, render
@@ -33,16 +33,15 @@ def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[P
     """
     judge = _Judge(views, parts, config)
     weights, into = np.asarray(parts.weights), np.arange(len(parts.canonical.alive))
-    before = None
+    here, before = judge(parts, weights), None
     while before is None or (into != before).any():
         before = into.copy()
         for part in _smallest_first(weights.argmax(-1)):
-            labels, here = weights.argmax(-1), judge(parts, weights)
-            ways = {q: given(weights, part, q) for q in touching(parts, labels, part)}
+            ways = {q: given(weights, part, q) for q in touching(parts, weights.argmax(-1), part)}
             losses = {q: judge(parts, changed) for q, changed in ways.items()}
             best = min(losses, key=losses.__getitem__)
             if losses[best] <= (1 + config.unify.least_gain) * here:
-                weights = ways[best]
+                weights, here = ways[best], losses[best]
                 into[into == part] = best
     return joined(parts, into)
 
@@ -81,7 +80,7 @@ class _Judge:
             frame = part_of(views.frame(t), (), _SHRINK)
             cameras = [(i + k * views.num_cameras // _CAMERAS) % views.num_cameras for k in range(_CAMERAS)]
             seen = seen_at(frame, parts.canonical, parts.weights, parts.pose(t))
-            self._seen += [(t, jax.tree.map(lambda a, c=c: a[c : c + 1], seen)) for c in sorted(set(cameras))]
+            self._seen += [(t, one_camera(seen, c)) for c in sorted(set(cameras))]
         scene = posed(parts.canonical, parts.weights, parts.pose(int(done[0])))
         self._plan = plan_render(scene, frame.cameras, headroom=2 * config.headroom)
 

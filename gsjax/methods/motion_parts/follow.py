@@ -31,7 +31,7 @@ from gsjax.methods.motion_parts.weights import warmed_up
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGrid
-from gsjax.scene.frame import Frame, part_of
+from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import HandlePose, at_rest, skin
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
@@ -192,12 +192,12 @@ class _Frames:
             size = _HALF if i < config.coarse * config.iterations else _WHOLE
             u, c = int(rng.choice(past)), int(rng.integers(len(frame.images)))
             while True:
-                plan = self._plan(size, frame, parts, weights)
-                batch = StreamBatch(canonical, _one(now[size], looks(i)), plan, weights)
+                plan = self._plan(size, now, parts, weights)
+                batch = StreamBatch(canonical, one_camera(now[size], looks(i)), plan, weights)
                 if config.past:
                     seen = self._seen_then(u, c, canonical, weights, parts)
                     batch = batch._replace(
-                        past=(seen, parts.pose(u)), past_plan=self._plan(_HALF, frame, parts, weights)
+                        past=(seen, parts.pose(u)), past_plan=self._plan(_HALF, now, parts, weights)
                     )
                 begun = perf_counter()
                 params, state, info = self._advance(params, state, batch, i / config.iterations)
@@ -209,7 +209,7 @@ class _Frames:
                     break
             losses.append(info["now"])
             skipped += int(info["skipped"])
-        self._past[t] = _on_host(part_of(frame, (), _HALF))
+        self._past[t] = _on_host(now[_HALF].frame)
         quats, translations, found = parts.quats.copy(), parts.translations.copy(), parts.found.copy()
         quats[t], translations[t], found[t] = params.pose.quats, params.pose.translations, parts.count + 1
         parts = parts._replace(
@@ -221,14 +221,14 @@ class _Frames:
         """What one camera saw in a frame of the past."""
         if u not in self._past:
             self._past[u] = _on_host(part_of(self._views.frame(u), (), _HALF))
-        frame = _one(self._past[u], c)
+        frame = one_camera(self._past[u], c)
         frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
         return seen_at(frame, canonical, weights, parts.pose(u))
 
-    def _plan(self, size: int, frame: Frame, parts: Parts, weights: Array) -> Plan:
+    def _plan(self, size: int, now: dict[int, Seen], parts: Parts, weights: Array) -> Plan:
         if size not in self._plans:
             scene = posed(parts.canonical, weights, parts.pose(int(np.argmax(parts.found))))
-            cameras = part_of(frame, (), size).cameras
+            cameras = now[size].frame.cameras
             self._plans[size] = plan_render(scene, cameras, headroom=self._config.headroom)
         return self._plans[size]
 
@@ -280,10 +280,6 @@ def _turns(rng: np.random.Generator, cameras: int) -> Callable[[int], int]:
     """Which camera a step looks at: all in a random order, and then in another."""
     order = np.concatenate([rng.permutation(cameras) for _ in range(64)])
     return lambda i: int(order[i % len(order)])
-
-
-def _one(tree: Any, c: int) -> Any:
-    return jax.tree.map(lambda a: a[c : c + 1], tree)
 
 
 def _on_host(frame: Frame) -> Frame:

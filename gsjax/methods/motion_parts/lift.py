@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from gsjax.geometry.cameras import Camera
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
@@ -41,7 +42,7 @@ def label_votes(
     """Votes of masks for labels 0 to `count` - 1, camera by camera."""
     total = np.zeros((gaussians.num, count), np.float32)
     for c, mask in enumerate(masks):
-        one = jax.tree.map(lambda a, c=c: a[c : c + 1], cameras)
+        one = one_camera(cameras, c)
         total += np.asarray(votes(gaussians, one, plan, jax.nn.one_hot(mask[None], count)))
     return total
 
@@ -74,7 +75,7 @@ def lift_masks(
     state, losses = optimizer.init(logits), []
     for i in range(iterations):
         c = i % len(masks)
-        one = jax.tree.map(lambda a, c=c: a[c : c + 1], cameras)
+        one = one_camera(cameras, c)
         logits, state, loss = _lift_step(logits, state, gaussians, one, plan, masks[c : c + 1], optimizer)
         losses.append(loss)
     return logits, np.asarray(losses)

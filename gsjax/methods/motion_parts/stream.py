@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.rotations import normalize_quats, quats_to_matrices
+from gsjax.geometry.rotations import normalize_quats
 from gsjax.losses.photometric import l1_loss, ssim, weighted_mean
 from gsjax.methods.motion_parts.config import StreamConfig
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
@@ -20,7 +20,7 @@ from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGrid, Located
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.handles import Blend, HandlePose, skin
+from gsjax.scene.handles import Blend, HandlePose, rigid_motions, skin
 from gsjax.scene.render import Rendered, render
 
 _FINAL_TEAR = 0.2  # of a frame's last step, over that of its first: less would hold back what does tear off
@@ -129,9 +129,7 @@ def tearing(
     """How much of the scene is torn: the share of neighbours whose motions take the same place apart, each
     counted by r^2 / (r^2 + scale^2) of the gap r. A hinge tears nothing along its axis, and what is torn for
     good costs no more the farther it goes; but a piece that no picture holds goes with its neighbours."""
-    rotations = quats_to_matrices(pose.quats)
-    offsets = canonical.centers + pose.translations
-    offsets -= jnp.einsum("pij,pj->pi", rotations, canonical.centers)
+    rotations, offsets = rigid_motions(canonical.centers, pose)
     rigid = jnp.concatenate([rotations, offsets[..., None]], axis=-1).reshape(-1, 12)
     still = jnp.eye(3, 4, dtype=rigid.dtype).ravel()
     mine = weights @ rigid

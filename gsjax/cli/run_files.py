@@ -1,0 +1,94 @@
+"""What commands that work on a run read back of it, whichever command made it: arrays, the scene, the
+recording. `again` is what each advises where a file is not as it was written."""
+
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gsjax.cli.recording import Recording, open_recording
+from gsjax.data import ReadOptions
+from gsjax.data.errors import DataError
+from gsjax.io.ply import read_ply
+from gsjax.scene.gaussians import Gaussians
+
+_SETTINGS = ("dataset", "cameras", "eval_cameras", "frames")
+
+
+def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file, those that are wanted among them.
+
+    Raises:
+        ValueError: it cannot be read, or lacks one of them.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            arrays = dict(saved)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{file}: expected plain arrays, found a file that cannot be read; {again}"
+        ) from error
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {again}")
+    return arrays
+
+
+def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
+    """The Gaussians of a run's scene.ply, as many as its file `arrays` tells of.
+
+    Raises:
+        ValueError: there are not as many, or not all of them can be drawn.
+    """
+    gaussians, report = read_ply(path / "scene.ply")
+    if gaussians.num != count or report.stored != count:
+        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
+        raise ValueError(f"{path}: expected {count} Gaussians as in {arrays}, found {found}; {again}")
+    return gaussians
+
+
+def reopen(
+    config: Path, again: str, also: Callable[[Mapping[str, Any]], Any] = lambda settings: None
+) -> tuple[Recording, Any]:
+    """The recording of a run, by what its config.yml says, and what else is wanted of the settings.
+
+    Raises:
+        ValueError: these are no such settings, or the recording cannot be opened.
+    """
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        wanted = also(settings)
+        read = _read_options(settings.get("read") or {})
+        return open_recording(*(settings[name] for name in _SETTINGS), read), wanted
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        listed = ", ".join(_SETTINGS)
+        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error
+    except DataError as error:
+        raise ValueError(
+            f"{config}: its recording cannot be opened: {error} A path that is not absolute is looked for "
+            "from the folder you are in."
+        ) from error
+
+
+def _read_options(stored: Mapping[str, Any]) -> ReadOptions:
+    known = {field.name for field in fields(ReadOptions)}
+    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
+    return ReadOptions(**{name: value for name, value in plain.items() if name in known})
+
+
+def chosen_camera(recording: Recording, camera: int | None, run: Path) -> int:
+    """The id of a camera of a run; the first held out one, else the first, unless given.
+
+    Raises:
+        ValueError: the run had no such camera.
+    """
+    known = list(recording.judged.camera_ids)
+    if camera is None:
+        return [*recording.held_out, *known][0]
+    if camera not in known:
+        raise ValueError(f"--camera: {run} has no camera {camera}; it has {known}.")
+    return camera
