@@ -73,9 +73,7 @@ def open_recording(
             raise ValueError(f"{option}: camera {twice[0]} is named twice.")
     both = [c for c in chosen if c in eval_cameras]
     if both:
-        raise ValueError(
-            f"--eval-cameras: camera {both[0]} stands in --cameras too; a judge must not."
-        )
+        raise ValueError(f"--eval-cameras: camera {both[0]} stands in --cameras too; a judge must not.")
     if not chosen:
         raise ValueError(f"--cameras: none is left; {sequence.name} has {known}.")
     total = sequence.num_frames
