@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gsjax.cli import fit as fit_command
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.parts_loop import Following, follow_parts
+from gsjax.cli.parts_loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts_results import finished, print_results, write_results
 from gsjax.cli.parts_resume import Saver, load
 from gsjax.cli.recording import Recording, located, open_recording, parse_frames
@@ -29,7 +29,7 @@ from gsjax.methods.motion_parts import (
     moved_pixels,
     without_needless,
 )
-from gsjax.methods.reconstruction import FitConfig
+from gsjax.methods.reconstruction import FitConfig, StartConfig
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
@@ -65,7 +65,9 @@ class Options:
     read: ReadOptions = field(default_factory=ReadOptions)
     """What the layout of the data leaves open."""
     fit: FitConfig = field(
-        default_factory=lambda: FitConfig(steps=3_000, cap=40_000, sh_degree=0, depth_weight=0.5)
+        default_factory=lambda: FitConfig(
+            steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000)
+        )
     )
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
@@ -127,7 +129,9 @@ def run(options: Options) -> int:
             with stage(console, "leaving out parts that no picture needs"):
                 parts, pairs = without_needless(tracked, parts, options.parts)
                 following.joined += pairs
-        seconds["finish"] = perf_counter() - at
+            seconds["finish"], at = perf_counter() - at, perf_counter()
+            parts = refine_parts(tracked, parts, options.parts, notes, console)
+            seconds["refine"] = perf_counter() - at
         found = finished(folder, recording, start, parts, following, options.parts, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
         found["notes"] = notes.all

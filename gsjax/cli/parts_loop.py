@@ -7,8 +7,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsjax.cli.messages import Notes, reason
 from gsjax.data import Sequence
-from gsjax.methods.motion_parts import Parts, PartsConfig, Start, follow
+from gsjax.methods.motion_parts import Parts, PartsConfig, Start, follow, refine
 
 
 @dataclass
@@ -66,6 +67,28 @@ def follow_parts(
             following.stopped = stopped
         save(following, last=True)
     return following
+
+
+def refine_parts(views: Sequence, parts: Parts, config: PartsConfig, notes: Notes, console: Console) -> Parts:
+    """Parts with the scene and all poses fitted to all frames, as far as it came where it was stopped."""
+    done, skipped, steps = 0, [], config.refine.iterations
+    columns = (TextColumn("refining the scene over all frames"), BarColumn(), MofNCompleteColumn())
+    if steps and not console.is_terminal:
+        console.print("refining the scene over all frames", soft_wrap=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=steps)
+        try:
+            for refined in refine(views, parts, config):
+                parts, done = refined.parts, done + 1
+                skipped.append(refined.skipped)
+                bar.update(task, completed=done)
+        except (KeyboardInterrupt, OSError) as stopped:
+            notes.warn(
+                f"the scene was refined by {done} of {steps} steps, and then stopped by {reason(stopped)}"
+            )
+    if lost := int(np.sum(skipped)):
+        notes.warn(f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite")
+    return parts
 
 
 def _count(parts: Parts) -> int:

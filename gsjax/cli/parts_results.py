@@ -212,5 +212,6 @@ _TIMES = (
     ("updates", "following, frame by frame"),
     ("compile", "compiling that"),
     ("finish", "leaving out parts that no picture needs"),
+    ("refine", "refining the scene over all frames, compiling included"),
     ("total", "all of it"),
 )

@@ -20,7 +20,9 @@ DERIVATIVES = ("reverse", "forward")
 TILE_SIZES = (4, 8, 16, 32)
 SORTS = ("host", "device")
 FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
-_BATCH_PIXELS = 16384  # pixels composited together: what a step of 8 Gaussians makes of them stays in L2
+_BATCH_PIXELS = {"cpu": 2048, "gpu": 16384}
+"""Pixels composited together. A batch ends with its longest list: small ones wait less. A GPU is to be kept
+busy."""
 
 
 class Limits(NamedTuple):
@@ -55,7 +57,7 @@ class Plan:
         max_per_tile: Gaussians of a tile that are drawn, nearest first; None for all. With a number the image
             is an approximation, and Gaussians left out get no gradient.
         tile_size: edge of a tile, pixels. Small tiles have fewer pixel pairs, large ones shorter lists.
-        tiles_per_batch: tiles composited together (default: 16384 pixels); a matter of speed alone.
+        tiles_per_batch: tiles composited together (default: 2048 pixels, on a GPU 16384); of speed alone.
         sort: "host" for numpy's sort where XLA runs on the CPU, "device" for XLA's own; of speed alone.
     """
 
@@ -137,9 +139,10 @@ class Plan:
         return self.tile_size * self.tile_size
 
     def batch_size(self, channels: int) -> int:
-        """Tiles composited together. By default as many as stay in cache, with the values of all channels."""
+        """Tiles composited together: `tiles_per_batch`, or fewer the more channels there are."""
+        pixels = _BATCH_PIXELS["cpu" if jax.default_backend() == "cpu" else "gpu"]
         return self.tiles_per_batch or max(
-            1, FEW_CHANNELS * _BATCH_PIXELS // (max(channels, FEW_CHANNELS) * self.tile_pixels)
+            1, FEW_CHANNELS * pixels // (max(channels, FEW_CHANNELS) * self.tile_pixels)
         )
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":

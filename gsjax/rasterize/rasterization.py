@@ -127,7 +127,7 @@ def rasterization(
         max_per_tile: Gaussians of a tile that are drawn, nearest first (default None: all). With a number the
             image is an approximation; `docs/choosing.md` says how good.
         tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Of speed alone.
-        tiles_per_batch: tiles composited together (default: 16384 pixels); of speed alone.
+        tiles_per_batch: tiles composited together (default: 2048 pixels, on a GPU 16384); of speed alone.
         sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; of speed alone.
 
     Returns:

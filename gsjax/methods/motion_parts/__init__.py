@@ -5,6 +5,7 @@
     start = begin(views, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
     for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
     parts, _ = without_needless(views, followed.parts, config)
+    for refined in refine(views, parts, config): parts = refined.parts
     scene, trajectory = outcome(start, parts, times)
 
 config.py    what can be set              stream.py   one step of the optimisation
@@ -12,14 +13,21 @@ anchor.py    which frame is canonical     unify.py    which parts are one
 masks.py     what moves in every view     follow.py   the loop over frames
 lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
 weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
-discover.py  all that, before any motion
+discover.py  all that, before any motion  refine.py   all frames together, in the end
 """
 
 from gsjax.methods.motion_parts.anchor import Anchor, choose_anchor, moved_pixels
-from gsjax.methods.motion_parts.config import DiscoverConfig, PartsConfig, StreamConfig, UnifyConfig
+from gsjax.methods.motion_parts.config import (
+    DiscoverConfig,
+    PartsConfig,
+    RefineConfig,
+    StreamConfig,
+    UnifyConfig,
+)
 from gsjax.methods.motion_parts.discover import Start, Views, begin
 from gsjax.methods.motion_parts.finish import outcome, without_needless
 from gsjax.methods.motion_parts.follow import Followed, Parts, first_parts, follow
+from gsjax.methods.motion_parts.refine import Refined, refine
 from gsjax.methods.motion_parts.stream import Canonical, StreamBatch, StreamParams, stream_loss, stream_step
 from gsjax.methods.motion_parts.trajectory import (
     BACKGROUND,
@@ -42,6 +50,8 @@ __all__ = [
     "PartScene",
     "Parts",
     "PartsConfig",
+    "RefineConfig",
+    "Refined",
     "Start",
     "StreamBatch",
     "StreamConfig",
@@ -57,6 +67,7 @@ __all__ = [
     "moment",
     "moved_pixels",
     "outcome",
+    "refine",
     "still",
     "stream_loss",
     "stream_step",

@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
+from gsjax.methods.settings import expect
 from gsjax.scene.feature_grid import FeatureGridConfig
 
 
@@ -18,6 +21,10 @@ class DiscoverConfig:
     """With how many frames the anchor is compared; 1 is the paper's: with the one that differs most."""
     lift_iterations: int = 32
     """Steps by which masks become logits of Gaussians."""
+
+    def __post_init__(self):
+        expect(self, "discover.", most_parts=(1, np.inf), threshold=(1e-6, 1), frames=(1, np.inf))
+        expect(self, "discover.", lift_iterations=(1, np.inf))
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,13 @@ class StreamConfig:
     blend: Literal["quaternion", "polar", "dual"] = "quaternion"
     """Of rotations, where a Gaussian follows several handles."""
 
+    def __post_init__(self):
+        shares, weights = ("coarse", "l1_weight"), ("depth_weight", "tear_weight", "hold_weight")
+        rates = ("rate", "turn_rate", "field_rate")
+        expect(self, "stream.", iterations=(1, np.inf), final_rate=(1e-6, 1), **dict.fromkeys(shares, (0, 1)))
+        expect(self, "stream.", **dict.fromkeys((*weights, *rates), (0, np.inf)))
+        expect(self, "stream.", **dict.fromkeys(("depth_limit", "tear_scale"), (1e-9, np.inf)))
+
 
 @dataclass(frozen=True)
 class UnifyConfig:
@@ -70,6 +84,23 @@ class UnifyConfig:
     least_gain: float = 0.01
     """In the end a part joins another, or stands still, where pictures get worse by less than this share."""
 
+    def __post_init__(self):
+        names = ("every", "least_cut", "noise", "tolerance", "least_gain")
+        expect(self, "unify.", **dict.fromkeys(names, (0, np.inf)))
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """How the scene and all poses are fitted to all frames, once the parts are known."""
+
+    iterations: int = 400
+    """Steps; with 0 the scene stays as the anchor frame shaped it, as in the paper."""
+    rate: float = 0.05
+    """Of Adam: how far Gaussians and parts are moved in a first step, pixels."""
+
+    def __post_init__(self):
+        expect(self, "refine.", **dict.fromkeys(("iterations", "rate"), (0, np.inf)))
+
 
 @dataclass(frozen=True)
 class PartsConfig:
@@ -78,6 +109,7 @@ class PartsConfig:
     discover: DiscoverConfig = field(default_factory=DiscoverConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
     unify: UnifyConfig = field(default_factory=UnifyConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
     grid: FeatureGridConfig = field(
         default_factory=lambda: FeatureGridConfig(
             levels=6, least_resolution=6, most_resolution=96, log2_entries=14, features=4, hidden=32
@@ -87,3 +119,6 @@ class PartsConfig:
     headroom: float = 1.6
     """How many times as much as it needs a plan holds at first."""
     seed: int = 0
+
+    def __post_init__(self):
+        expect(self, headroom=(1, np.inf), seed=(0, np.inf))

@@ -17,6 +17,7 @@ from gsjax.optim.compiler import host_options
 from gsjax.scene.frame import one_camera, part_of
 from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose
+from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
 
 _FRAMES, _CAMERAS = 6, 2  # by which parts are judged
@@ -79,7 +80,7 @@ class _Judge:
         for i, t in enumerate(frames.tolist()):
             frame = part_of(views.frame(t), (), _SHRINK)
             cameras = [(i + k * views.num_cameras // _CAMERAS) % views.num_cameras for k in range(_CAMERAS)]
-            seen = seen_at(frame, parts.canonical, parts.weights, parts.pose(t))
+            seen = seen_at(frame, parts.canonical, parts.weights, parts.pose(t), TILE // _SHRINK)
             self._seen += [(t, one_camera(seen, c)) for c in sorted(set(cameras))]
         scene = posed(parts.canonical, parts.weights, parts.pose(int(done[0])))
         self._plan = plan_render(scene, frame.cameras, headroom=2 * config.headroom)

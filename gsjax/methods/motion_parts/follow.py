@@ -33,7 +33,7 @@ from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGrid
 from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import HandlePose, at_rest, skin
-from gsjax.scene.region import tiles_to_pixels, touched_tiles
+from gsjax.scene.region import TILE, tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
 _HALF, _WHOLE = 2, 1  # sizes of pictures, by how many times smaller they are
@@ -182,7 +182,7 @@ class _Frames:
         weights = skinning_weights(params.field, canonical)
         frame = self._views.frame(t)
         now = {
-            size: seen_at(part_of(frame, (), size), canonical, weights, params.pose)
+            size: seen_at(part_of(frame, (), size), canonical, weights, params.pose, TILE // size)
             for size in (_HALF, _WHOLE)
         }
         past = np.flatnonzero(parts.found >= parts.born[np.asarray(canonical.alive)].max())
@@ -223,7 +223,7 @@ class _Frames:
             self._past[u] = _on_host(part_of(self._views.frame(u), (), _HALF))
         frame = one_camera(self._past[u], c)
         frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
-        return seen_at(frame, canonical, weights, parts.pose(u))
+        return seen_at(frame, canonical, weights, parts.pose(u), TILE // _HALF)
 
     def _plan(self, size: int, now: dict[int, Seen], parts: Parts, weights: Array) -> Plan:
         if size not in self._plans:
@@ -265,15 +265,15 @@ def _predicted(parts: Parts, t: int, way: int, before: HandlePose) -> HandlePose
     return HandlePose(quats, 2 * before.translations - first.translations)
 
 
-@jax.jit
-def seen_at(frame: Frame, canonical: Canonical, weights: Array, pose: HandlePose) -> Seen:
+@partial(jax.jit, static_argnames="tile")
+def seen_at(frame: Frame, canonical: Canonical, weights: Array, pose: HandlePose, tile: int = TILE) -> Seen:
     """Pixels count where what moves is, and where it was in the canonical scene."""
     moves = weights[:, BACKGROUND] < 0.5
     moved = skin(canonical.movable, weights, canonical.centers, pose).means
     # What stands still is put behind all cameras' backs, where it touches nothing.
     nowhere = jnp.full_like(moved, jnp.nan)
     places = [jnp.where(moves[:, None], means, nowhere) for means in (moved, canonical.movable.means)]
-    return Seen(frame, tiles_to_pixels(touched_tiles(places, frame), frame))
+    return Seen(frame, tiles_to_pixels(touched_tiles(places, frame, tile), frame, tile))
 
 
 def _turns(rng: np.random.Generator, cameras: int) -> Callable[[int], int]:

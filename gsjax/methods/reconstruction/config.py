@@ -1,9 +1,11 @@
 """How a scene is fitted to photographs. Comments become the command line's help."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+
+from gsjax.methods.settings import expect
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class StartConfig:
     """Of all of them, in distances to their neighbours."""
 
     def __post_init__(self):
-        _expect(self, "start.", count=(1, np.inf), opacity=(1e-3, 0.999), scale=(1e-6, np.inf))
+        expect(self, "start.", count=(1, np.inf), opacity=(1e-3, 0.999), scale=(1e-6, np.inf))
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class RatesConfig:
     """Of the cameras' turns, radians, and shifts, radii of the scene; it falls to a hundredth by the end."""
 
     def __post_init__(self):
-        _expect(self, "rates.", **{field.name: (0, np.inf) for field in fields(self)})
+        expect(self, "rates.", **{field.name: (0, np.inf) for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class GrowthConfig:
     """Weight of the mean scale, in radii of the scene."""
 
     def __post_init__(self):
-        _expect(self, "growth.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), factor=(1, np.inf))
-        _expect(self, "growth.", **dict.fromkeys(("noise", "opacity_cost", "scale_cost"), (0, np.inf)))
+        expect(self, "growth.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), factor=(1, np.inf))
+        expect(self, "growth.", **dict.fromkeys(("noise", "opacity_cost", "scale_cost"), (0, np.inf)))
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,8 @@ class SplitConfig:
     """Steps after which all opacities are lowered to 0.01: what is not needed stays there."""
 
     def __post_init__(self):
-        _expect(self, "split.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), reset_every=(1, np.inf))
-        _expect(self, "split.", large=(0, np.inf), too_large=(0, np.inf))
+        expect(self, "split.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), reset_every=(1, np.inf))
+        expect(self, "split.", large=(0, np.inf), too_large=(0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -131,17 +133,8 @@ class FitConfig:
     split: SplitConfig = field(default_factory=SplitConfig)
 
     def __post_init__(self):
-        _expect(self, steps=(1, np.inf), cap=(1, np.inf), sh_degree=(0, 3), sh_every=(1, np.inf))
-        _expect(self, dssim_weight=(0, 1), depth_weight=(0, np.inf), coarse_until=(0, 1), prune=(0, 1))
-
-
-def _expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
-    """Raises ValueError for the first field that lies outside its range."""
-    for name, (low, high) in ranges.items():
-        value = getattr(config, name)
-        if not low <= value <= high:
-            most = "" if high == np.inf else f" and at most {high:g}"
-            raise ValueError(f"{where}{name}: expected at least {low:g}{most}, found {value}")
+        expect(self, steps=(1, np.inf), cap=(1, np.inf), sh_degree=(0, 3), sh_every=(1, np.inf))
+        expect(self, dssim_weight=(0, 1), depth_weight=(0, np.inf), coarse_until=(0, 1), prune=(0, 1))
 
 
 PRESETS = {
