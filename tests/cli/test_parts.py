@@ -20,7 +20,16 @@ QUICK += (
     "--parts.discover.lift-iterations",
     "3",
 )
-QUICK += ("--parts.discover.most-parts", "6", "--parts.stream.coarse", "0", "--fit.coarse-until", "0")
+QUICK += (
+    "--parts.refine.iterations",
+    "5",
+    "--parts.discover.most-parts",
+    "6",
+    "--parts.stream.coarse",
+    "0",
+    "--fit.coarse-until",
+    "0",
+)
 
 
 @pytest.fixture

@@ -45,20 +45,30 @@ class RefineParams(NamedTuple):
 
 
 class RefineBatch(NamedTuple):
-    """What a step is given: one camera's view of frame t, weights that stay, and a plan."""
+    """What a step is given.
+
+    Attributes:
+        canonical: the handles; its Gaussians are not read.
+        weights: of the movable Gaussians; they stay.
+        seen: what one camera saw at frame t.
+        t: which frame it is.
+        anchor: the canonical frame, at which all handles are at rest.
+        plan: for its pictures.
+    """
 
     canonical: Canonical
     weights: Float[Array, "M P"]
     seen: Seen
     t: Int[Array, ""]
+    anchor: Int[Array, ""]
     plan: Plan
 
 
 def refine_step(config: PartsConfig) -> Step:
     """Adam on `RefineParams`, with a state for each frame's pose; `step` is the share that is done.
 
-    The background's handle does not move. A step whose loss or gradient is not finite, or whose plan
-    overflowed, changes nothing, and `info["skipped"]` says so.
+    The background's handle does not move, nor does any at the canonical frame. A step whose loss or gradient
+    is not finite, or whose plan overflowed, changes nothing, and `info["skipped"]` says so.
     """
     poses = optax.adam(1.0, b2=0.99)
 
@@ -96,6 +106,7 @@ def refine_step(config: PartsConfig) -> Step:
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
         free = batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND)
+        free &= batch.t != batch.anchor
         shift = jnp.where(free, length, 0.0)[:, None]
         turn = shift / (2 * batch.canonical.radii[:, None])  # half the angle
         quats = normalize_quats(pose.quats + turn * moves.quats)
@@ -136,6 +147,7 @@ def refine(views: Views, parts: Parts, config: PartsConfig) -> Iterator[Refined]
     """
     advance, rng = _compiled(config), np.random.default_rng((config.seed, 1))
     canonical, weights, frames = parts.canonical, parts.weights, np.flatnonzero(parts.done)
+    anchor = jnp.asarray(int(np.flatnonzero(parts.found == 0)[0]))
     poses = HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))
     params = RefineParams(canonical.movable, canonical.fixed, poses)
     state, plan, i = refine_step(config).init(params), None, 0
@@ -149,7 +161,7 @@ def refine(views: Views, parts: Parts, config: PartsConfig) -> Iterator[Refined]
                 if plan is None:
                     scene = posed(canonical, weights, parts.pose(t))
                     plan = plan_render(scene, frame.cameras, headroom=config.headroom)
-                batch = RefineBatch(canonical, weights, seen, jnp.asarray(t), plan)
+                batch = RefineBatch(canonical, weights, seen, jnp.asarray(t), anchor, plan)
                 params, state, info = advance(params, state, batch, i / config.refine.iterations)
                 if not bool(info["overflow"]):
                     break
