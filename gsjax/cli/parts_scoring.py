@@ -17,7 +17,8 @@ from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
 from gsjax.scene.handles import HandlePose, skin_means
 
-_POINTS = 500  # of a part, by which its joint is fitted
+_POINTS = 500  # of a part, by which its joint is fitted ...
+_FAR = 3.0  # ... none so many times as far from its middle as half of them: there, noise of a turn is large
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
 
@@ -46,6 +47,8 @@ def joints_of(
     found = {}
     for part in range(BACKGROUND + 1, scene.num_parts):
         mine = means[labels == part]
+        far = np.linalg.norm(mine - np.median(mine, axis=0), axis=1)
+        mine = mine[far <= _FAR * np.median(far)]
         found[part] = fit_joint(motions[:, part], mine[:: max(1, len(mine) // _POINTS)], noise_m=noise_m)
     return found
 
