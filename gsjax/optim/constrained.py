@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jaxopt.projection import projection_simplex
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 _DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as of Adam elsewhere
 
@@ -48,30 +48,38 @@ def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformatio
     wrong places: where all entries of a row are pulled the same way, however unequally, it moves them alike,
     and the projection undoes that. With one v a row, it stops where plain projected descent does.
 
+    Its `update` takes `allowed` [P] too: where that is False, entries are 0 and stay 0.
+
     Args:
         rate: about how far entries move in a step, of 1; or a schedule of it.
     """
+    scale = optax.scale_by_learning_rate(rate)
 
     def init(weights):
         square = jax.tree.map(lambda w: jnp.zeros_like(w[..., :1]), weights)
-        return _Moments(jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, weights), square)
+        moments = _Moments(jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, weights), square)
+        return moments, scale.init(weights)
 
-    def update(gradients, state, weights):
-        del weights
-        centered = jax.tree.map(lambda g: g - g.mean(axis=-1, keepdims=True), gradients)
-        squares = jax.tree.map(lambda g: jnp.mean(g**2, axis=-1, keepdims=True), centered)
+    def update(gradients, state, weights, *, allowed=True, **_):
+        (state, scaling) = state
+        centered = jax.tree.map(lambda g: _centered(g, allowed), gradients)
+        squares = jax.tree.map(lambda g: jnp.mean(g**2, axis=-1, keepdims=True, where=allowed), centered)
         mean = optax.tree_utils.tree_update_moment(centered, state.mean, _DECAY, order=1)
         square = optax.tree_utils.tree_update_moment(squares, state.square, _SQUARE_DECAY, order=1)
         count = state.count + 1
         m = optax.tree_utils.tree_bias_correction(mean, _DECAY, count)
         v = optax.tree_utils.tree_bias_correction(square, _SQUARE_DECAY, count)
-        return jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + _EPS), m, v), _Moments(count, mean, square)
+        ways = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + _EPS), m, v)
+        ways, scaling = scale.update(ways, scaling)
+        moved = jax.tree.map(lambda u, w: jnp.where(allowed, w + u, -jnp.inf), ways, weights)
+        updates = jax.tree.map(lambda m, w: project_simplex(m) - w, moved, weights)
+        return updates, (_Moments(count, mean, square), scaling)
 
-    def project(updates, weights):
-        return jax.tree.map(lambda u, w: project_simplex(w + u) - w, updates, weights)
+    return optax.GradientTransformationExtraArgs(init, update)
 
-    return optax.chain(
-        optax.GradientTransformation(init, update),
-        optax.scale_by_learning_rate(rate),
-        optax.stateless(project),
-    )
+
+def _centered(
+    gradient: Float[Array, "*batch P"], allowed: Bool[Array, "P"] | bool
+) -> Float[Array, "*batch P"]:
+    mean = gradient.mean(axis=-1, keepdims=True, where=allowed)
+    return jnp.where(allowed, gradient - mean, 0.0)

@@ -11,8 +11,8 @@ from gsjax.methods.motion_parts.discover import begin, pixel_width
 from gsjax.methods.motion_parts.lift import label_votes, lift_masks
 from gsjax.methods.motion_parts.masks import moving_segments, order_of_views, propagated_masks
 from gsjax.methods.motion_parts.stream import skinning_weights
-from gsjax.methods.motion_parts.weights import new_grid, warmed_up
-from gsjax.scene.feature_grid import FeatureGridConfig, locate
+from gsjax.methods.motion_parts.weights import new_field, saying, weights_of
+from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.render import plan_render
 from tests.methods.moving_boxes import Box, MovingBoxes, linear
 
@@ -149,17 +149,21 @@ def test_votes_are_shares_of_pixels(boxes):
     assert 0.2 * pixels < total.sum() <= pixels * (1 + 1e-5)
 
 
-def test_a_grid_learns_weights_of_living_parts_only():
+@pytest.mark.parametrize("kind", ["grid", "table", "simplex"])
+def test_a_field_says_weights_of_living_parts_only(kind):
     rng = np.random.default_rng(0)
     means = jnp.asarray(rng.uniform(-1, 1, (200, 3)), jnp.float32)
     wanted = jax.nn.one_hot((means[:, 0] > 0).astype(int), 4)
     alive = jnp.array([True, True, False, False])
-    config = FeatureGridConfig(4, 4, 16, 10, 2, 16)
-    grid = new_grid(jax.random.key(0), config, means, 4)
-    grid, losses = warmed_up(grid, locate(grid, means), wanted, alive, 60)
-    assert losses[-1] < 0.1 * losses[0]
-    logits = np.asarray(grid.at(locate(grid, means)))[:, :2]
-    assert (logits.argmax(-1) == np.asarray(wanted)[:, :2].argmax(-1)).mean() > 0.97
+    config = PartsConfig(weights=kind, grid=FeatureGridConfig(4, 4, 16, 10, 2, 16))
+    field, located = new_field(jax.random.key(0), config, means, 4)
+    field, losses = saying(field, located, wanted, alive, 60)
+    if kind == "grid":
+        assert losses[-1] < 0.1 * losses[0]
+    said = np.asarray(weights_of(field, located, alive))
+    np.testing.assert_allclose(said.sum(-1), 1, rtol=1e-5)
+    assert (said[:, 2:] == 0).all()
+    assert (said.argmax(-1) == np.asarray(wanted).argmax(-1)).mean() > 0.97
 
 
 def test_a_pixel_is_as_wide_as_depth_over_focal_length(boxes):
@@ -182,7 +186,7 @@ def test_a_start_knows_its_pieces(boxes):
     means = np.concatenate([start.canonical.movable.means, start.canonical.fixed.means])
     np.testing.assert_array_equal(means, np.asarray(boxes.gaussians.means)[order])
     assert start.canonical.alive.tolist() == [True, True, True, False]
-    weights = np.asarray(skinning_weights(start.grid, start.canonical))
+    weights = np.asarray(skinning_weights(start.field, start.canonical))
     np.testing.assert_allclose(weights.sum(-1), 1, rtol=1e-5)
     assert (weights[:, 3] == 0).all()
     bodies = boxes.bodies[order[:count]]

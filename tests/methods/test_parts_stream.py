@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.motion_parts.config import StreamConfig
+from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
 from gsjax.methods.motion_parts.stream import (
     Canonical,
     Seen,
@@ -18,7 +18,7 @@ from gsjax.methods.motion_parts.stream import (
     stream_step,
     tearing,
 )
-from gsjax.methods.motion_parts.weights import new_grid
+from gsjax.methods.motion_parts.weights import SimplexTable, new_field
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.frame import Frame
@@ -72,7 +72,7 @@ def batch_of(boxes, dtype=jnp.float32, past=True):
     seen = Seen(frame, jnp.ones(frame.images.shape[:3], bool))
     plan = plan_render(boxes.gaussians, frame.cameras, headroom=3)
     rest = jax.tree.map(lambda a: a.astype(dtype), at_rest(PARTS))
-    then = (seen, rest) if past else None
+    then = ((seen, rest),) if past else ()
     return StreamBatch(canonical, seen, plan, weights, then, plan if past else None), bodies
 
 
@@ -115,7 +115,7 @@ def test_the_past_teaches_the_field_alone(boxes):
 
     def of_past(params):
         told = stream_loss(CONFIG)(
-            params, batch._replace(past=(batch.now, shifted(0.01))), step=0.0, key=None
+            params, batch._replace(past=((batch.now, shifted(0.01)),)), step=0.0, key=None
         )[1]
         return told["past"]
 
@@ -197,7 +197,38 @@ def test_what_moves_together_is_not_torn(boxes):
 
 def test_a_grid_and_a_table_of_logits_serve_alike(boxes):
     canonical, _ = canonical_of(boxes)
-    grid = new_grid(jax.random.key(0), FeatureGridConfig(3, 4, 16, 8, 2, 8), canonical.movable.means, PARTS)
-    canonical = canonical._replace(located=locate(grid, canonical.movable.means))
+    config = PartsConfig(grid=FeatureGridConfig(3, 4, 16, 8, 2, 8))
+    grid, located = new_field(jax.random.key(0), config, canonical.movable.means, PARTS)
+    canonical = canonical._replace(located=located)
     table = grid.at(canonical.located)
     np.testing.assert_array_equal(skinning_weights(grid, canonical), skinning_weights(table, canonical))
+
+
+def test_weights_stay_on_the_simplex_and_what_is_not_alive_gets_none(boxes):
+    batch, bodies = batch_of(boxes)
+    mixed = 0.7 * jax.nn.one_hot(bodies, PARTS) + 0.3 / 3 * batch.canonical.alive
+    params = StreamParams(shifted(0.01), SimplexTable(mixed))
+    step = stream_step(StreamConfig(field_rate=0.05))
+    state = step.init(params, len(bodies))
+    update = jax.jit(lambda p, s: step.update(p, s, batch, step=0.0, key=None))
+    for _ in range(3):
+        params, state, info = update(params, state)
+    assert not info["skipped"]
+    weights = np.asarray(params.field.weights)
+    assert (weights >= 0).all()
+    assert (weights[:, 3] == 0).all()
+    np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
+    assert np.abs(weights - mixed).max() > 0.05
+
+
+def test_several_frames_of_the_past_count_in_the_mean(boxes):
+    batch, bodies = batch_of(boxes)
+    params = StreamParams(shifted(0.01), soft(bodies))
+    then = [(batch.now, shifted(by)) for by in (0.0, 0.01, 0.02)]
+
+    def told(past):
+        return stream_loss(CONFIG)(params, batch._replace(past=tuple(past)), step=0.0, key=None)[1]["past"]
+
+    one_by_one = [float(told([one])) for one in then]
+    assert len(set(one_by_one)) == 3
+    assert float(told(then)) == pytest.approx(np.mean(one_by_one), rel=1e-5)

@@ -210,3 +210,23 @@ def test_no_other_module_imports_jaxopt():
         if re.search(r"^\s*(import|from) jaxopt", file.read_text(encoding="utf-8"), re.M)
     ]
     assert [file.relative_to(package).as_posix() for file in users] == ["optim/constrained.py"]
+
+
+def test_what_is_not_allowed_is_as_if_it_were_not_there():
+    A, b, best = least_squares(2)
+    optimizer, allowed = simplex_descent(0.05), jnp.array([True, True, True, True, False])
+    start = jnp.full(best.shape, 1 / best.shape[1])
+
+    def descended(weights, **options):
+        state = optimizer.init(weights)
+        for _ in range(5):
+            slope = jax.grad(lambda w: misfit(w, (A, b, 1.0), step=0, key=None)[0])(weights[:, :4])
+            slope = jnp.pad(slope, ((0, 0), (0, weights.shape[1] - 4)), constant_values=-7.0)
+            updates, state = optimizer.update(slope, state, weights, **options)
+            weights = optax.apply_updates(weights, updates)
+        return weights
+
+    alone = descended(start)
+    with_another = descended(jnp.pad(start, ((0, 0), (0, 1))), allowed=allowed)
+    np.testing.assert_allclose(with_another[:, :4], alone, atol=1e-6)
+    assert (with_another[:, 4] == 0).all()

@@ -19,6 +19,8 @@ class DiscoverConfig:
     """What counts as changed: a difference of colours from 0 to 1."""
     frames: int = 16
     """With how many frames the anchor is compared; 1 is the paper's: with the one that differs most."""
+    difference: bool = True
+    """Only what changed may move (I_d). Without, all that the segmenter tells apart does."""
     lift_iterations: int = 32
     """Steps by which masks become logits of Gaussians."""
 
@@ -55,16 +57,24 @@ class StreamConfig:
     final_rate: float = 0.05
     """Of a frame's last step, over that of its first."""
     field_rate: float = 1e-3
-    """Of Adam, for the grid that weights are made of."""
-    past: bool = True
-    """Each step looks at a frame of the past too, from which only the grid learns (temporal consistency)."""
+    """Of Adam, for what weights are made of; 0.01 suits tables."""
+    past: int = 1
+    """How many frames of the past each step looks at too, from which only weights learn (temporal
+    consistency)."""
     blend: Literal["quaternion", "polar", "dual"] = "quaternion"
     """Of rotations, where a Gaussian follows several handles."""
 
     def __post_init__(self):
         shares, weights = ("coarse", "l1_weight"), ("depth_weight", "tear_weight", "hold_weight")
         rates = ("rate", "turn_rate", "field_rate")
-        expect(self, "stream.", iterations=(1, np.inf), final_rate=(1e-6, 1), **dict.fromkeys(shares, (0, 1)))
+        expect(
+            self,
+            "stream.",
+            iterations=(1, np.inf),
+            past=(0, np.inf),
+            final_rate=(1e-6, 1),
+            **dict.fromkeys(shares, (0, 1)),
+        )
         expect(self, "stream.", **dict.fromkeys((*weights, *rates), (0, np.inf)))
         expect(self, "stream.", **dict.fromkeys(("depth_limit", "tear_scale"), (1e-9, np.inf)))
 
@@ -110,6 +120,9 @@ class PartsConfig:
     stream: StreamConfig = field(default_factory=StreamConfig)
     unify: UnifyConfig = field(default_factory=UnifyConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
+    weights: Literal["grid", "table", "simplex"] = "grid"
+    """What skinning weights are made of: a hash grid over the scene, a row of logits for each Gaussian, or a
+    row of weights, kept on the simplex."""
     grid: FeatureGridConfig = field(
         default_factory=lambda: FeatureGridConfig(
             levels=6, least_resolution=6, most_resolution=96, log2_entries=14, features=4, hidden=32

@@ -15,10 +15,9 @@ from gsjax.methods.motion_parts.lift import label_votes, lift_masks
 from gsjax.methods.motion_parts.masks import order_of_views, propagated_masks
 from gsjax.methods.motion_parts.stream import Canonical
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
-from gsjax.methods.motion_parts.weights import new_grid, warmed_up
+from gsjax.methods.motion_parts.weights import Field, new_field, saying
 from gsjax.methods.protocols import Segmenter
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.feature_grid import FeatureGrid, locate
 from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
@@ -48,7 +47,7 @@ class Start(NamedTuple):
         anchor: the canonical frame, which `gaussians` shows.
         order: rows of the given Gaussians, those that may move first.
         canonical: the scene in that order.
-        grid: skinning weights, warmed up.
+        field: of skinning weights, warmed up.
         masks: pieces that changed, in every view of the anchor frame, [C,H,W].
         losses: of lifting and of the warm-up.
     """
@@ -56,7 +55,7 @@ class Start(NamedTuple):
     anchor: Anchor
     order: Int[np.ndarray, "N"]
     canonical: Canonical
-    grid: FeatureGrid
+    field: Field
     masks: Int[np.ndarray, "C H W"]
     losses: dict[str, np.ndarray]
 
@@ -80,7 +79,7 @@ def begin(
         moved: from `moved_pixels`.
         config: how.
         segmenter: what belongs together in a picture; not asked where masks are given.
-        key: of the grid.
+        key: of the field.
         masks: of the pieces in every view, where they are known.
 
     Raises:
@@ -91,6 +90,8 @@ def begin(
     frame = views.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
     if masks is None:
+        if not config.discover.difference:
+            moved = np.ones_like(moved)
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
         masks = find_masks(views, gaussians, frame, plan, anchor, moved, config, segmenter)
@@ -106,9 +107,8 @@ def begin(
     alive = np.isin(np.arange(slots), [BACKGROUND, *np.unique(labels)])
     weights = np.where(alive, weights, 0)
     weights /= weights.sum(-1, keepdims=True)
-    grid = new_grid(key, config.grid, movable.means, slots)
-    located = locate(grid, movable.means)
-    grid, warming = warmed_up(grid, located, jnp.asarray(weights), jnp.asarray(alive))
+    field, located = new_field(key, config, movable.means, slots)
+    field, warming = saying(field, located, jnp.asarray(weights), jnp.asarray(alive))
     means = np.asarray(gaussians.means)[order]
     centers = centers_of(means[:count], labels, slots)
     canonical = Canonical(
@@ -121,8 +121,8 @@ def begin(
         jnp.asarray(alive),
         jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
     )
-    losses = {"lifting": lifting, "warming": np.asarray(warming)}
-    return Start(anchor, order, canonical, grid, masks, losses)
+    losses = {"lifting": lifting, "warming": warming}
+    return Start(anchor, order, canonical, field, masks, losses)
 
 
 def find_masks(

@@ -27,10 +27,9 @@ from gsjax.methods.motion_parts.stream import (
 )
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
 from gsjax.methods.motion_parts.unify import Motions, best_cut, motions_of, unified
-from gsjax.methods.motion_parts.weights import warmed_up
+from gsjax.methods.motion_parts.weights import saying
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.feature_grid import FeatureGrid
 from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import HandlePose, at_rest, skin
 from gsjax.scene.region import TILE, tiles_to_pixels, touched_tiles
@@ -70,7 +69,7 @@ class Parts(NamedTuple):
 
     Attributes:
         canonical: the scene and which handles there are.
-        params: the pose at the last frame, and the grid.
+        params: the pose at the last frame, and what weights are made of.
         state: of the optimizer.
         quats, translations: poses at all frames, [T,P,4] and [T,P,3]; at rest where not yet found.
         found: of each frame, as which it was found; 0 is the anchor, -1 is not yet.
@@ -117,7 +116,7 @@ class Parts(NamedTuple):
 def first_parts(start: Start, frames: int, config: PartsConfig) -> Parts:
     """Before anything is followed: all at rest."""
     slots, count = len(start.canonical.alive), start.canonical.movable.num
-    params = StreamParams(at_rest(slots), start.grid)
+    params = StreamParams(at_rest(slots), start.field)
     quats = np.zeros((frames, slots, 4), np.float32)
     quats[..., 0] = 1
     translations = np.zeros((frames, slots, 3), np.float32)
@@ -190,15 +189,13 @@ class _Frames:
         looks, losses, skipped, compiling = _turns(rng, len(frame.images)), [], 0, 0.0
         for i in range(config.iterations):
             size = _HALF if i < config.coarse * config.iterations else _WHOLE
-            u, c = int(rng.choice(past)), int(rng.integers(len(frame.images)))
+            back = [(int(rng.choice(past)), int(rng.integers(len(frame.images)))) for _ in range(config.past)]
             while True:
                 plan = self._plan(size, now, parts, weights)
                 batch = StreamBatch(canonical, one_camera(now[size], looks(i)), plan, weights)
-                if config.past:
-                    seen = self._seen_then(u, c, canonical, weights, parts)
-                    batch = batch._replace(
-                        past=(seen, parts.pose(u)), past_plan=self._plan(_HALF, now, parts, weights)
-                    )
+                if back:
+                    seen = tuple(self._seen_then(u, c, canonical, weights, parts) for u, c in back)
+                    batch = batch._replace(past=seen, past_plan=self._plan(_HALF, now, parts, weights))
                 begun = perf_counter()
                 params, state, info = self._advance(params, state, batch, i / config.iterations)
                 grown = self._grown(info, size)
@@ -217,13 +214,15 @@ class _Frames:
         )
         return parts, np.asarray(losses), skipped, compiling
 
-    def _seen_then(self, u: int, c: int, canonical: Canonical, weights: Array, parts: Parts) -> Seen:
-        """What one camera saw in a frame of the past."""
+    def _seen_then(
+        self, u: int, c: int, canonical: Canonical, weights: Array, parts: Parts
+    ) -> tuple[Seen, HandlePose]:
+        """What one camera saw in a frame of the past, and where handles were."""
         if u not in self._past:
             self._past[u] = _on_host(part_of(self._views.frame(u), (), _HALF))
         frame = one_camera(self._past[u], c)
         frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
-        return seen_at(frame, canonical, weights, parts.pose(u), TILE // _HALF)
+        return seen_at(frame, canonical, weights, parts.pose(u), TILE // _HALF), parts.pose(u)
 
     def _plan(self, size: int, now: dict[int, Seen], parts: Parts, weights: Array) -> Plan:
         if size not in self._plans:
@@ -343,14 +342,10 @@ def split(parts: Parts, config: PartsConfig) -> tuple[Parts, list[tuple[int, int
 
 
 def _with_weights(parts: Parts, weights: np.ndarray, alive: np.ndarray) -> Parts:
-    """With a grid that says these weights."""
+    """With a field that says these weights."""
     centers, labels = np.asarray(parts.canonical.centers), weights.argmax(-1)
     radii = jnp.asarray(radii_of(np.asarray(parts.canonical.movable.means), labels, centers))
     canonical = parts.canonical._replace(alive=jnp.asarray(alive), radii=radii)
-    field = parts.params.field
     targets = jnp.asarray(weights), canonical.alive
-    if isinstance(field, FeatureGrid):
-        field, _ = warmed_up(field, canonical.located, *targets, _REWARM)
-    else:
-        field = jnp.log(jnp.maximum(targets[0], 1e-4))
+    field, _ = saying(parts.params.field, canonical.located, *targets, _REWARM)
     return parts._replace(canonical=canonical, params=parts.params._replace(field=field))

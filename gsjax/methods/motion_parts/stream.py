@@ -15,18 +15,17 @@ from gsjax.geometry.rotations import normalize_quats
 from gsjax.losses.photometric import l1_loss, ssim, weighted_mean
 from gsjax.methods.motion_parts.config import StreamConfig
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
+from gsjax.methods.motion_parts.weights import Field, SimplexTable, weights_of
+from gsjax.optim.constrained import simplex_descent
 from gsjax.optim.step import Step, all_finite, keep_if
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.feature_grid import FeatureGrid, Located
+from gsjax.scene.feature_grid import Located
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, rigid_motions, skin
 from gsjax.scene.render import Rendered, render
 
 _FINAL_TEAR = 0.2  # of a frame's last step, over that of its first: less would hold back what does tear off
-
-Field = FeatureGrid | Float[Array, "M P"]
-"""What weights are made of: a grid over the canonical scene, or a row of logits for each Gaussian."""
 
 
 class Canonical(NamedTuple):
@@ -75,22 +74,21 @@ class StreamBatch(NamedTuple):
         now: this frame.
         plan: for its pictures.
         weights: before this frame, which are held unless pictures tell otherwise.
-        past: a frame of the past and its pose; None before there is one.
-        past_plan: for its pictures.
+        past: frames of the past and their poses.
+        past_plan: for their pictures.
     """
 
     canonical: Canonical
     now: Seen
     plan: Plan
     weights: Float[Array, "M P"]
-    past: tuple[Seen, HandlePose] | None = None
+    past: tuple[tuple[Seen, HandlePose], ...] = ()
     past_plan: Plan | None = None
 
 
 def skinning_weights(field: Field, canonical: Canonical) -> Float[Array, "M P"]:
     """Weights of the movable Gaussians; 0 for slots that hold no handle."""
-    logits = field.at(canonical.located) if isinstance(field, FeatureGrid) else field
-    return jax.nn.softmax(jnp.where(canonical.alive, logits, -jnp.inf))
+    return weights_of(field, canonical.located, canonical.alive)
 
 
 def posed(
@@ -142,8 +140,9 @@ def tearing(
 
 
 def stream_loss(config: StreamConfig):
-    """`loss(params, batch, *, step, key, nudges=None)`: of this frame by pose and field, and of the past one
-    by the field alone. `nudges` [M,3] are added to where Gaussians are now, for who asks where each would go.
+    """`loss(params, batch, *, step, key, nudges=None)`: of this frame by pose and field, and of past ones, in
+    the mean, by the field alone. `nudges` [M,3] are added to where Gaussians are now, for who asks where each
+    would go.
     """
 
     def loss(params: StreamParams, batch: StreamBatch, *, step: Any, key: Any, nudges: Array | None = None):
@@ -162,21 +161,17 @@ def stream_loss(config: StreamConfig):
         tear = config.tear_weight * _FINAL_TEAR**step
         value += tear * told["torn"] + config.hold_weight * changed
         told |= {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
-        if batch.past is not None:
-            seen, pose = batch.past
-            before = render(
-                posed(batch.canonical, weights, jax.lax.stop_gradient(pose), config.blend),
-                seen.frame.cameras,
-                batch.past_plan,
-                roi=seen.counts,
-            )
-            past = picture_loss(before, seen, config)
-            value += past
-            told |= {
-                "past": past,
-                "past_overflow": before.meta.overflow.any(),
-                "past_needed": before.meta.needed.max(),
-            }
+        if batch.past:
+            past, overflow, needed = [], [], []
+            for seen, pose in batch.past:
+                then = posed(batch.canonical, weights, jax.lax.stop_gradient(pose), config.blend)
+                before = render(then, seen.frame.cameras, batch.past_plan, roi=seen.counts)
+                past.append(picture_loss(before, seen, config))
+                overflow.append(before.meta.overflow.any())
+                needed.append(before.meta.needed.max())
+            told["past"] = jnp.stack(past).mean()
+            told |= {"past_overflow": jnp.stack(overflow).any(), "past_needed": jnp.stack(needed).max()}
+            value += told["past"]
         return value, told
 
     return loss
@@ -210,10 +205,15 @@ def stream_step(config: StreamConfig) -> Step:
     """
     loss = stream_loss(config)
     poses = optax.adam(1.0, b2=0.99)
-    fields = optax.adam(config.field_rate, eps=1e-12)
+
+    def fields(field: Field) -> optax.GradientTransformationExtraArgs:
+        if isinstance(field, SimplexTable):
+            return simplex_descent(config.field_rate)
+        return optax.with_extra_args_support(optax.adam(config.field_rate, eps=1e-12))
 
     def init(params: StreamParams, count: int) -> StreamState:
-        return StreamState(poses.init(params.pose), fields.init(params.field), jnp.zeros((count, 3)))
+        field = fields(params.field).init(params.field)
+        return StreamState(poses.init(params.pose), field, jnp.zeros((count, 3)))
 
     def update(params: StreamParams, state: StreamState, batch: StreamBatch, *, step, key):
         def of(params, nudges):
@@ -230,7 +230,9 @@ def stream_step(config: StreamConfig) -> Step:
         quats = params.pose.quats + turn * moves.quats
         shifts = shift * moves.translations
         pose = HandlePose(normalize_quats(quats), params.pose.translations + shifts)
-        changes, field_state = fields.update(slope.field, state.field)
+        changes, field_state = fields(params.field).update(
+            slope.field, state.field, params.field, allowed=batch.canonical.alive
+        )
         field = eqx.apply_updates(params.field, changes)
         overflow = told["overflow"] | told.get("past_overflow", False)
         sound = all_finite((value, slope, pose, eqx.filter(field, eqx.is_array))) & ~overflow

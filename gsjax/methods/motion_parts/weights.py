@@ -1,26 +1,70 @@
-"""Skinning weights from a feature grid over the scene, warmed up on what was lifted (papers/001, 3.3)."""
+"""What skinning weights are made of: a feature grid over the scene, warmed up on what was lifted (papers/001,
+3.3), or a table."""
 
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig, Located, init_feature_grid
+from gsjax.methods.motion_parts.config import PartsConfig
+from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
 _RATE = 1e-2
 _MARGIN = 0.05  # of the box, beyond the outermost Gaussians, in its own size
+_LEAST = 1e-4  # weight of which a logit is made
 
 
-def new_grid(
-    key: PRNGKeyArray, config: FeatureGridConfig, means: Float[Array, "M 3"], parts: int
-) -> FeatureGrid:
-    """A grid over the box of the movable Gaussians, with an output for each part."""
+class SimplexTable(eqx.Module):
+    """Weights themselves, a row for each Gaussian; the optimizer keeps them on the simplex."""
+
+    weights: Float[Array, "M P"]
+
+
+Field = FeatureGrid | SimplexTable | Float[Array, "M P"]
+"""What weights are made of: a grid over the canonical scene, a table of them, or one of their logits."""
+
+
+def new_field(
+    key: PRNGKeyArray, config: PartsConfig, means: Float[Array, "M 3"], parts: int
+) -> tuple[Field, Located | None]:
+    """What `config.weights` says, and where the Gaussians lie in it; a grid is over the box of these."""
+    if config.weights != "grid":
+        empty = jnp.zeros((len(means), parts))
+        return (SimplexTable(empty) if config.weights == "simplex" else empty), None
     low, high = means.min(0), means.max(0)
     room = _MARGIN * jnp.maximum((high - low).max(), 1e-3)
-    return init_feature_grid(key, config, parts, jnp.stack([low - room, high + room]))
+    grid = init_feature_grid(key, config.grid, parts, jnp.stack([low - room, high + room]))
+    return grid, locate(grid, means)
+
+
+def weights_of(field: Field, located: Located | None, alive: Bool[Array, "P"]) -> Float[Array, "M P"]:
+    """What it says: weights that sum to 1, and 0 for slots that are not alive."""
+    if isinstance(field, SimplexTable):
+        return field.weights
+    logits = field.at(located) if isinstance(field, FeatureGrid) else field
+    return jax.nn.softmax(jnp.where(alive, logits, -jnp.inf))
+
+
+def saying(
+    field: Field,
+    located: Located | None,
+    weights: Float[Array, "M P"],
+    alive: Bool[Array, "P"],
+    iterations: int = 100,
+) -> tuple[Field, Float[np.ndarray, "iterations"]]:
+    """The field that says these weights: a table at once, a grid as far as it can after so many steps, of
+    which the losses come back too."""
+    if isinstance(field, SimplexTable):
+        return SimplexTable(weights), np.zeros(0)
+    if not isinstance(field, FeatureGrid):
+        return jnp.log(jnp.maximum(weights, _LEAST)), np.zeros(0)
+    assert located is not None
+    grid, losses = warmed_up(field, located, weights, alive, iterations)
+    return grid, np.asarray(losses)
 
 
 @partial(jax.jit, static_argnames="iterations")
