@@ -1,0 +1,100 @@
+"""What experiments with parts share: a canonical scene for many settings, and scores as of `gsjax parts`."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsjax.cli import fit as fit_command
+from gsjax.cli.parts import Options
+from gsjax.cli.parts import run as run_parts
+from gsjax.cli.parts_run import open_parts_run
+from gsjax.cli.views import part_views
+from gsjax.metrics.temporal import temporal_scores
+from gsjax.perception.optical_flow import DisFlow
+
+FIT = Options.__dataclass_fields__["fit"].default_factory()
+
+
+def canonical_of(options: Options, folder: Path) -> Path:
+    """The run of `gsjax fit` at the options' anchor, made once for several cells; beside `folder`.
+
+    Args:
+        options: of `gsjax parts`, with an anchor.
+        folder: of a cell.
+    """
+    assert options.anchor is not None
+    asked = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
+    path = folder.parent / f"canonical-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+    if not (path / "report.html").is_file():
+        fit_command.run(
+            fit_command.Options(
+                options.dataset,
+                path,
+                frames=f"{options.anchor}:{options.anchor + 1}",
+                cameras=options.cameras,
+                eval_cameras=options.eval_cameras,
+                overwrite=True,
+                read=options.read,
+                fit=options.fit,
+            )
+        )
+    return path
+
+
+def discovered(options: Options) -> dict[str, Any]:
+    """What `gsjax parts` found, in a row: parts, motion and joints against the truth, and pictures.
+
+    `joints` counts parts whose kind of joint was found, of those that have one; errors are over the parts
+    that were found.
+    """
+    run_parts(options)
+    found = json.loads((options.out / "metrics.json").read_text())
+    matched = [row for row in found["parts"] if row.get("true_name")]
+    jointed = [row for row in matched if row.get("same_kind")]
+    points = [row["median_point_error_mm"] for row in matched]
+    turning = [row for row in jointed if row["kind"] == "revolute"]
+    row = {
+        "ari": found["ari"],
+        "parts": found["num_parts"],
+        "true_found": None if found["ari"] is None else len(matched),
+        "point_mm": float(np.mean(points)) if points else None,
+        "worst_point_mm": max(points, default=None),
+        "joints": len(jointed),
+        "axis_deg": float(np.mean([row["axis_deg"] for row in turning])) if turning else None,
+        "gaussians": found["num_gaussians"],
+        "update_s": found["update_s"]["median"],
+        "minutes": (found["seconds"]["total"] - found["seconds"].get("canonical", 0.0)) / 60,
+        "skipped": found["skipped"],
+        "found": [
+            f"{row.get('true_name') or '-'}: {row['gaussians']} Gaussians, {row['kind']}"
+            for row in found["parts"]
+        ],
+    }
+    for kind, name in (("held_out", "held_out"), ("tracked", "train")):
+        row |= {f"{name}_psnr": found[kind]["psnr"], f"{name}_ssim": found[kind]["ssim"]}
+    return row
+
+
+def steadiness(folder: Path) -> dict[str, Any]:
+    """How steady the run's video of the first held-out camera is, beside the recording's."""
+    run = open_parts_run(folder)
+    camera = run.camera(None)
+    videos: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for views in part_views(run.layer.scene, run.layer.trajectory, run.recording, run.blend):
+        view = next(view for view in views if view.camera == camera)
+        for video, picture in zip(videos, (view.render, view.image), strict=True):
+            video.append(picture)
+    found = temporal_scores(*(np.stack(video) for video in videos), optical_flow=DisFlow())
+    return {name: found[name] for name in ("t_ssim_gap", "flow_warp_error", "flow_warp_share")}
+
+
+def with_parts(options: Options, **sections: dict[str, Any]) -> Options:
+    """With other settings: `stream={"past": 0}`; `top={...}` for those that are in no section."""
+    parts = replace(options.parts, **sections.pop("top", {}))
+    for name, values in sections.items():
+        parts = replace(parts, **{name: replace(getattr(parts, name), **values)})
+    return replace(options, parts=parts)
