@@ -23,7 +23,7 @@ from gsjax.methods.motion_parts import (
     outcome,
     without_needless,
 )
-from gsjax.methods.motion_parts.finish import given, touching
+from gsjax.methods.motion_parts.finish import given, settled, touching
 from gsjax.methods.motion_parts.follow import joined, order_of_frames
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import skin
@@ -143,6 +143,18 @@ def test_what_no_picture_needs_is_given_up(boxes, halves):
     assert (free, BACKGROUND) in pairs
     kept = set(np.unique(np.asarray(after.weights).argmax(-1)).tolist())
     assert kept == set(np.unique(np.asarray(parts.weights).argmax(-1)).tolist())
+
+
+def test_in_the_end_weights_that_only_tie_parts_together_are_cut(halves):
+    _, steps = halves
+    before, after = steps[-1].parts, settled(steps[-1].parts)
+    weights, cut = np.asarray(before.weights), np.asarray(after.weights)
+    assert ((weights > 0) & (weights < 0.02)).mean() > 0.2
+    assert not ((cut > 0) & (cut < 0.02)).any()
+    np.testing.assert_allclose(cut.sum(-1), 1, atol=1e-6)
+    np.testing.assert_array_equal(cut.argmax(-1), weights.argmax(-1))
+    assert np.abs(cut - weights).max() < 0.02 * weights.shape[1]
+    np.testing.assert_allclose(settled(after).weights, cut, atol=1e-6)
 
 
 def test_parts_that_are_touched(halves):

@@ -13,6 +13,7 @@ from gsjax.methods.motion_parts.discover import Start, Views, centers_of
 from gsjax.methods.motion_parts.follow import Parts, joined, seen_at
 from gsjax.methods.motion_parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.motion_parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
+from gsjax.methods.motion_parts.weights import SimplexTable
 from gsjax.optim.compiler import host_options
 from gsjax.scene.frame import one_camera, part_of
 from gsjax.scene.gaussians import take
@@ -22,6 +23,7 @@ from gsjax.scene.render import plan_render, render
 
 _FRAMES, _CAMERAS = 6, 2  # by which parts are judged
 _LEAST_CONTACT = 0.05  # share of a part's neighbours
+_LEAST_WEIGHT = 0.02
 _SHRINK = 2
 
 
@@ -31,6 +33,9 @@ def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[P
 
     What a scene does not require is not modelled. It is decided by what is seen, and not by how motions
     compare: the motion of a thin piece is badly known, and matters little for the same reason.
+
+    The weights that are left are a table from here on, without those below 2 %: a softmax gives every part a
+    little of everything, and to move a part would move all others a little.
     """
     judge = _Judge(views, parts, config)
     weights, into = np.asarray(parts.weights), np.arange(len(parts.canonical.alive))
@@ -44,7 +49,16 @@ def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[P
             if losses[best] <= (1 + config.unify.least_gain) * here:
                 weights, here = ways[best], losses[best]
                 into[into == part] = best
-    return joined(parts, into)
+    parts, pairs = joined(parts, into)
+    return settled(parts), pairs
+
+
+def settled(parts: Parts) -> Parts:
+    """With a table of weights, without those that are so small that they only tie parts to each other."""
+    weights = np.asarray(parts.weights)
+    kept = np.where(weights < _LEAST_WEIGHT, 0.0, weights)
+    table = SimplexTable(jnp.asarray(kept / kept.sum(-1, keepdims=True), weights.dtype))
+    return parts._replace(params=parts.params._replace(field=table))
 
 
 def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
