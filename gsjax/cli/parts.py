@@ -51,6 +51,8 @@ class Options:
     """Ids of cameras that are held out: only judged, in the end."""
     frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
     """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
+    scale: float = 1.0
+    """Look at pictures this many times smaller, as in 0.5; all of them, the held-out ones too."""
     anchor: int | None = None
     """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
     scene: Path | None = None
@@ -84,7 +86,12 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         recording = open_recording(
-            options.dataset, options.cameras, options.eval_cameras, options.frames, options.read
+            options.dataset,
+            options.cameras,
+            options.eval_cameras,
+            options.frames,
+            options.read,
+            options.scale,
         )
         _check(options, recording)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
@@ -188,6 +195,7 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
         frames=f"{frame}:{frame + 1}",
         cameras=options.cameras,
         eval_cameras=options.eval_cameras,
+        scale=options.scale,
         resume=is_run(path),
         read=options.read,
         fit=options.fit,

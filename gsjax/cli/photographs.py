@@ -13,14 +13,14 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.machine import available_mb
-from gsjax.cli.recording import open_recording, parse_frames
+from gsjax.cli.recording import LEAST_SIDE, open_recording, parse_frames
 from gsjax.cli.run_folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.methods.reconstruction import View
 
-_LEAST, _LARGE = 8, 1600  # pixels, a side
+_LARGE = 1600  # pixels, a side
 _BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
 
 
@@ -77,10 +77,10 @@ def _scaled(photographs: Photographs, scale: float) -> Photographs:
     smaller = photographs.scaled(scale)
     least = smaller.sizes.min(1).argmin()
     (width, height), (before, high) = smaller.sizes[least], photographs.sizes[least]
-    if scale < 1 and min(width, height) < _LEAST:
+    if scale < 1 and min(width, height) < LEAST_SIDE:
         raise ValueError(
             f"--scale {scale:g}: a photograph of {before}x{high} would be {width}x{height}; expected "
-            f"{_LEAST} pixels or more a side"
+            f"{LEAST_SIDE} pixels or more a side"
         )
     return smaller
 

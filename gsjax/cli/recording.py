@@ -19,6 +19,9 @@ from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 
+LEAST_SIDE = 8
+"""Of a picture that is made smaller, pixels."""
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -54,11 +57,14 @@ def open_recording(
     eval_cameras: Indices[int],
     frames: str,
     read: ReadOptions | None = None,
+    scale: float = 1.0,
 ) -> Recording:
-    """Open a dataset and choose frames and cameras; without `cameras` all that are not held out.
+    """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
+    made smaller by `scale`.
 
     Raises:
-        ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen.
+        ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
+            much would be left of pictures.
         DataError: the dataset cannot be read.
     """
     sequence = open_sequence(dataset, read)
@@ -83,7 +89,7 @@ def open_recording(
     if (chosen_frames.stop or 0) > total:
         message = f"--frames: {frames} goes beyond the last frame of {sequence.name}, {total - 1}"
         warnings.warn(message, DataWarning, stacklevel=2)
-    sequence = sequence.select(frames=chosen_frames)
+    sequence = _scaled(sequence.select(frames=chosen_frames), scale)
     simulated = dataset.startswith(SIMULATED_PREFIX)
     if simulated:
         sequence = remembered(sequence)
@@ -93,6 +99,18 @@ def open_recording(
         frames_in_data=total,
         simulated=simulated,
     )
+
+
+def _scaled(sequence: Sequence, scale: float) -> Sequence:
+    if not 0 < scale <= 1:
+        raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
+    smaller = sequence.scaled(scale)
+    if scale < 1 and min(smaller.width, smaller.height) < LEAST_SIDE:
+        raise ValueError(
+            f"--scale {scale:g}: pictures of {sequence.width}x{sequence.height} would be "
+            f"{smaller.width}x{smaller.height}; expected {LEAST_SIDE} pixels or more a side"
+        )
+    return smaller
 
 
 def parse_frames(text: str) -> slice:

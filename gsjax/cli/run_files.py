@@ -63,7 +63,8 @@ def reopen(
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         wanted = also(settings)
         read = _read_options(settings.get("read") or {})
-        return open_recording(*(settings[name] for name in _SETTINGS), read), wanted
+        scale = float(settings.get("scale", 1.0))
+        return open_recording(*(settings[name] for name in _SETTINGS), read, scale), wanted
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error

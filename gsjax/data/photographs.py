@@ -4,12 +4,12 @@ from collections.abc import Callable
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from gsjax.data.errors import DataError
+from gsjax.data.resizing import blended, expect_scale, picked
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses, check_shape
 from gsjax.geometry.cameras import Camera
@@ -155,30 +155,22 @@ class Photographs:
         Raises:
             ValueError: `scale` is not above 0 and at most 1.
         """
-        if not 0 < scale <= 1:
-            raise ValueError(f"scale must be above 0 and at most 1, got {scale}")
+        expect_scale(scale)
         if scale == 1:
             return self
         sizes = np.maximum(1, np.round(self.sizes * scale).astype(int))
         factors = np.concatenate([sizes / self.sizes, np.ones((self.num, 1))], axis=1)
 
-        def resized(load: Callable, how: int) -> Callable:
-            def smaller(i: int) -> np.ndarray | None:
-                full = load(i)
-                if full is None:
-                    return None
-                picture = full.astype(np.uint8) if full.dtype == bool else full
-                return cv2.resize(picture, sizes[i], interpolation=how).astype(full.dtype)
-
-            return smaller
+        def size(i: int) -> tuple[int, int]:
+            return tuple(sizes[i].tolist())
 
         return replace(
             self,
             sizes=sizes,
             Ks=self.Ks * factors[:, :, None],
-            load_image=resized(self.image, cv2.INTER_AREA),
-            load_mask=self.load_mask and resized(self.mask, cv2.INTER_NEAREST_EXACT),
-            load_depth=self.load_depth and resized(self.depth, cv2.INTER_NEAREST_EXACT),
+            load_image=blended(self.image, size),
+            load_mask=picked(self.load_mask and self.mask, size),
+            load_depth=picked(self.load_depth and self.depth, size),
         )
 
     def where(self, kind: str, i: int) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.resizing import blended, expect_scale, picked
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import Camera
 from gsjax.geometry.joints import Joint
@@ -316,6 +317,35 @@ class Sequence:
             truth=truth,
         )
 
+    def scaled(self, scale: float) -> "Sequence":
+        """The same views in smaller pictures: colours are means over what a pixel covers, depths, labels and
+        flow those in its middle.
+
+        Raises:
+            ValueError: `scale` is not above 0 and at most 1.
+        """
+        expect_scale(scale)
+        if scale == 1:
+            return self
+        width, height = (max(1, round(side * scale)) for side in (self.width, self.height))
+        factors = np.array([width / self.width, height / self.height, 1.0])
+
+        def size(*_: int) -> tuple[int, int]:
+            return width, height
+
+        flow = picked(self.load_flow, size)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            Ks=self.Ks * factors[:, None],
+            load_image=blended(self.image, size),
+            load_depth=picked(self.load_depth and self.depth, size),
+            load_mask=picked(self.load_mask and self.mask, size),
+            load_flow=flow and (lambda *which: _times(flow(*which), factors[:2])),
+            float_images=False,  # `image` has made bytes of them, and `depth` knows which were not finite
+        )
+
     def _raw_image(self, t: int, c: int) -> np.ndarray:
         image = self._load(self.load_image, "image", t, c)
         kind, words = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
@@ -354,3 +384,7 @@ def _check_array(
 
 def _reindex(loader: Callable | None, frames: list[int], cameras: list[int]) -> Callable | None:
     return loader and (lambda t, c: loader(frames[t], cameras[c]))
+
+
+def _times(flow: np.ndarray | None, factors: Float[np.ndarray, "2"]) -> np.ndarray | None:
+    return None if flow is None else (flow * factors).astype(flow.dtype)

@@ -135,6 +135,9 @@ def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
     code, said = gsjax_parts("--frames", "0:24:8", "--scene", str(tmp_path), "--anchor", "0")
     assert code == 2
     assert "expected the folder of a run of `gsjax fit`" in said
+    code, said = gsjax_parts("--scale", "0.05")
+    assert code == 2
+    assert "--scale 0.05: pictures of 96x72 would be 5x4; expected 8 pixels or more a side" in said
     code, said = gsjax_parts("--frames", "0:3", "--anchor", "7")
     assert code == 2
     assert "anchor: expected a frame from 0 to 2, found 7" in said

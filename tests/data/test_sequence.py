@@ -98,6 +98,55 @@ def test_select_takes_positions_and_camera_ids():
     assert again.image(0, 0)[1, 1, 0] == 31
 
 
+def test_smaller_colours_are_means_and_the_rest_is_not():
+    def load_image(t, c):
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        image[::2, ::2] = 200  # one of the four pixels of each new one
+        return image
+
+    rising = np.arange(WIDTH, dtype=np.float32) + np.ones((4, 1), np.float32)
+    sequence = make(
+        height=4,
+        load_image=lambda t, c: load_image(t, c)[:4],
+        load_depth=lambda t, c: rising if c == 0 else None,
+        load_mask=lambda t, c: (rising > 4).astype(np.int32),
+        load_flow=lambda t, u, c: np.stack([rising, np.full_like(rising, 2)], -1),
+    )
+    half = sequence.scaled(0.5)
+    assert (half.width, half.height) == (3, 2)
+    assert half.image(1, 0).dtype == np.uint8
+    assert (half.image(1, 0) == 50).all()
+    assert half.depth(0, 0)[0].tolist() == [2.0, 4.0, 6.0]
+    assert half.depth(0, 1) is None
+    assert half.mask(0, 0)[0].tolist() == [0, 0, 1]
+    np.testing.assert_array_equal(half.flow(0, 0)[0], [[1, 1], [2, 1], [3, 1]])  # half the pixels
+    K = np.array(sequence.Ks[0, 0])
+    np.testing.assert_allclose(half.Ks[0, 0], np.diag([0.5, 0.5, 1]) @ K)
+    assert half.frame(0).images.shape == (2, 2, 3, 3)
+    assert sequence.scaled(1.0) is sequence
+    assert half.select(cameras=[3]).image(0, 0).shape == (2, 3, 3)
+    bare = make(load_depth=None, load_mask=None, load_flow=None).scaled(0.5)
+    assert [bare.has_depth, bare.has_masks, bare.has_flow] == [False] * 3
+
+
+def test_smaller_float_pictures_have_lost_what_is_not_finite():
+    def load_image(t, c):
+        image = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+        image[0, 0], image[2, 2] = np.nan, 0.0
+        return image
+
+    with pytest.warns(DataWarning, match="1 pixels are not finite"):
+        small = make(load_image=load_image, float_images=True).scaled(0.5).image(0, 0)
+    assert small.dtype == np.uint8
+    assert small[1, 2].tolist() == [128, 128, 128]
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, float("nan")])
+def test_scales_that_make_nothing_smaller(scale):
+    with pytest.raises(ValueError, match="scale must be above 0 and at most 1, got"):
+        make().scaled(scale)
+
+
 def test_select_swaps_cameras():
     swapped = make().select(cameras=[3, 7])
     assert swapped.camera_ids == (3, 7)
