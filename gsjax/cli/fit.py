@@ -20,6 +20,7 @@ from gsjax.cli.fit_orbit import write_orbit
 from gsjax.cli.fit_parts import parts
 from gsjax.cli.fit_results import Curve, Plans, Scores, judge, living, print_results, write_results
 from gsjax.cli.fit_resume import load
+from gsjax.cli.fit_start import start_from
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
@@ -135,9 +136,9 @@ def run(options: Options) -> int:
             folder.check_config(settings, but=_OF_NO_BEARING)
         say_if_large(photographs)
         views = read_views(photographs, console)
-        cloud = None if photographs.cloud is None else (photographs.cloud.points, photographs.cloud.colors)
         fitted = [views[i] for i in chosen]
-        problem, state = begin(fitted, options.fit, cloud, photographs.background)
+        config, cloud = start_from(photographs, fitted, options.fit, console)
+        problem, state = begin(fitted, config, cloud, photographs.background)
         folder.write_config(settings)  # from here on an earlier run is gone
         curve = Curve()
         if options.resume:

@@ -12,10 +12,11 @@ from gsjax.methods.settings import expect
 class StartConfig:
     """Where the first Gaussians are."""
 
-    source: Literal["auto", "cloud", "depth", "random"] = "auto"
-    """The data's points, its depth, or random places before cameras; auto takes the first that there is."""
+    source: Literal["auto", "cloud", "depth", "matches", "random"] = "auto"
+    """The data's points, its depth, what photographs are found to share, or random places before cameras;
+    auto takes the first that there is."""
     count: int = 20_000
-    """How many, where they are drawn from depth or at random."""
+    """How many, where they are not the data's own points."""
     opacity: float = 0.1
     """Of all of them; more where depth says that something is there."""
     scale: float = 1.0

@@ -71,6 +71,9 @@ def start_points(
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], str]:
     """Points and their colours, and where they come from.
 
+    Args:
+        cloud: points and their colours: the data's own, or, where `config.source` says so, those of matches.
+
     Raises:
         ValueError: the source that is asked for is not there.
     """
@@ -82,9 +85,10 @@ def start_points(
     is_seen = cloud is not None and source in ("auto", "cloud") and _is_seen(cloud[0], views)
     if source == "auto":
         source = "cloud" if is_seen else "depth" if has_depth else "random"
-    if source == "cloud":
+    if source in ("cloud", "matches"):
         if cloud is None:
-            raise ValueError("start.source: the data has no points; use depth, random or auto")
+            lacks = "the data has no points" if source == "cloud" else "photographs share nothing"
+            raise ValueError(f"start.source: {lacks}; use depth, random or auto")
         return *cloud, source
     if source == "depth":
         if not has_depth:
