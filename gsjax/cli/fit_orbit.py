@@ -27,6 +27,7 @@ def write_orbit(folder: RunFolder, problem: Problem, gaussians: Gaussians) -> No
     mode, plan = "antialiased" if problem.config.antialiased else "classic", None
     with VideoWriter(folder.video(NAME), _FPS) as video:
         for viewmat in viewmats:
-            camera = Camera(*(jnp.asarray(a, jnp.float32)[None] for a in (viewmat, K)), width, height)
+            placed = (jnp.asarray(a, jnp.float32)[None] for a in (viewmat, K))
+            camera = Camera(*placed, width, height, view.near)
             drawn, plan = render_with_room(gaussians, camera, plan, backgrounds=behind, rasterize_mode=mode)
             video.write(np.asarray(drawn.colors[0]))

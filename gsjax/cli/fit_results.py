@@ -237,7 +237,7 @@ def look(
     """
     height, width = view.image.shape[:2]
     viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (view.viewmat, view.K))
-    camera, mode = Camera(viewmat, K, width, height), "antialiased" if antialiased else "classic"
+    camera, mode = Camera(viewmat, K, width, height, view.near), "antialiased" if antialiased else "classic"
     behind = jnp.array([background or (0.0, 0.0, 0.0)])
     drawn, plan = render_with_room(gaussians, camera, plan, backgrounds=behind, rasterize_mode=mode)
     image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), view.image / 255

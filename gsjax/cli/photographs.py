@@ -142,7 +142,8 @@ def read_views(photographs: Photographs, console: Console) -> list[View]:
 
     def read(i: int) -> View:
         mask, depth = photographs.mask(i), photographs.depth(i)
-        return View(photographs.image(i), mask, depth, photographs.viewmats[i], photographs.Ks[i])
+        viewmat, K = photographs.viewmats[i], photographs.Ks[i]
+        return View(photographs.image(i), mask, depth, viewmat, K, photographs.near)
 
     with ThreadPoolExecutor(2) as executor:
         jobs = [executor.submit(read, i) for i in range(photographs.num)]

@@ -1,9 +1,11 @@
 """Opens any recording, and any set of photographs, that some reader here knows."""
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qsl
+
+import numpy as np
 
 from gsjax.data import colmap, poses_bounds, transforms
 from gsjax.data.errors import DataError
@@ -16,6 +18,7 @@ from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.simulated import articulated, bar, tabletop
 from gsjax.data.structure_from_motion import SUFFIXES
 from gsjax.data.tum import read_tum
+from gsjax.geometry.cameras import NEAR
 
 SIMULATED_PREFIX = "simulated:"
 SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated, "bar": bar}
@@ -44,6 +47,13 @@ class ReadOptions:
     """Folder of the photographs, in COLMAP's and LLFF's layouts."""
     depth_unit_m: float | None = None
     """Lengths of one step of a depth image (Open3D, nerfstudio); 0.001 unless given."""
+    near: float = NEAR
+    """What is nearer to a camera than this is not drawn: the rig, where cameras see each other. In the unit
+    of the poses."""
+
+    def __post_init__(self):
+        if not 0 <= self.near < np.inf:
+            raise ValueError(f"near: expected 0 or more, found {self.near}")
 
 
 def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
@@ -57,6 +67,10 @@ def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Seque
         ValueError: there is no built-in scene of that name, or it has no such argument; an option is missing.
     """
     options = options or ReadOptions()
+    return replace(_sequence(path, options), near=options.near)
+
+
+def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     if str(path).startswith(SIMULATED_PREFIX):
         return _simulate(str(path))
     root = _folder(path)
@@ -81,7 +95,12 @@ def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Ph
         DataError: there is no such folder, or its layout is not known.
         ValueError: as `open_sequence`, or `axes` is needed and missing.
     """
-    options, text = options or ReadOptions(), str(path)
+    options = options or ReadOptions()
+    return replace(_photographs(path, options), near=options.near)
+
+
+def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
+    text = str(path)
     if text.startswith(SIMULATED_PREFIX):
         return photographs_of(open_sequence(text))
     if text.endswith(".json") and Path(path).is_file():

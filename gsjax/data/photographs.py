@@ -12,7 +12,7 @@ from gsjax.data.errors import DataError
 from gsjax.data.resizing import blended, expect_scale, picked
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses, check_shape
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import NEAR, Camera
 
 # Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
 
@@ -57,6 +57,7 @@ class Photographs:
         splits: "train", "val" or "test" for each, as the data has it; None where it does not say.
         cloud: points of the scene.
         background: RGB, 0 to 1, of what was behind transparent photographs; None where none was transparent.
+        near: what is nearer to a camera is not to be drawn, metres.
         locate: (kind, i) -> path of a file, for messages; kind is "image", "mask" or "depth".
 
     Raises:
@@ -75,6 +76,7 @@ class Photographs:
     splits: tuple[str, ...] | None = None
     cloud: Cloud | None = field(default=None, repr=False)
     background: tuple[float, float, float] | None = None
+    near: float = NEAR
     locate: Callable[[str, int], str] | None = field(default=None, repr=False)
 
     def __post_init__(self):
@@ -99,7 +101,8 @@ class Photographs:
         """The camera of photograph `i`, in JAX's default float type."""
         dtype = jnp.result_type(float)
         width, height = (int(size) for size in self.sizes[i])
-        return Camera(jnp.asarray(self.viewmats[i], dtype), jnp.asarray(self.Ks[i], dtype), width, height)
+        viewmat, K = (jnp.asarray(a[i], dtype) for a in (self.viewmats, self.Ks))
+        return Camera(viewmat, K, width, height, self.near)
 
     def image(self, i: int) -> UInt8[np.ndarray, "height width 3"]:
         """RGB.
@@ -206,5 +209,6 @@ def photographs_of(sequence: Sequence) -> Photographs:
         load_image=lambda i: sequence.image(*places[i]),
         load_depth=(lambda i: sequence.depth(*places[i])) if sequence.has_depth else None,
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
+        near=sequence.near,
         locate=lambda kind, i: sequence.where(kind, *places[i]),
     )

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.resizing import blended, expect_scale, picked
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import NEAR, Camera
 from gsjax.geometry.joints import Joint
 from gsjax.scene.frame import Frame
 
@@ -131,6 +131,7 @@ class Sequence:
         models: shapes known beforehand.
         float_images: `load_image` gives floats. Its pixels that are not finite are reported, turn black, and
             count as invalid in `depth`.
+        near: what is nearer to a camera is not to be drawn, metres.
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
 
     Raises:
@@ -152,6 +153,7 @@ class Sequence:
     truth: Truth | None = None
     models: tuple[PointModel, ...] = ()
     float_images: bool = False
+    near: float = NEAR
     locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)
 
     def __post_init__(self):
@@ -201,7 +203,7 @@ class Sequence:
         """Camera `c` as it stood in frame `t`, in JAX's default float type."""
         dtype = jnp.result_type(float)
         viewmat, K = jnp.asarray(self.viewmats[t, c], dtype), jnp.asarray(self.Ks[t, c], dtype)
-        return Camera(viewmat=viewmat, K=K, width=self.width, height=self.height)
+        return Camera(viewmat, K, self.width, self.height, self.near)
 
     def image(self, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
         """RGB. Warns with DataWarning where float pixels are not finite or the whole image is one colour.
@@ -264,7 +266,7 @@ class Sequence:
             loaded = [self.depth(t, c) for c in cameras]
             depths = jnp.asarray(np.stack([nothing if d is None else d for d in loaded]), dtype)
         viewmats, Ks = jnp.asarray(self.viewmats[t], dtype), jnp.asarray(self.Ks[t], dtype)
-        camera = Camera(viewmat=viewmats, K=Ks, width=self.width, height=self.height)
+        camera = Camera(viewmats, Ks, self.width, self.height, self.near)
         return Frame(jnp.asarray(images, dtype) / 255, depths, camera)
 
     def flow(self, t: int, c: int) -> Float[np.ndarray, "height width 2"] | None:

@@ -9,6 +9,10 @@ from jaxtyping import Array, Float
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+NEAR = 0.01
+"""Metres; so near is nothing that a camera sees sharply."""
+
+
 class Camera(eqx.Module):
     """One or many pinhole cameras of the same image size.
 
@@ -17,12 +21,14 @@ class Camera(eqx.Module):
         K: intrinsics in pixels; the principal point counts pixel centres at +0.5.
         width: pixels, static.
         height: pixels, static.
+        near: what is nearer is not drawn, metres, static: the rig itself, where cameras see each other.
     """
 
     viewmat: Float[Array, "*batch 4 4"]
     K: Float[Array, "*batch 3 3"]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+    near: float = eqx.field(static=True, default=NEAR)
 
 
 def viewmat_from_opengl(camera_to_world: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
@@ -61,7 +67,8 @@ def intrinsics(
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
     """The same view in pictures of another size, whose pixels are 1 / `scale` times as wide."""
-    return Camera(camera.viewmat, camera.K * jnp.array([[scale], [scale], [1.0]]), width, height)
+    K = camera.K * jnp.array([[scale], [scale], [1.0]])
+    return Camera(camera.viewmat, K, width, height, camera.near)
 
 
 def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) -> Float[Array, "*n 3"]:

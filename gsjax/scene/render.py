@@ -34,7 +34,12 @@ def plan_render(gaussians: Gaussians, cameras: Camera, **options: Any) -> Plan:
         cameras.K,
         cameras.width,
         cameras.height,
-        **{"sh_degree": gaussians.sh_degree, "render_mode": "RGB+ED", **options},
+        **{
+            "sh_degree": gaussians.sh_degree,
+            "render_mode": "RGB+ED",
+            "near_plane": cameras.near,
+            **options,
+        },
     )
 
 

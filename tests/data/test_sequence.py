@@ -3,7 +3,17 @@ import warnings
 import numpy as np
 import pytest
 
-from gsjax.data import DataError, DataWarning, PointModel, Sequence, Truth, check_depth
+from gsjax.data import (
+    DataError,
+    DataWarning,
+    PointModel,
+    ReadOptions,
+    Sequence,
+    Truth,
+    check_depth,
+    open_sequence,
+)
+from gsjax.data.photographs import photographs_of
 
 FRAMES, CAMERAS, WIDTH, HEIGHT = 4, 2, 6, 5
 
@@ -320,3 +330,14 @@ def test_usual_depth_passes_without_a_word(median):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_depth(np.full((3, 4), median), "depth")
+
+
+def test_what_is_too_near_to_be_drawn_is_known_to_all_that_is_made_of_a_sequence():
+    sequence = make(near=0.4)
+    assert sequence.select(cameras=[3]).scaled(0.5).camera(0, 0).near == 0.4
+    assert sequence.frame(1).cameras.near == 0.4
+    assert photographs_of(sequence).camera(0).near == 0.4
+    read = ReadOptions(near=0.3)
+    assert open_sequence("simulated:articulated?width=48&height=36&cameras=2", read).near == 0.3
+    with pytest.raises(ValueError, match="near: expected 0 or more, found -1"):
+        ReadOptions(near=-1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gsjax
-from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.geometry.cameras import Camera, intrinsics, look_at, resized
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render, render_with_room
 
@@ -165,3 +165,17 @@ def test_a_plan_is_made_kept_and_grown_as_it_must_be(scene, cameras):
         lambda g: g.shN, scene, jnp.zeros((scene.num, 3, 3)), is_leaf=lambda leaf: leaf is None
     )
     assert render_with_room(bare, cameras, plan)[1].sh_degree == 1  # another degree asks for another plan
+
+
+def test_what_is_nearer_than_the_camera_looks_is_not_drawn():
+    """A plan has it from the cameras that it is made for."""
+    means = jnp.array([[0.0, 0.0, 0.3], [0.0, 0.0, 2.0]])  # the first right before the camera
+    scene = gaussians_from_activated(
+        means, np.tile([1.0, 0, 0, 0], (2, 1)), np.full((2, 3), 0.2), np.full(2, 0.99), np.eye(3)[:2]
+    )
+    viewmat, K = jnp.eye(4)[None], jnp.array([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]])
+    for near, color in ((0.01, 0), (0.5, 1)):
+        camera = Camera(viewmat, K, 16, 16, near)
+        drawn = render(scene, camera, plan_render(scene, camera))
+        assert int(drawn.colors[0, 8, 8].argmax()) == color
+        assert resized(camera, 0.5, 8, 8).near == near

@@ -263,7 +263,7 @@ def _observe(view: View, number: int, shrink: int, kinds: tuple[bool, bool]) -> 
     viewmat, K = (jnp.asarray(a, dtype)[None] for a in (view.viewmat, factors[:, None] * view.K))
     known = None if depth is None else jnp.asarray(depth, dtype)[None]
     counts = None if mask is None else jnp.asarray(mask)[None]
-    camera = Camera(viewmat, K, width, height)
+    camera = Camera(viewmat, K, width, height, view.near)
     return Observation(jnp.asarray(image)[None], counts, known, camera, jnp.asarray(number, jnp.int32))
 
 
@@ -273,6 +273,7 @@ def _plan(problem: Problem, gaussians: Gaussians, cameras: Camera, capacity: int
     if capacity == 0:
         return plan_render(gaussians, cameras, headroom=_HEADROOM, rasterize_mode=mode)
     options = {"rasterize_mode": mode, "render_mode": "RGB+ED", "sh_degree": gaussians.sh_degree}
+    options["near_plane"] = cameras.near
     return Plan(cameras.width, cameras.height, capacity, **options)
 
 

@@ -42,7 +42,7 @@ def light_of(
     for view in views:
         height, width = view.image.shape[:2]
         viewmat, K = (jnp.asarray(a, gaussians.means.dtype)[None] for a in (view.viewmat, view.K))
-        camera = Camera(viewmat, K, width, height)
+        camera = Camera(viewmat, K, width, height, view.near)
         while True:
             if (width, height) not in plans:
                 plans[width, height] = plan_render(

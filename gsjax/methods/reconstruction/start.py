@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from gsjax.geometry.cameras import NEAR
 from gsjax.methods.reconstruction.config import StartConfig
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
@@ -26,6 +27,7 @@ class View(NamedTuple):
         depth: 0 where unknown, or None.
         viewmat: world to camera, OpenCV axes.
         K: intrinsics in pixels.
+        near: what is nearer is not drawn, metres.
     """
 
     image: np.ndarray
@@ -33,6 +35,7 @@ class View(NamedTuple):
     depth: np.ndarray | None
     viewmat: Float[np.ndarray, "4 4"]
     K: Float[np.ndarray, "3 3"]
+    near: float = NEAR
 
 
 class Extent(NamedTuple):
