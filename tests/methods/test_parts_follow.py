@@ -125,6 +125,25 @@ def test_two_boxes_in_one_piece_are_divided(boxes):
     assert of[0] != of[1]
 
 
+@pytest.mark.parametrize("kind", ["table", "simplex"])
+def test_weights_in_a_table_are_followed_too(boxes, kind):
+    """Once, the table itself was given away in the first step."""
+    stream = replace(CONFIG.stream, iterations=3, field_rate=0.02, past=2)
+    config = replace(CONFIG, weights=kind, stream=stream)
+    found = choose_anchor(boxes.image, FRAMES, boxes.num_cameras, 0)
+    moved = moved_pixels(boxes.image, found, boxes.num_cameras)
+    masks = boxes.masks(boxes.bodies)
+    start = begin(boxes, boxes.gaussians, found, moved, config, None, jax.random.key(0), masks)
+    parts = first_parts(start, FRAMES, config)
+    before = np.asarray(parts.weights)
+    step = next(follow(boxes, start, parts, config))
+    assert step.skipped == 0
+    after = np.asarray(step.parts.weights)
+    np.testing.assert_allclose(after.sum(-1), 1, atol=1e-5)
+    assert 0 < np.abs(after - before).max() < 0.2
+    np.testing.assert_array_equal(parts.weights, before)
+
+
 def test_what_no_picture_needs_is_given_up(boxes, halves):
     """A piece of floor that was taken for a part is background again; the boxes stay."""
     start, steps = halves

@@ -178,7 +178,7 @@ class _Frames:
         # Steps give away what they replace; the parts of the last frame stay whole.
         field = jax.tree.map(jnp.copy, parts.params.field)
         params, state = StreamParams(_predicted(parts, t, way, before), field), parts.state.in_new_frame()
-        weights = skinning_weights(params.field, canonical)
+        weights = parts.weights
         frame = self._views.frame(t)
         now = {
             size: seen_at(part_of(frame, (), size), canonical, weights, params.pose, TILE // size)
