@@ -25,11 +25,15 @@ from gsjax.cli.messages import Notes
 from gsjax.cli.outputs import write_tracking
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.track import Options as TrackOptions
-from gsjax.cli.view import open_viewable, screenshots
+from gsjax.cli.view import screenshots
+from gsjax.cli.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
+from gsjax.methods.motion_parts import gaussians_at, moment
 from gsjax.methods.object_tracker import Pose, TrackedScene
 from gsjax.methods.reconstruction import FitConfig
 from gsjax.scene.gaussians import gaussians_from_activated
+from tests.cli.test_edit import scene_and_trajectory
+from tests.cli.test_edit import write_run as write_parts_run
 
 pytest.importorskip("viser", reason="viser is not installed")
 
@@ -162,6 +166,35 @@ def test_a_damaged_trajectory_is_said(tracked, view):
     code, said = view(tracked)
     assert code == 2
     assert "trajectory.npz: expected plain arrays" in said
+
+
+def test_parts_over_time(tmp_path, notes):
+    write_parts_run(tmp_path / "parts")
+    scene, folder = open_viewable(tmp_path / "parts", notes)
+    assert folder == tmp_path / "parts"
+    found, trajectory = scene_and_trajectory()
+    assert (scene.num_frames, scene.num_moving) == (4, 133)  # all but the background
+    for t in (0, 3):
+        expected = gaussians_at(found, moment(trajectory, t))
+        ours, theirs = (
+            np.asarray(g.means)[np.lexsort(np.asarray(g.means).T)] for g in (scene.at(t), expected)
+        )
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert set(scene.labels[:133]) == {1, 2}
+    assert scene.name_of(int(np.flatnonzero(scene.labels == 1)[0])) == "drawer"
+    np.testing.assert_allclose(scene.times, np.arange(4) / 15, atol=1e-6)
+    assert list(scene.shots.names) == ["camera 0", "camera 1", "camera 2 (held out)"]
+
+
+def test_parts_without_their_recording(tmp_path, notes):
+    write_parts_run(tmp_path / "parts", followed=2)
+    scene, _ = open_viewable(tmp_path / "parts", notes)
+    assert (scene.num_frames, scene.shots) == (2, None)
+    config = tmp_path / "parts" / "config.yml"
+    config.write_text(config.read_text().replace("simulated:articulated", "simulated:nothing"))
+    scene, _ = open_viewable(tmp_path / "parts", notes)
+    assert scene.shots is None
+    assert any("its recording is not shown" in note for note in notes.all)
 
 
 def test_a_ply_file(ply, notes):

@@ -1,0 +1,166 @@
+"""What `gsjax view` opens: a run of any kind, or a PLY file."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import yaml
+
+from gsjax.cli.messages import Notes
+from gsjax.cli.parts_run import open_parts_run, read_parts
+from gsjax.cli.photographs import photographs_of_run
+from gsjax.cli.recording import Recording
+from gsjax.cli.run_folder import expect_run
+from gsjax.cli.saved_run import open_run, read_tracking
+from gsjax.data.photographs import Photographs
+from gsjax.io.ply import read_ply
+from gsjax.methods.motion_parts import BACKGROUND, PartScene, gaussians_at, moment
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.viz.colors import to_uint8
+from gsjax.viz.viewer import Shots, Viewable
+
+
+def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
+    """What there is to see, and the folder that screenshots belong to.
+
+    Raises:
+        FileNotFoundError: there is no such file, or the folder is no run with a scene.
+        ValueError: the file holds no Gaussians, or something else than a run writes.
+    """
+    if path.is_file():
+        if path.suffix.lower() != ".ply":
+            raise ValueError(f"{path}: expected a PLY file or the folder of a run, found another file")
+        gaussians, labels = _read(path, notes)
+        return Viewable(path.name, gaussians, labels), path.absolute().parent
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
+    expect_run(path)
+    if not (path / "scene.ply").is_file():
+        raise FileNotFoundError(
+            f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
+            "keeps no scene; let `gsjax fit` or `gsjax track` finish (--resume goes on)"
+        )
+    if (path / "parts.npz").is_file():
+        return _of_parts(path, notes), path
+    tracked = (path / "trajectory.npz").is_file()
+    return (_of_track if tracked else _of_fit)(path, notes), path
+
+
+def _of_fit(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax fit`, with its photographs where they still are."""
+    gaussians, labels = _read(path / "scene.ply", notes)
+    config = path / "config.yml"
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        antialiased = bool(settings["fit"]["antialiased"])
+        behind = settings["fit"]["background"]
+        shots, photographs = None, None
+        try:
+            photographs = photographs_of_run(settings)
+            shots = _shots_of(photographs)
+        except (ValueError, OSError) as error:
+            notes.warn(f"its photographs are not shown: {error}")
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
+    background = photographs.background if photographs is not None and behind == "data" else None
+    if background is None:
+        background = (1.0, 1.0, 1.0) if behind == "white" else (0.0, 0.0, 0.0)
+    title = path.absolute().name
+    return Viewable(title, gaussians, labels, shots=shots, background=background, antialiased=antialiased)
+
+
+def _of_track(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax track` over time, with its cameras where its recording still is."""
+    names: dict[int, str] = {}
+    shots, times = None, None
+    try:
+        saved = open_run(path)
+    except ValueError as error:
+        tracking = read_tracking(path)  # what is damaged there is an error
+        notes.warn(f"its recording is not shown: {error}")
+    else:
+        tracking, names = saved.tracking, saved.names
+        recording = saved.recording.judged
+        shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
+    count = tracking.scene.num_moving
+    return Viewable(
+        path.absolute().name,
+        tracking.scene.gaussians,
+        np.asarray(tracking.scene.labels),
+        names,
+        means=tracking.means()[:, :count],
+        quats=tracking.quats(),
+        times=times,
+        shots=shots,
+        unit="m",
+    )
+
+
+def _of_parts(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax parts` over time, with its cameras where its recording still is."""
+    layer, names = read_parts(path)
+    shots, blend = None, "quaternion"
+    try:
+        saved = open_parts_run(path)
+    except ValueError as error:
+        notes.warn(f"its recording is not shown: {error}")
+    else:
+        blend = saved.blend
+        if saved.complete:
+            shots = _shots_of_recording(saved.recording)
+        else:
+            notes.warn("it is a partial run: only the frames that were followed are there, and no cameras")
+    weights = np.asarray(layer.scene.weights)
+    moves = weights[:, BACKGROUND] < 1
+    order = np.argsort(~moves, kind="stable")
+    scene = PartScene(take(layer.scene.gaussians, order), layer.scene.weights[order], layer.scene.centers)
+    placed, count = jax.jit(partial(gaussians_at, blend=blend)), int(moves.sum())
+    frames = [placed(scene, moment(layer.trajectory, t)) for t in range(len(layer.trajectory.times))]
+    return Viewable(
+        path.absolute().name,
+        scene.gaussians,
+        np.asarray(scene.labels),
+        {part: name for name, part in names.items()},  # the true name, which comes last, where it is known
+        means=np.stack([np.asarray(g.means[:count]) for g in frames]),
+        quats=np.stack([np.asarray(g.quats[:count]) for g in frames]),
+        times=np.asarray(layer.trajectory.times),
+        shots=shots,
+        unit="m",
+    )
+
+
+def _read(path: Path, notes: Notes) -> tuple[Gaussians, np.ndarray | None]:
+    """The Gaussians of a file, and their labels.
+
+    Raises:
+        ValueError: it holds none.
+    """
+    gaussians, report = read_ply(path)
+    if report.culled:
+        notes.warn(f"{path}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
+    if gaussians.num == 0:
+        raise ValueError(f"{path}: expected Gaussians, found none that can be drawn")
+    return gaussians, report.labels
+
+
+def _shots_of(photographs: Photographs) -> Shots:
+    return Shots(
+        photographs.names,
+        photographs.viewmats[None],
+        photographs.Ks[None],
+        photographs.sizes,
+        load_image=lambda _, v: photographs.image(v),
+    )
+
+
+def _shots_of_recording(recording: Recording) -> Shots:
+    sequence, held_out = recording.judged, recording.held_out
+    names = [f"camera {c}" + (" (held out)" if c in held_out else "") for c in sequence.camera_ids]
+    return Shots(
+        tuple(names),
+        sequence.viewmats,
+        sequence.Ks,
+        np.tile([sequence.width, sequence.height], (len(names), 1)),
+        load_image=lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
+    )
