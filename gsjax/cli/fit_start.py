@@ -11,6 +11,7 @@ from gsjax.data.photographs import Photographs
 from gsjax.methods.reconstruction import FitConfig, View
 from gsjax.perception.matching import filled_up, match_points
 
+_MOST_MATCHED = 150  # photographs; of more, as many that are spread over them
 LEAST_MATCHED = 100
 """Points that photographs share, below which they tell too little of where things are."""
 
@@ -34,6 +35,7 @@ def start_from(
     has_depth = any(view.depth is not None for view in views)
     if source != "matches" and (source != "auto" or has_points or has_depth):
         return config, (cloud.points, cloud.colors) if cloud is not None else None
+    views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MOST_MATCHED).round().astype(int))]
     pictures, masks = [view.image for view in views], [view.mask for view in views]
     viewmats, Ks = np.stack([view.viewmat for view in views]), np.stack([view.K for view in views])
     with stage(console, "looking for what photographs share"):

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 _FEATURES = 4_000  # of a photograph
+_LARGEST = 1_000  # pixels, the longer side of what is matched; larger photographs are shrunk for it
 _CONTRAST = 0.01  # of a feature; OpenCV's 0.04 leaves out what is plain
 _NEIGHBORS = 6  # photographs that one is matched with
 _RATIO = 0.85  # of the distances of the best match and the next (Lowe 2004, section 7.1)
@@ -58,7 +59,9 @@ def match_points(
         masks: which pixels count; all unless given.
     """
     counted = masks or [None] * len(pictures)
-    features = [_features(*pair) for pair in zip(pictures, counted, strict=True)]
+    small = [_shrunk(*each) for each in zip(pictures, Ks, counted, strict=True)]
+    pictures, Ks = [picture for picture, _, _ in small], np.stack([K for _, K, _ in small])
+    features = [_features(picture, mask) for picture, _, mask in small]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     shown: list[list[np.ndarray]] = [[] for _ in pictures]
     total = 0
@@ -108,6 +111,21 @@ def filled_up(
         column, row = places.astype(int).T
         colors.append(picture[row, column] / 255)
     return np.concatenate(points), np.concatenate(colors)
+
+
+def _shrunk(
+    picture: UInt8[np.ndarray, "H W 3"], K: Float[np.ndarray, "3 3"], mask: Bool[np.ndarray, "H W"] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """A photograph as it is matched, its intrinsics, and which pixels count."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, _LARGEST / max(height, width))
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    if size == (width, height):
+        return picture, K, mask
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    factors = np.array([size[0] / width, size[1] / height, 1.0])
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), factors[:, None] * K, mask
 
 
 def _features(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> _Features:

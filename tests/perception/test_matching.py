@@ -86,3 +86,20 @@ def test_photographs_that_share_nothing(wall):
     assert len(strangers.points) < 5
     alone = match_points(pictures[:1], viewmats[:1], Ks[:1])
     assert len(alone.points) == 0
+
+
+def test_large_photographs_are_matched_in_small(wall, monkeypatch):
+    pictures, viewmats, Ks = wall
+    masks = [np.arange(WIDTH) < 100 + np.zeros((HEIGHT, 1)), None, None, None]
+    monkeypatch.setattr("gsjax.perception.matching._LARGEST", WIDTH)
+    large = [cv2.resize(p, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_CUBIC) for p in pictures]
+    matched = match_points(
+        large,
+        viewmats,
+        np.diag([2.0, 2.0, 1.0]) @ Ks,
+        [np.repeat(np.repeat(masks[0], 2, 0), 2, 1), None, None, None],
+    )
+    assert len(matched.points) > 100
+    assert np.median(np.abs(matched.points[:, 2])) < 0.004
+    same = match_points(pictures, viewmats, Ks, masks)
+    assert len(matched.points) == pytest.approx(len(same.points), rel=0.2)
