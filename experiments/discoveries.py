@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from gsjax.cli import fit as fit_command
+from gsjax.cli.parts import FIT as FIT  # for settings that differ from it in one thing
 from gsjax.cli.parts import Options
 from gsjax.cli.parts import run as run_parts
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.cli.views import part_views
 from gsjax.metrics.temporal import temporal_scores
 from gsjax.perception.optical_flow import DisFlow
-
-FIT = Options.__dataclass_fields__["fit"].default_factory()
 
 
 def canonical_of(options: Options, folder: Path) -> Path:

@@ -171,6 +171,16 @@ def draw_basin(rows: list[dict[str, Any]], path: Path, pixels_per_mm: float) -> 
     drawing.savefig(path, dpi=120)
 
 
+def draw_variants(axes: Axes, names: list[str], lengths: list[float], title: str) -> None:
+    """A bar for each variant of an ablation; the line is the one with all parts on."""
+    bars = axes.barh(names, lengths, color=["#444444" if name == "all on" else "#4c8cc4" for name in names])
+    axes.bar_label(bars, [f"{v:.3g}" if v < 100 else f"{v:.0f}" for v in lengths], padding=3)
+    axes.set(title=title)
+    axes.margins(x=0.3)
+    if "all on" in names:
+        axes.axvline(lengths[names.index("all on")], color="#444444", linewidth=1, linestyle=":")
+
+
 def _bars(
     axes: Axes, at: Sequence[float], found: list[list[float]], color: str, label: str | None, width: float
 ) -> None:

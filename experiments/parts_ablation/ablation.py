@@ -59,17 +59,12 @@ PANELS = (
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A panel for each score, a bar for each variant."""
     from matplotlib.figure import Figure
+    from plots import draw_variants
 
     drawing = Figure(figsize=(16, 1.0 + 0.32 * len(rows)), dpi=100, layout="constrained")
     panels = drawing.subplots(1, len(PANELS), sharey=True)
     names = [row["variant"] for row in rows]
     for axes, (key, title) in zip(panels, PANELS, strict=True):
-        lengths = [row[key] or 0.0 for row in rows]
-        bars = axes.barh(names, lengths, color=["#444444" if n == "all on" else "#4c8cc4" for n in names])
-        axes.bar_label(bars, [f"{v:.3g}" for v in lengths], padding=3)
-        axes.set(title=title)
-        axes.margins(x=0.25)
-        if "all on" in names:
-            axes.axvline(lengths[names.index("all on")], color="#444444", linewidth=1, linestyle=":")
+        draw_variants(axes, names, [row[key] or 0.0 for row in rows], title)
     panels[0].invert_yaxis()
     drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")

@@ -65,6 +65,7 @@ PANELS = (
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A row of panels for each recording, a bar for each variant."""
     from matplotlib.figure import Figure
+    from plots import draw_variants
 
     recordings = list(dict.fromkeys(row["recording"] for row in rows))
     drawing = Figure(figsize=(16, 0.8 + 3.2 * len(recordings)), dpi=100, layout="constrained")
@@ -74,12 +75,6 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         names = [row["variant"] for row in mine]
         panels[0].set_ylabel(recording)
         for axes, (key, title) in zip(panels, PANELS, strict=True):
-            lengths = [row[key] for row in mine]
-            bars = axes.barh(names, lengths, color=["#444444" if n == "all on" else "#4c8cc4" for n in names])
-            axes.bar_label(bars, [f"{v:.3g}" if v < 100 else f"{v:.0f}" for v in lengths], padding=3)
-            axes.set(title=title)
-            axes.margins(x=0.3)
-            if "all on" in names:
-                axes.axvline(lengths[names.index("all on")], color="#444444", linewidth=1, linestyle=":")
+            draw_variants(axes, names, [row[key] for row in mine], title)
         panels[0].invert_yaxis()
     drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")

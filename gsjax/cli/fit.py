@@ -24,7 +24,7 @@ from gsjax.cli.fit_start import start_from
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
-from gsjax.cli.recording import located
+from gsjax.cli.recording import expect_scale, located
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.tensorboard import TensorBoard
 from gsjax.data.open import ReadOptions
@@ -225,8 +225,7 @@ def _check(options: Options) -> None:
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
-    if not 0 < options.scale <= 1:
-        raise ValueError(f"--scale: expected above 0 and at most 1, found {options.scale}")
+    expect_scale(options.scale)
     if options.test_every < 0 or options.test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
 

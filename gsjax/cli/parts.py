@@ -33,6 +33,8 @@ from gsjax.methods.reconstruction import FitConfig, StartConfig
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
+FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000))
+"""How the canonical scene is fitted unless told."""
 _EVERYTHING = 0.6  # share of pixels that change
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is found
 
@@ -66,11 +68,7 @@ class Options:
     """Show Python's traceback when something fails."""
     read: ReadOptions = field(default_factory=ReadOptions)
     """What the layout of the data leaves open."""
-    fit: FitConfig = field(
-        default_factory=lambda: FitConfig(
-            steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000)
-        )
-    )
+    fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
     """How parts are found and followed."""

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.machine import available_mb
-from gsjax.cli.recording import LEAST_SIDE, open_recording, parse_frames
+from gsjax.cli.recording import expect_enough_left, open_recording, parse_frames
 from gsjax.cli.run_folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
@@ -76,12 +76,8 @@ def choose_photographs(
 def _scaled(photographs: Photographs, scale: float) -> Photographs:
     smaller = photographs.scaled(scale)
     least = smaller.sizes.min(1).argmin()
-    (width, height), (before, high) = smaller.sizes[least], photographs.sizes[least]
-    if scale < 1 and min(width, height) < LEAST_SIDE:
-        raise ValueError(
-            f"--scale {scale:g}: a photograph of {before}x{high} would be {width}x{height}; expected "
-            f"{LEAST_SIDE} pixels or more a side"
-        )
+    sizes = (tuple(of.sizes[least].tolist()) for of in (photographs, smaller))
+    expect_enough_left(scale, "a photograph", *sizes)
     return smaller
 
 

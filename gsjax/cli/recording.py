@@ -19,8 +19,7 @@ from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 
-LEAST_SIDE = 8
-"""Of a picture that is made smaller, pixels."""
+_LEAST_SIDE = 8  # of a picture that is made smaller, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,15 +101,26 @@ def open_recording(
 
 
 def _scaled(sequence: Sequence, scale: float) -> Sequence:
+    expect_scale(scale)
+    smaller = sequence.scaled(scale)
+    sizes = (sequence.width, sequence.height), (smaller.width, smaller.height)
+    expect_enough_left(scale, "pictures", *sizes)
+    return smaller
+
+
+def expect_scale(scale: float) -> None:
+    """Raises ValueError where --scale makes nothing smaller."""
     if not 0 < scale <= 1:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
-    smaller = sequence.scaled(scale)
-    if scale < 1 and min(smaller.width, smaller.height) < LEAST_SIDE:
+
+
+def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:
+    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height."""
+    if scale < 1 and min(after) < _LEAST_SIDE:
         raise ValueError(
-            f"--scale {scale:g}: pictures of {sequence.width}x{sequence.height} would be "
-            f"{smaller.width}x{smaller.height}; expected {LEAST_SIDE} pixels or more a side"
+            f"--scale {scale:g}: {what} of {before[0]}x{before[1]} would be {after[0]}x{after[1]}; expected "
+            f"{_LEAST_SIDE} pixels or more a side"
         )
-    return smaller
 
 
 def parse_frames(text: str) -> slice:

@@ -86,3 +86,17 @@ def gsjax_track(tmp_path, capfd):
         return code, out + err
 
     return call
+
+
+@pytest.fixture
+def gsjax(capfd):
+    """Runs a command in this process; returns the exit code and what was said, spaces as one."""
+
+    def call(*arguments) -> tuple[int, str]:
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        said = "".join(capfd.readouterr())
+        assert "Traceback" not in said
+        return code, " ".join(said.split())
+
+    return call

@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 import gsjax.cli.edit as edit_command
-from gsjax.cli import main
 from gsjax.cli.edit import shots
 from gsjax.cli.parts_results import write_parts
 from gsjax.cli.parts_run import open_parts_run
@@ -71,20 +70,6 @@ def write_run(path, *, followed=4, anchor=0):
 @pytest.fixture
 def run(tmp_path):
     return write_run(tmp_path / "run")
-
-
-@pytest.fixture
-def gsjax(capfd):
-    """Runs a command in this process; returns the exit code and what was said, spaces as one."""
-
-    def call(*arguments) -> tuple[int, str]:
-        capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
-        said = "".join(capfd.readouterr())
-        assert "Traceback" not in said
-        return code, " ".join(said.split())
-
-    return call
 
 
 def test_a_run_is_read_as_it_was_written(run):

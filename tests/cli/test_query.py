@@ -34,20 +34,6 @@ def run(tracked, tmp_path):
     return shutil.copytree(tracked, tmp_path / "run")
 
 
-@pytest.fixture
-def gsjax(capfd):
-    """Runs a command in this process; returns the exit code and what was said, spaces as one."""
-
-    def call(*arguments) -> tuple[int, str]:
-        capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
-        said = "".join(capfd.readouterr())
-        assert "Traceback" not in said
-        return code, " ".join(said.split())
-
-    return call
-
-
 def test_query_says_which_object_and_shows_it_over_time(gsjax, run, pristine):
     code, said = gsjax("query", run, "the blue can")
     assert code == 0, said

@@ -17,12 +17,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.geometry.rotations import normalize_quats
 from gsjax.methods.motion_parts.config import PartsConfig
 from gsjax.methods.motion_parts.discover import Views
 from gsjax.methods.motion_parts.follow import Parts
-from gsjax.methods.motion_parts.stream import Canonical, Seen, picture_loss, posed
-from gsjax.methods.motion_parts.trajectory import BACKGROUND
+from gsjax.methods.motion_parts.stream import Canonical, Seen, moved_on, picture_loss, posed
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import Step, all_finite, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
@@ -105,12 +103,8 @@ def refine_step(config: PartsConfig) -> Step:
             gaussians.append(optax.apply_updates(before, moves))
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
-        free = batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND)
-        free &= batch.t != batch.anchor
-        shift = jnp.where(free, length, 0.0)[:, None]
-        turn = shift / (2 * batch.canonical.radii[:, None])  # half the angle
-        quats = normalize_quats(pose.quats + turn * moves.quats)
-        pose = HandlePose(quats, pose.translations + shift * moves.translations)
+        far = jnp.where(batch.t == batch.anchor, 0.0, length)
+        pose = moved_on(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)
         )

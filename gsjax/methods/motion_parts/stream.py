@@ -197,6 +197,17 @@ class StreamState(NamedTuple):
         return StreamState(pose, *jax.tree.map(jnp.copy, (self.field, self.pulls)))
 
 
+def moved_on(
+    pose: HandlePose, moves: HandlePose, canonical: Canonical, shift: Array, turn: Array
+) -> HandlePose:
+    """The pose after moves of Adam, of which one of length 1 shifts a part by `shift`, and turns it so far
+    that its border goes by `turn`, metres. The background's handle stays, and so do slots that hold none."""
+    free = (canonical.alive & (jnp.arange(len(canonical.alive)) != BACKGROUND))[:, None]
+    shift, turn = (jnp.where(free, far, 0.0) for far in (shift, turn))
+    quats = pose.quats + turn / (2 * canonical.radii[:, None]) * moves.quats  # half the angle
+    return HandlePose(normalize_quats(quats), pose.translations + shift * moves.translations)
+
+
 def stream_step(config: StreamConfig) -> Step:
     """Adam on `StreamParams`; `step` is the share of the frame's iterations that is done, 0 to 1.
 
@@ -222,14 +233,8 @@ def stream_step(config: StreamConfig) -> Step:
         at_rest = jnp.zeros_like(state.pulls)
         (value, told), (slope, push) = jax.value_and_grad(of, (0, 1), has_aux=True)(params, at_rest)
         moves, pose_state = poses.update(slope.pose, state.pose)
-        fall = config.final_rate**step
-        free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]
-        unit = jnp.where(free, batch.canonical.pixel * fall, 0.0)
-        shift = config.rate * unit
-        turn = config.turn_rate * unit / (2 * batch.canonical.radii[:, None])  # half the angle
-        quats = params.pose.quats + turn * moves.quats
-        shifts = shift * moves.translations
-        pose = HandlePose(normalize_quats(quats), params.pose.translations + shifts)
+        unit = batch.canonical.pixel * config.final_rate**step
+        pose = moved_on(params.pose, moves, batch.canonical, config.rate * unit, config.turn_rate * unit)
         changes, field_state = fields(params.field).update(
             slope.field, state.field, params.field, allowed=batch.canonical.alive
         )
