@@ -1,6 +1,7 @@
 """Opens any recording, and any set of photographs, that some reader here knows."""
 
 import inspect
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qsl
@@ -15,13 +16,13 @@ from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
-from gsjax.data.simulated import articulated, bar, tabletop
+from gsjax.data.simulated import articulated, bar, hard_parts, tabletop
 from gsjax.data.structure_from_motion import SUFFIXES
 from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
 
 SIMULATED_PREFIX = "simulated:"
-SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated, "bar": bar}
+SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated, "bar": bar, "hard_parts": hard_parts}
 
 # What only a folder of that layout has (* stands for anything), and its reader.
 _LAYOUTS = {
@@ -213,11 +214,16 @@ def _simulate(text: str) -> Sequence:
     return scene(**arguments)
 
 
-def _parse(text: str, key: str, value: str, kind: type) -> int | bool:
-    """An integer, or a truth value written true, false, 1, or 0."""
+def _parse(text: str, key: str, value: str, kind: type) -> int | float | bool | str:
+    """As the argument's default is: a word, a number, or a truth value written true, false, 1, or 0."""
     if kind is bool and value.lower() in ("true", "false", "1", "0"):
         return value.lower() in ("true", "1")
+    if kind is str:
+        return value
     if kind is int and value.lstrip("-").isdecimal():
         return int(value)
-    wanted = "true or false" if kind is bool else "an integer"
+    if kind is float:
+        with suppress(ValueError):
+            return float(value)
+    wanted = {bool: "true or false", int: "an integer", float: "a number"}[kind]
     raise ValueError(f"{text}: {key} must be {wanted}, got {value!r}")

@@ -1,12 +1,17 @@
-"""One step of the stream: its loss, its derivatives, and what it may change."""
+"""One step of the stream: its loss, its derivatives, what it may change; and the loss as residuals."""
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax
 import numpy as np
+import optimistix
 import pytest
 
 from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
+from gsjax.methods.motion_parts.residual import motions_of_handles, pose_of, pose_residual
 from gsjax.methods.motion_parts.stream import (
     Canonical,
     Seen,
@@ -19,6 +24,7 @@ from gsjax.methods.motion_parts.stream import (
     tearing,
 )
 from gsjax.methods.motion_parts.weights import SimplexTable, new_field
+from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.frame import Frame
@@ -232,3 +238,77 @@ def test_several_frames_of_the_past_count_in_the_mean(boxes):
     one_by_one = [float(told([one])) for one in then]
     assert len(set(one_by_one)) == 3
     assert float(told(then)) == pytest.approx(np.mean(one_by_one), rel=1e-5)
+
+
+def forward(batch):
+    """With a plan through which columns of a Jacobian can be pushed."""
+    return batch._replace(plan=replace(batch.plan, derivative="forward"))
+
+
+def half_squares(residuals):
+    return 0.5 * sum(float(jnp.sum(r * r)) for r in jax.tree.leaves(residuals))
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_half_the_squares_are_the_loss_without_ssim(boxes, depth):
+    batch, _ = batch_of(boxes, past=False)
+    frame = batch.now.frame
+    if depth:
+        frame = Frame(frame.images, jnp.full(frame.images.shape[:-1], 0.6), frame.cameras)
+        batch = batch._replace(now=batch.now._replace(frame=frame))
+    config, pose = StreamConfig(l1_weight=1.0, tear_weight=0.3, hold_weight=0.0), shifted(0.02)
+    certain = StreamParams(pose, SimplexTable(batch.weights))
+    loss = stream_loss(config)(certain, batch, step=0.5, key=None)[0]
+    residuals, told = pose_residual(
+        motions_of_handles(pose), batch, step=0.5, key=None, config=config, block=1, softness=1e-6
+    )
+    assert residuals.keys() == ({"color", "tear", "depth"} if depth else {"color", "tear"})
+    assert half_squares(residuals) / batch.now.counts.sum() == pytest.approx(float(loss), rel=2e-3)
+    assert not told["overflow"]
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_derivative_of_residuals_is_that_of_differences(boxes):
+    batch = forward(batch_of(boxes, jnp.float64, past=False)[0])
+    start = motions_of_handles(shifted(0.01, jnp.float64))
+
+    @jax.jit
+    def values(twists):
+        found, _ = pose_residual(start @ type(start).exp(twists), batch, step=0, key=None, config=CONFIG)
+        return jnp.concatenate([r.ravel() for r in jax.tree.leaves(found)])
+
+    rng = np.random.default_rng(0)
+    at, way, far = jnp.zeros((PARTS, 6)), jnp.asarray(rng.normal(size=(PARTS, 6))), 1e-6
+    still = way.at[1:3].set(0)  # of the background and the empty slot
+    np.testing.assert_array_equal(jax.jvp(values, (at,), (still,))[1], 0)
+    way = way - still
+    found = jax.jvp(values, (at,), (way,))[1]
+    expected = (values(far * way) - values(-far * way)) / (2 * far)
+    # Where a faint edge ends, a pixel jumps; its difference is none of the derivative.
+    cosine = jnp.vdot(found, expected) / (jnp.linalg.norm(found) * jnp.linalg.norm(expected))
+    assert cosine > 0.99
+
+
+# The background and the empty slot have columns of zeros, so there is more than one best move.
+UNDAMPED = optimistix.GaussNewton(1e-4, 1e-5, linear_solver=lineax.AutoLinearSolver(well_posed=False))
+
+
+@pytest.mark.parametrize("solver", [LEVENBERG_MARQUARDT, UNDAMPED])
+def test_gauss_newton_brings_handles_home(boxes, solver):
+    batch = forward(batch_of(boxes, past=False)[0])
+    frame = batch.now.frame
+    drawn = render(posed(batch.canonical, batch.weights, at_rest(PARTS)), frame.cameras, batch.plan)
+    seen = batch.now._replace(frame=Frame(frame.images, drawn.depths, frame.cameras))
+    batch = batch._replace(now=seen)
+
+    def residual(motions, batch, *, step, key):
+        return pose_residual(motions, batch, step=step, key=key, config=CONFIG, block=2)
+
+    step = least_squares_step(residual, solver)
+    motions = motions_of_handles(shifted(0.01))
+    update, state = jax.jit(lambda *of: step.update(*of, batch, step=0.0, key=None)), step.init(motions)
+    for _ in range(8):
+        motions, state, info = update(motions, state)
+    assert not info["skipped"]
+    off = np.linalg.norm(pose_of(motions).translations, axis=-1)[1:3]
+    assert off.max() < 0.002

@@ -5,10 +5,21 @@ They are no Gaussians, so a reconstruction of them cannot be right by accident; 
 
 from gsjax.data.simulated.articulated import articulated
 from gsjax.data.simulated.bar import bar
+from gsjax.data.simulated.hard_parts import hard_parts
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.simulation import simulated_sequence
 from gsjax.data.simulated.tabletop import tabletop
 from gsjax.data.simulated.textures import Texture
 
-__all__ = ["Light", "Primitive", "Scene", "Texture", "articulated", "bar", "simulated_sequence", "tabletop"]
+__all__ = [
+    "Light",
+    "Primitive",
+    "Scene",
+    "Texture",
+    "articulated",
+    "bar",
+    "hard_parts",
+    "simulated_sequence",
+    "tabletop",
+]

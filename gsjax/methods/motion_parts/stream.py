@@ -25,7 +25,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, rigid_motions, skin
 from gsjax.scene.render import Rendered, render
 
-_FINAL_TEAR = 0.2  # of a frame's last step, over that of its first: less would hold back what does tear off
+FINAL_TEAR = 0.2  # of a frame's last step, over that of its first: less would hold back what does tear off
 
 
 class Canonical(NamedTuple):
@@ -127,6 +127,14 @@ def tearing(
     """How much of the scene is torn: the share of neighbours whose motions take the same place apart, each
     counted by r^2 / (r^2 + scale^2) of the gap r. A hinge tears nothing along its axis, and what is torn for
     good costs no more the farther it goes; but a piece that no picture holds goes with its neighbours."""
+    squared = jnp.sum(gaps_between(canonical, weights, pose) ** 2, axis=-1)
+    return jnp.mean(squared / (squared + scale**2))
+
+
+def gaps_between(
+    canonical: Canonical, weights: Float[Array, "M P"], pose: HandlePose
+) -> Float[Array, "M k 3"]:
+    """By how much the motions of neighbours take the same place apart, metres."""
     rotations, offsets = rigid_motions(canonical.centers, pose)
     rigid = jnp.concatenate([rotations, offsets[..., None]], axis=-1).reshape(-1, 12)
     still = jnp.eye(3, 4, dtype=rigid.dtype).ravel()
@@ -134,9 +142,7 @@ def tearing(
     all_ = jnp.concatenate([mine, jnp.broadcast_to(still, (canonical.fixed.num, 12))])
     apart = (mine[:, None] - all_[canonical.neighbors]).reshape(*canonical.neighbors.shape, 3, 4)
     at = canonical.movable.means
-    gaps = jnp.einsum("nkij,nj->nki", apart[..., :3], at) + apart[..., 3]
-    squared = jnp.sum(gaps**2, axis=-1)
-    return jnp.mean(squared / (squared + scale**2))
+    return jnp.einsum("nkij,nj->nki", apart[..., :3], at) + apart[..., 3]
 
 
 def stream_loss(config: StreamConfig):
@@ -158,7 +164,7 @@ def stream_loss(config: StreamConfig):
         scale = config.tear_scale * batch.canonical.pixel
         told = {"now": value, "torn": tearing(batch.canonical, fixed, params.pose, scale)}
         changed = -jnp.sum(batch.weights * jnp.log(jnp.maximum(weights, 1e-6)), axis=-1).mean()
-        tear = config.tear_weight * _FINAL_TEAR**step
+        tear = config.tear_weight * FINAL_TEAR**step
         value += tear * told["torn"] + config.hold_weight * changed
         told |= {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
         if batch.past:

@@ -1,5 +1,6 @@
 """Photometric refinement of D_k and delta_i against the new images (section II-C)."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from gsjax.methods.object_tracker.config import RefineConfig
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
 from gsjax.methods.object_tracker.region import shift_background
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.optim.least_squares import huber
+from gsjax.optim.residuals import block_residual
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered, render
@@ -75,43 +76,25 @@ def refine_residual(
     """The differences of `refine_loss` as residuals of rigid motions, for `gsjax.optim.least_squares`.
 
     Half their squares sum up to a thousand times that loss (with blocks of one pixel), but for differences
-    below `softness` times their limit, which are rounded off (Huber): an absolute value has no curvature that
-    Gauss-Newton could use.
+    below `softness` times their limit, which are rounded off.
 
     Args:
         motions: of each group, K of them, about its centre.
         batch: with a plan whose derivative is "forward" where the Jacobian is made by columns.
-        block: differences are means over blocks so many pixels wide. How one rendered pixel changes depends
-            on the Gaussian whose edge it lies at; that is no part of the motion, and in J^T J it counts like
-            gradients of the picture, which makes steps short. Pixels that fill no block are left out.
+        block, softness: of `block_residual`.
     """
     twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
     rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
     frame = batch.frame
-
-    def residual(difference, limit, weights):
-        """Of differences [c, h, w, d] that count `weights` [c, h, w, 1]."""
-        total = _summed(weights, block)
-        mean = _summed(difference * weights, block) / jnp.maximum(total, 1e-6)
-        rounded = softness * limit
-        return huber(jnp.clip(mean, -limit, limit), rounded) * jnp.sqrt(total / rounded)
-
+    residual = partial(block_residual, block=block, softness=softness)
     residuals = {
-        "color": residual(rendered.colors - frame.images, config.color_limit, weights[..., None] / 3)
+        "color": residual(rendered.colors - frame.images, weights[..., None] / 3, config.color_limit)
     }
     if frame.depths is not None:
         known = config.depth_weight * weights * (frame.depths > 0)
         gap = (rendered.depths - frame.depths)[..., None]
-        residuals["depth"] = residual(gap, config.depth_limit, known[..., None])
+        residuals["depth"] = residual(gap, known[..., None], config.depth_limit)
     return residuals, {"overflow": rendered.meta.overflow.any(), "needed": rendered.meta.needed.max()}
-
-
-def _summed(values: Float[Array, "c height width d"], block: int) -> Float[Array, "c rows columns d"]:
-    """Sums over blocks of `block` by `block` pixels."""
-    cameras, height, width, channels = values.shape
-    values = values[:, : height // block * block, : width // block * block]
-    values = values.reshape(cameras, height // block, block, width // block, block, channels)
-    return values.sum((2, 4))
 
 
 def _moved(motion: Motion, batch: RefineBatch) -> tuple[Rendered, Float[Array, "c height width"]]:
