@@ -203,7 +203,7 @@ def adam(update: Update, coarse: float | None = None) -> Trace:
 
 
 def least_squares(
-    update: Update, solver, block: int = 2, softness: float = 0.1, most: int | None = None
+    update: Update, solver, block: int = 4, softness: float = 0.1, most: int | None = None
 ) -> Trace:
     """Of all cameras at once, or of so many that take turns; the last iterations at the whole size."""
 
