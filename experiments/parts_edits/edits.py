@@ -99,13 +99,12 @@ def films(saved: PartsRun, name: str) -> tuple[Film, Film, list[int], list[int]]
     before = apply(Script(length=length), saved.layer, saved.names)
     after = apply(Script(edits=(edit,), length=length), saved.layer, saved.names, read_parts)
     parts = [saved.names[part] if isinstance(part, str) else part for part in edit.parts]
-    was, now = (
-        jax.tree.leaves(eqx.tree_at(lambda t: t.times, film[0].trajectory, None)) for film in (before, after)
-    )
+    shown = [replace(film[0].trajectory, times=None) for film in (before, after)]
+    pairs = list(zip(*map(jax.tree.leaves, shown), strict=True))
     concerned = [
         part
         for part in edit.concerned(trajectory, parts)
-        if any((a[:, part] != b[:, part]).any() for a, b in zip(was, now, strict=True))
+        if any((a[:, part] != b[:, part]).any() for a, b in pairs)
     ]
     return before, after, concerned, parts
 
@@ -117,11 +116,8 @@ def camera_of(saved: PartsRun, parts: list[int]) -> Camera:
     now = moment(layer.trajectory, len(layer.trajectory.times) // 2)
     gaussians = gaussians_at(layer.scene, now, saved.blend)
     cameras = [jax.tree.map(lambda a: a[None], judged.camera(0, c)) for c in range(judged.num_cameras)]
-    shown = [
-        float(render(gaussians, camera, plan_render(gaussians, camera), features=marks).features.sum())
-        for camera in cameras
-    ]
-    return cameras[int(np.argmax(shown))]
+    drawn = [render(gaussians, camera, plan_render(gaussians, camera), features=marks) for camera in cameras]
+    return cameras[int(np.argmax([np.asarray(each.features).sum() for each in drawn]))]
 
 
 def seen(film: Film, camera: Camera, concerned: list[int], saved: PartsRun) -> Seen:
