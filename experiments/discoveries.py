@@ -6,7 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from gsjax.cli import fit as fit_command
 from gsjax.cli.parts import FIT as FIT  # for settings that differ from it in one thing
@@ -14,8 +16,12 @@ from gsjax.cli.parts import Options
 from gsjax.cli.parts import run as run_parts
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.cli.views import part_views
+from gsjax.data import Sequence
+from gsjax.methods.motion_parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores
+from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.optical_flow import DisFlow
+from gsjax.scene.gaussians import Gaussians
 
 
 def canonical_of(options: Options, folder: Path) -> Path:
@@ -97,3 +103,22 @@ def with_parts(options: Options, **sections: dict[str, Any]) -> Options:
     for name, values in sections.items():
         parts = replace(parts, **{name: replace(getattr(parts, name), **values)})
     return replace(options, parts=parts)
+
+
+def told_the_truth(
+    sequence: Sequence, gaussians: Gaussians, anchor: int, config: PartsConfig
+) -> tuple[Start, Float[np.ndarray, "T P 4 4"], Int[np.ndarray, "labels"]]:
+    """A discovery that begins with true masks of what moves, the true motion of each of its handles against
+    the canonical scene, and which handle each label of a mask is, 0 where none."""
+    truth = sequence.truth
+    motions = [relative_motion(truth.poses[:, k], anchor) for k in range(len(truth.label_ids))]
+    moving = [k for k, motion in enumerate(motions) if np.abs(motion - np.eye(4)).max() > 1e-3]
+    masks = np.stack([sequence.mask(anchor, c) for c in range(sequence.num_cameras)])
+    slots = np.zeros(max(int(masks.max()), int(truth.label_ids.max())) + 1, int)
+    slots[truth.label_ids[moving]] = np.arange(1, len(moving) + 1)
+    pieces = slots[np.maximum(masks, 0)]
+    config = replace(config, discover=replace(config.discover, most_parts=len(moving)))
+    chosen = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras, anchor)
+    start = begin(sequence, gaussians, chosen, pieces > 0, config, None, jax.random.key(0), masks=pieces)
+    still = np.broadcast_to(np.eye(4), motions[0].shape)
+    return start, np.stack([still, *(motions[k] for k in moving)], axis=1), slots

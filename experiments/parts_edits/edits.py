@@ -35,12 +35,12 @@ from gsjax.scene.render import plan_render, render, render_with_room
 HELD_OUT, ANCHOR = (3, 8), 0
 EDITS = {
     "isolate": "isolate:parts=laptop_lid",
-    "freeze": "freeze:parts=laptop_lid,at=1.2",
+    "freeze": "freeze:parts=laptop_lid,at=0.5",
     "speed": "speed:parts=drawer,factor=2",
-    "loop": "loop:parts=laptop_lid,from=0.8,to=1.8,times=2,bounce=true",
+    "loop": "loop:parts=laptop_lid,from=0.3,to=0.7,times=2,bounce=true",
     "ghost": "ghost:parts=[drawer, laptop_lid],opacity=0.1",
     "fade": "fade:parts=box",
-    "echo": "echo:parts=drawer,copies=3,every=0.3",
+    "echo": "echo:parts=drawer,copies=3,every=0.1",
     "composite": "composite:parts=box,from_run={run},place={{scale: 0.7, to: [0.0, 0.0, 0.25]}}",
     "scale": "scale:parts=box,factor=0.5",
     "move": "move:parts=box,by=[0, 0, 0.15]",
@@ -123,7 +123,7 @@ def camera_of(saved: PartsRun, parts: list[int]) -> Camera:
 def seen(film: Film, camera: Camera, concerned: list[int], saved: PartsRun) -> Seen:
     """What a camera sees of a film. Pixels count as edited where parts that are concerned, or another layer,
     have any share."""
-    of = [layer.scene.weights[:, jnp.array(concerned)].max(-1) > 0 for layer in film[:1]]
+    of = [layer.scene.weights[:, jnp.array(concerned, int)].max(-1, initial=0) > 0 for layer in film[:1]]
     of += [jnp.ones(layer.scene.gaussians.num, bool) for layer in film[1:]]
     marks = jnp.concatenate(of).astype(jnp.float32)[:, None]
     placed = jax.jit(film_gaussians, static_argnames="blend", compiler_options=host_options())

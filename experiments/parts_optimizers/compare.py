@@ -19,7 +19,7 @@ import jaxlie
 import lineax
 import numpy as np
 import optimistix
-from discoveries import Options, canonical_of
+from discoveries import Options, canonical_of, told_the_truth
 from jaxtyping import Array, Float
 from recordings import recorded
 
@@ -31,14 +31,11 @@ from gsjax.methods.motion_parts import (
     PartsConfig,
     StreamBatch,
     StreamParams,
-    begin,
-    choose_anchor,
     stream_step,
 )
 from gsjax.methods.motion_parts.follow import seen_at
 from gsjax.methods.motion_parts.residual import motions_of_handles, pose_of, pose_residual
 from gsjax.methods.motion_parts.stream import posed, skinning_weights
-from gsjax.metrics.tracking import relative_motion
 from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
 from gsjax.scene.frame import Frame, part_of
@@ -119,35 +116,15 @@ def updates(gap: int, frames: tuple[int, ...] = FRAMES) -> list[Update]:
     asked = Options(str(dataset), Path("unused"), eval_cameras=HELD_OUT, anchor=ANCHOR)
     sequence = open_recording(str(dataset), (), HELD_OUT, ":").tracked
     fitted = canonical_of(asked, FOLDER) / "scene.ply"
-    truth, poses = sequence.truth, {}
-    for k, label in enumerate(truth.label_ids):
-        motion = relative_motion(truth.poses[:, k], ANCHOR)
-        if np.abs(motion - np.eye(4)).max() > 1e-3:
-            poses[int(label)] = motion
-    masks = np.stack([sequence.mask(ANCHOR, c) for c in range(sequence.num_cameras)])
-    slots = np.zeros(int(masks.max()) + 1, int)
-    slots[list(poses)] = np.arange(1, len(poses) + 1)
-    config = replace(
-        PartsConfig(), weights="table", discover=replace(PartsConfig().discover, most_parts=len(poses))
-    )
-    anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras, ANCHOR)
-    start = begin(
-        sequence,
-        read_ply(fitted)[0],
-        anchor,
-        masks > 0,
-        config,
-        None,
-        jax.random.key(0),
-        masks=slots[np.maximum(masks, 0)],
+    start, motions, _ = told_the_truth(
+        sequence, read_ply(fitted)[0], ANCHOR, replace(PartsConfig(), weights="table")
     )
     canonical, weights = start.canonical, skinning_weights(start.field, start.canonical)
     centers = np.asarray(canonical.centers, np.float64)
 
     def pose(t: int) -> HandlePose:
-        motions = np.stack([np.eye(4), *(motion[t] for motion in poses.values())])
-        shifts = np.einsum("pij,pj->pi", motions[:, :3, :3], centers) + motions[:, :3, 3] - centers
-        quats = jaxlie.SO3.from_matrix(jnp.asarray(motions[:, :3, :3], jnp.float32)).wxyz
+        shifts = np.einsum("pij,pj->pi", motions[t, :, :3, :3], centers) + motions[t, :, :3, 3] - centers
+        quats = jaxlie.SO3.from_matrix(jnp.asarray(motions[t, :, :3, :3], jnp.float32)).wxyz
         return HandlePose(quats, jnp.asarray(shifts, jnp.float32))
 
     found = []

@@ -1,0 +1,253 @@
+"""Do parts that are tracked in pictures and lifted stay parts? All methods begin with the same true masks."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from discoveries import Options, canonical_of, told_the_truth
+from jaxtyping import Bool, Float, Int
+from recordings import recorded
+from scipy.ndimage import map_coordinates
+from trimesh.registration import procrustes
+
+from gsjax.cli.recording import open_recording
+from gsjax.data import Sequence
+from gsjax.geometry.cameras import project
+from gsjax.geometry.flow import seen_in_both
+from gsjax.io.ply import read_ply
+from gsjax.methods.motion_parts import PartsConfig, Start, first_parts, follow
+from gsjax.methods.motion_parts.stream import posed, skinning_weights
+from gsjax.optim.compiler import host_options
+from gsjax.perception.optical_flow import DisFlow
+from gsjax.perception.propagation import FlowPropagator
+from gsjax.scene.handles import HandlePose, rigid_motions
+from gsjax.scene.render import plan_render, render, render_with_room
+
+HELD_OUT, ANCHOR = (3, 8), 0
+AFTER = (5, 15, 39)
+TRIMMED = 3.0  # points so many times as far off as half of them are taken for lost
+LEAST_POINTS = 6  # of a part that is to be placed
+NEAR_M = 0.02  # behind what is seen, a Gaussian is not seen
+
+
+class Problem(NamedTuple):
+    """What methods are given, and what they are judged by.
+
+    Attributes:
+        sequence: the recording, looked through.
+        start: a discovery that knows the true masks.
+        motions: the true ones, of each handle.
+        labels: the true masks by handle, [T,C,H,W].
+    """
+
+    sequence: Sequence
+    start: Start
+    motions: Float[np.ndarray, "T P 4 4"]
+    labels: Int[np.ndarray, "T C H W"]
+
+
+class Tracked(NamedTuple):
+    """What a method finds: masks by handle, and the motion of each handle, where it has any."""
+
+    labels: Int[np.ndarray, "T C H W"]
+    motions: Float[np.ndarray, "T P 4 4"] | None
+
+
+@cache
+def problem(folder: Path) -> Problem:
+    """articulated_0, from the anchor on."""
+    dataset = str(recorded("articulated_0"))
+    sequence = open_recording(dataset, (), HELD_OUT, ":").tracked
+    asked = Options(dataset, folder, eval_cameras=HELD_OUT, anchor=ANCHOR)
+    gaussians, _ = read_ply(canonical_of(asked, folder) / "scene.ply")
+    start, motions, slots = told_the_truth(sequence, gaussians, ANCHOR, PartsConfig())
+    every = [[sequence.mask(t, c) for c in range(sequence.num_cameras)] for t in range(sequence.num_frames)]
+    return Problem(sequence, start, motions, slots[np.maximum(every, 0)])
+
+
+def masks_tracked(given: Problem) -> Tracked:
+    """In each video on its own, from frame to frame."""
+    sequence, found = given.sequence, []
+    for c in range(sequence.num_cameras):
+        video = np.stack([sequence.image(t, c) for t in range(sequence.num_frames)])
+        found.append(FlowPropagator()(video, given.labels[ANCHOR, c]))
+    return Tracked(np.stack(found, axis=1), None)
+
+
+def points_lifted(given: Problem) -> Tracked:
+    """Each part goes where the tracks of its Gaussians meet in space, which videos that see them have."""
+    sequence, canonical = given.sequence, given.start.canonical
+    means = np.asarray(canonical.movable.means, np.float64)
+    parts = np.asarray(skinning_weights(given.start.field, canonical)).argmax(-1)
+    tracks = [_tracks(given, c, means, parts) for c in range(sequence.num_cameras)]
+    motions = np.broadcast_to(np.eye(4), given.motions.shape).copy()
+    for t in range(1, sequence.num_frames):
+        points = _met([places[t] for places in tracks], sequence, t)
+        for part in range(1, motions.shape[1]):
+            mine = (parts == part) & np.isfinite(points).all(-1)
+            fitted = _fitted(means[mine], points[mine])
+            motions[t, part] = motions[t - 1, part] if fitted is None else fitted
+    return Tracked(_masks(given, motions), motions)
+
+
+def followed(given: Problem) -> Tracked:
+    """As `gsjax parts` does, but for the masks; the parts stay those that masks tell of."""
+    config = replace(PartsConfig(), unify=replace(PartsConfig().unify, every=0))
+    parts = first_parts(given.start, given.sequence.num_frames, config)
+    for update in follow(given.sequence, given.start, parts, config):
+        parts = update.parts
+    rotations, offsets = jax.vmap(partial(rigid_motions, parts.canonical.centers))(
+        HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))
+    )
+    motions = np.broadcast_to(np.eye(4), given.motions.shape).copy()
+    motions[..., :3, :3], motions[..., :3, 3] = rotations, offsets
+    return Tracked(_masks(given, motions, parts.weights), motions)
+
+
+def _tracks(
+    given: Problem, c: int, means: Float[np.ndarray, "n 3"], parts: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "T n 2"]:
+    """Where one camera sees points in each frame, by flow from frame to frame; NaN from where one is lost."""
+    sequence, canonical = given.sequence, given.start.canonical
+    camera = sequence.frame(ANCHOR).cameras
+    one = jax.tree.map(lambda a: a[c : c + 1], camera)
+    whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), canonical.movable, canonical.fixed)
+    depth = np.asarray(render_with_room(whole, one)[0].depths[0])
+    uv, z = (np.asarray(a) for a in project(jnp.asarray(means, jnp.float32), one.viewmat[0], one.K[0]))
+    columns, rows = np.clip(uv.astype(int), 0, [camera.width - 1, camera.height - 1]).T
+    inside = (uv >= 0).all(-1) & (uv < [camera.width, camera.height]).all(-1)
+    shown = (
+        inside
+        & (given.labels[ANCHOR, c][rows, columns] == parts)
+        & (np.abs(z - depth[rows, columns]) < NEAR_M)
+    )
+    found, flow = [np.where(shown[:, None], uv, np.nan)], DisFlow()
+    for t in range(1, sequence.num_frames):
+        before, now = sequence.image(t - 1, c), sequence.image(t, c)
+        ahead = flow(before, now)
+        sure = np.where(seen_in_both(ahead, flow(now, before))[..., None], ahead, np.nan)
+        at = np.nan_to_num(found[-1] - 0.5, nan=-9.0)[:, ::-1].T
+        steps = [map_coordinates(sure[..., k], at, order=1, cval=np.nan) for k in range(2)]
+        found.append(found[-1] + np.stack(steps, axis=-1))
+    return np.stack(found)
+
+
+def _met(places: list[Float[np.ndarray, "n 2"]], sequence: Sequence, t: int) -> Float[np.ndarray, "n 3"]:
+    """Where rays of two or more cameras come nearest to each other, in the mean of squares; NaN without."""
+    lhs, rhs, count = np.zeros((len(places[0]), 3, 3)), np.zeros((len(places[0]), 3)), 0
+    for c, uv in enumerate(places):
+        viewmat, K = sequence.viewmats[t, c], sequence.Ks[t, c]
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(K).T @ viewmat[:3, :3]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        known = np.isfinite(uv).all(-1)
+        across = np.where(known[:, None, None], np.eye(3) - rays[:, :, None] * rays[:, None], 0.0)
+        eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        lhs, rhs, count = lhs + across, rhs + across @ eye, count + known
+    points = np.full((len(count), 3), np.nan)
+    points[count > 1] = np.linalg.solve(lhs[count > 1], rhs[count > 1, :, None])[..., 0]
+    return points
+
+
+def _fitted(means: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"]) -> np.ndarray | None:
+    """The rigid motion from one to the other, without points that were lost; None where too few are left."""
+    kept = np.ones(len(means), bool)
+    for _ in range(4):
+        if kept.sum() < LEAST_POINTS:
+            return None
+        motion = procrustes(means[kept], points[kept], reflection=False, scale=False, return_cost=False)
+        off = np.linalg.norm(means @ motion[:3, :3].T + motion[:3, 3] - points, axis=-1)
+        kept = off <= TRIMMED * np.median(off[kept])
+    return motion
+
+
+def _masks(
+    given: Problem, motions: Float[np.ndarray, "T P 4 4"], weights: Any = None
+) -> Int[np.ndarray, "T C H W"]:
+    """What is seen of each part in all frames, if handles move like that."""
+    canonical, sequence = given.start.canonical, given.sequence
+    weights = skinning_weights(given.start.field, canonical) if weights is None else weights
+    shares = jnp.concatenate([weights, jax.nn.one_hot(jnp.zeros(canonical.fixed.num, int), weights.shape[1])])
+    centers, plan, found = np.asarray(canonical.centers, np.float64), None, []
+    draw = jax.jit(
+        lambda gaussians, cameras, plan: render(gaussians, cameras, plan, features=shares),
+        compiler_options=host_options(),
+    )
+    for t, motion in enumerate(motions):
+        shifts = np.einsum("pij,pj->pi", motion[:, :3, :3], centers) + motion[:, :3, 3] - centers
+        quats = jaxlie.SO3.from_matrix(jnp.asarray(motion[:, :3, :3], jnp.float32)).wxyz
+        gaussians = posed(canonical, weights, HandlePose(quats, jnp.asarray(shifts, jnp.float32)))
+        cameras = sequence.frame(t).cameras
+        plan = plan or plan_render(gaussians, cameras, headroom=2.0)
+        drawn = draw(gaussians, cameras, plan)
+        if bool(drawn.meta.overflow.any()):
+            plan = plan.grown(int(drawn.meta.needed.max()), 2.0)
+            drawn = draw(gaussians, cameras, plan)
+        found.append(np.asarray(drawn.features.argmax(-1)))
+    return np.stack(found)
+
+
+METHODS: dict[str, Callable[[Problem], Tracked]] = {
+    "masks tracked": masks_tracked,
+    "points tracked and lifted": points_lifted,
+    "followed in space": followed,
+}
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """One method."""
+    given, begun = problem(folder.parent / "canonical"), perf_counter()
+    found = METHODS[options["method"]](given)
+    minutes = (perf_counter() - begun) / 60
+    parts = range(1, given.motions.shape[1])
+    ious = np.array(
+        [[_iou(a == p, b == p) for p in parts] for a, b in zip(found.labels, given.labels, strict=True)]
+    )
+    row = {f"iou_{t}": float(ious[t].mean()) for t in AFTER} | {
+        "iou": float(ious[1:].mean()),
+        "worst_iou": float(ious[1:].mean(0).min()),
+        "ious": ious.mean(1).tolist(),
+        "minutes": minutes,
+    }
+    if found.motions is not None:
+        means = np.asarray(given.start.canonical.movable.means, np.float64)
+        labels = np.asarray(skinning_weights(given.start.field, given.start.canonical)).argmax(-1)
+        points = [_point_error(means[labels == p], found.motions[:, p], given.motions[:, p]) for p in parts]
+        row |= {"point_mm": float(np.mean(points)), "worst_point_mm": float(max(points))}
+    return {"point_mm": None, "worst_point_mm": None} | row
+
+
+def _iou(found: Bool[np.ndarray, "C H W"], true: Bool[np.ndarray, "C H W"]) -> float:
+    return float((found & true).sum() / max((found | true).sum(), 1))
+
+
+def _point_error(
+    means: Float[np.ndarray, "n 3"], found: Float[np.ndarray, "T 4 4"], true: Float[np.ndarray, "T 4 4"]
+) -> float:
+    """Of half the points of a part, at most, in the mean over time, mm."""
+    gap = found - true
+    off = np.einsum("tij,nj->tni", gap[:, :3, :3], means) + gap[:, None, :3, 3]
+    return 1000 * float(np.median(np.linalg.norm(off, axis=-1).mean(0)))
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """Overlap over time."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(7, 4), dpi=110, layout="constrained")
+    axes = drawing.subplots()
+    for row in rows:
+        axes.plot(row["ious"], label=row["method"])
+    axes.set(xlabel="frames since the masks were told", ylabel="overlap with the true masks", ylim=(0, 1))
+    axes.grid(color="0.9")
+    axes.legend()
+    drawing.savefig(path)
