@@ -1,0 +1,225 @@
+"""The discovery of parts where data and settings are at the edge of sense."""
+
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from discoveries import FIT, Options, canonical_of
+from jaxtyping import Int
+
+from gsjax.data import Sequence, open_sequence
+from gsjax.io.ply import read_ply
+from gsjax.methods.motion_parts import (
+    PartScene,
+    PartsConfig,
+    Trajectory,
+    begin,
+    choose_anchor,
+    first_parts,
+    follow,
+    gaussians_at,
+    moment,
+    moved_pixels,
+    outcome,
+    refine,
+    without_needless,
+)
+from gsjax.metrics.tracking import relative_motion, true_labels
+from gsjax.perception.segmenters import PieceSegmenter
+from gsjax.scene.gaussians import Gaussians, take
+
+DATASET = "simulated:hard_parts?case=small&width=160&height=120&cameras=6&frames=12"
+BLOCK, BOX = 1, 2  # labels
+
+
+class Case(NamedTuple):
+    """What a discovery is given.
+
+    Attributes:
+        sequence: what cameras see.
+        gaussians: as in frame 0.
+        labels: the true ones of these.
+        config: how.
+        meter: how long a metre is.
+    """
+
+    sequence: Sequence
+    gaussians: Gaussians
+    labels: Int[np.ndarray, "N"]
+    config: PartsConfig
+    meter: float = 1.0
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """One discovery; an error in words is an outcome, any other is raised."""
+    case = CASES[options["case"]](as_it_is(folder.parent / "canonical"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            row = discovered(case)
+        except ValueError as error:
+            nothing = dict.fromkeys(("skipped", "parts", "block_mm", "box_mm", "update_s"))
+            return nothing | {"finite": "-", "said": f"error: {error}"}
+    told = dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning)
+    return row | {"said": "; ".join(told)}
+
+
+def discovered(case: Case) -> dict[str, Any]:
+    """As `gsjax parts` does it, from a scene that is there."""
+    views, config = case.sequence, case.config
+    anchor = choose_anchor(views.image, views.num_frames, views.num_cameras, 0)
+    moved = moved_pixels(views.image, anchor, views.num_cameras)
+    start = begin(views, case.gaussians, anchor, moved, config, PieceSegmenter(), jax.random.key(0))
+    parts, skipped, seconds = first_parts(start, views.num_frames, config), 0, []
+    for update in follow(views, start, parts, config):
+        parts, skipped = update.parts, skipped + update.skipped
+        seconds.append(update.seconds)
+    parts, _ = without_needless(views, parts, config)
+    for refined in refine(views, parts, config):
+        parts, skipped = refined.parts, skipped + int(refined.skipped)
+    scene, trajectory = outcome(start, parts, jnp.asarray(views.times, jnp.float32))
+    everything = jax.tree.leaves(eqx.filter((scene, trajectory), eqx.is_inexact_array))
+    block, box = (_error_mm(case, scene, trajectory, label) for label in (BLOCK, BOX))
+    return {
+        "finite": "yes" if all(bool(jnp.isfinite(leaf).all()) for leaf in everything) else "NO",
+        "skipped": skipped,
+        "parts": len(np.unique(np.asarray(scene.labels))) - 1,
+        "block_mm": block,
+        "box_mm": box,
+        "update_s": float(np.median(seconds)),
+    }
+
+
+def _error_mm(case: Case, scene: PartScene, trajectory: Trajectory, label: int) -> float:
+    """How far half of the Gaussians of an object are from where they truly are, at most, in the mean over the
+    frames."""
+    mine, truth = case.labels == label, case.sequence.truth
+    frames = range(case.sequence.num_frames)
+    means = np.stack([np.asarray(gaussians_at(scene, moment(trajectory, t)).means)[mine] for t in frames])
+    motions = relative_motion(truth.poses[:, list(truth.label_ids).index(label)])
+    true = np.einsum("tij,nj->tni", motions[:, :3, :3], means[0]) + motions[:, None, :3, 3]
+    off = np.linalg.norm(means - true, axis=-1).mean(0)
+    return 1000 * float(np.median(off)) / case.meter
+
+
+def as_it_is(folder: Path) -> Case:
+    """The scene and its recording, without anything odd."""
+    sequence = open_sequence(DATASET)
+    fit = replace(FIT, steps=1500, cap=5_000, start=replace(FIT.start, count=3_000))
+    gaussians, _ = read_ply(canonical_of(Options(DATASET, folder, anchor=0, fit=fit), folder) / "scene.ply")
+    seen = zip(
+        *((sequence.mask(0, c), sequence.depth(0, c)) for c in range(sequence.num_cameras)), strict=True
+    )
+    labels = true_labels(np.asarray(gaussians.means), *seen, list(sequence.viewmats[0]), list(sequence.Ks[0]))
+    config = PartsConfig()
+    return Case(sequence, gaussians, labels, replace(config, refine=replace(config.refine, iterations=60)))
+
+
+def seen_as(change: Callable[[np.ndarray, int, int], np.ndarray]) -> Callable[[Case], Case]:
+    """Other pictures: `change(picture, t, c)`."""
+
+    def changed(case: Case) -> Case:
+        load = case.sequence.load_image
+        return case._replace(
+            sequence=replace(case.sequence, load_image=lambda t, c: change(load(t, c), t, c))
+        )
+
+    return changed
+
+
+def looked_at(**selected: Any) -> Callable[[Case], Case]:
+    """Other frames, or cameras."""
+    return lambda case: case._replace(sequence=case.sequence.select(**selected))
+
+
+def set_to(section: str, **values: Any) -> Callable[[Case], Case]:
+    """Other settings."""
+
+    def changed(case: Case) -> Case:
+        one = replace(getattr(case.config, section), **values)
+        return case._replace(config=replace(case.config, **{section: one}))
+
+    return changed
+
+
+def larger(by: float) -> Callable[[Case], Case]:
+    """Everything, cameras too."""
+
+    def changed(case: Case) -> Case:
+        sequence, truth = case.sequence, case.sequence.truth
+        viewmats, poses = sequence.viewmats.copy(), truth.poses.copy()
+        viewmats[..., :3, 3] *= by
+        poses[..., :3, 3] *= by
+        load = sequence.load_depth
+        sequence = replace(
+            sequence,
+            viewmats=viewmats,
+            near=by * sequence.near,
+            load_depth=lambda t, c: by * load(t, c),
+            truth=replace(truth, poses=poses, joints=()),
+        )
+        gaussians = eqx.tree_at(
+            lambda g: (g.means, g.log_scales),
+            case.gaussians,
+            (by * case.gaussians.means, case.gaussians.log_scales + np.log(by)),
+        )
+        return case._replace(sequence=sequence, gaussians=gaussians, meter=by)
+
+    return changed
+
+
+def fewer_gaussians(count: int) -> Callable[[Case], Case]:
+    """Only some of the scene, most of what is labelled."""
+
+    def changed(case: Case) -> Case:
+        rows = np.sort(np.random.default_rng(0).permutation(case.gaussians.num)[:count])
+        return case._replace(gaussians=take(case.gaussians, rows), labels=case.labels[rows])
+
+    return changed
+
+
+def bad_depth(case: Case) -> Case:
+    """A third of the pixels is NaN, a third infinite."""
+    load = case.sequence.load_depth
+
+    def broken(t: int, c: int) -> np.ndarray:
+        depth = np.array(load(t, c), np.float32)
+        depth[::3], depth[1::3] = np.nan, np.inf
+        return depth
+
+    return case._replace(sequence=replace(case.sequence, load_depth=broken))
+
+
+def noise(picture: np.ndarray, t: int, c: int) -> np.ndarray:
+    """In one camera."""
+    return np.random.default_rng((t, c)).integers(0, 255, picture.shape, np.uint8) if c == 2 else picture
+
+
+CASES: dict[str, Callable[[Case], Case]] = {
+    "as it is": lambda case: case,
+    "two cameras": looked_at(cameras=[2, 3]),
+    "every fifth frame": looked_at(frames=slice(0, None, 5)),
+    "a thousand times larger": larger(1e3),
+    "a thousand times smaller": larger(1e-3),
+    "one camera black from frame 3 on": seen_as(lambda p, t, c: 0 * p if c == 2 and t >= 3 else p),
+    "one camera noise": seen_as(noise),
+    "all black from frame 5 on": seen_as(lambda p, t, c: 0 * p if t >= 5 else p),
+    "light halved at frame 4": seen_as(lambda p, t, c: p // 2 if t >= 4 else p),
+    "depth of NaN and infinity": bad_depth,
+    "sixty Gaussians": fewer_gaussians(60),
+    "one step a frame": set_to("stream", iterations=1),
+    "steps a thousand times as long": set_to("stream", rate=500.0, turn_rate=250.0),
+    "weights learned a thousand times as fast": set_to("stream", field_rate=1.0),
+    "one slot for parts": set_to("discover", most_parts=1),
+    "nothing moves": looked_at(frames=[0, 0]),
+    "one camera": looked_at(cameras=[2]),
+}
