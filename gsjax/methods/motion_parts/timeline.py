@@ -64,15 +64,18 @@ def parse_script(text: str) -> Script:
     return read(Script, {} if found is None else found)
 
 
-def parse_op(text: str) -> Edit:
+def parse_op(text: str, number: int = 1) -> Edit:
     """One edit from one line: `speed:parts=drawer,factor=2` or `scale:parts=[1, lid],factor=0.5,from=1`.
+
+    Args:
+        number: that messages call it by.
 
     Raises:
         ValueError: as for `parse_script`.
     """
     operation, _, pairs = text.partition(":")
     pairs = re.sub(r"(^|,)\s*(\w+)\s*=", r"\1 \2: ", pairs)
-    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")])
+    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
     return edit
 
 
