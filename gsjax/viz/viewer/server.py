@@ -30,7 +30,7 @@ class Viewer:
     def __init__(self, server: Any, shared: Shared, host: str):
         self._server, self._pages, self._lock = server, {}, threading.Lock()
         self._shared = shared
-        self._closed = threading.Event()
+        self._closed = shared.closing
         self.port: int = server.get_port()
         shown = f"[{host}]" if ":" in host else host
         self.url: str = f"http://{shown}:{self.port}"
