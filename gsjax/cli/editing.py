@@ -168,7 +168,7 @@ def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
 
 
 def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, str]]:
-    """Labels of all Gaussians of a film, and their names; parts of other runs come behind those of the run."""
+    """Labels of all Gaussians of a film, and their names; parts of other runs come behind the own ones."""
     known: dict[int, Any] = {part: name for name, part in names.items()}  # the true name, which comes last
     labels, behind = [], film[0].scene.num_parts
     for layer in film:

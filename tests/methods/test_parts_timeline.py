@@ -213,7 +213,7 @@ class TestScripts:
 
     def test_a_line_has_what_an_operation_is_about(self):
         assert first_line("echo", "lid") == "echo:parts=lid,copies=3,every=0.2,fade=0.5"
-        assert first_line("move", "all") == "move:parts=all,by=[0, 0, 0.1]"
+        assert first_line("move", "all") == "move:parts=all,by=[0,0,0.1]"
         assert explained("speed")[1] == (
             "factor: a factor from 0.01 to 100, or from -0.01 to -100 for backwards"
         )
