@@ -18,9 +18,10 @@ from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import atomic_write, write_json
 from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
-from gsjax.methods.motion_parts.film import Film, film_gaussians
-from gsjax.methods.motion_parts.limits import beyond_captured, describe_beyond
-from gsjax.methods.motion_parts.timeline import Script, apply, to_yaml
+from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
+from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.motion_parts.timeline import ROUND, Script, apply, to_yaml
+from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
@@ -60,7 +61,7 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     if not saved.complete:
         frames = len(recorded.trajectory.times)
         doubts.append(f"{saved.path} is a partial run: only {frames} of its frames are there")
-    beyond = describe_beyond(beyond_captured(recorded, now), now.times, saved.names)
+    beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
     if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
         doubts.append(". ".join(beyond))
     return film, doubts
@@ -134,6 +135,14 @@ def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
         drawn, plan = render_with_room(gaussians, cameras, plan)
         image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
         yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)
+
+
+def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
+    """`beyond_captured`, of a film of any length by a program that is there already."""
+    length = len(now.times)
+    rows = np.minimum(np.arange(length + -length % ROUND), length - 1)
+    longer = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), now)
+    return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
 
 
 def _clear(folder: Path) -> None:

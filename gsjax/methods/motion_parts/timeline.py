@@ -34,8 +34,9 @@ LoadScene = Callable[[str], tuple[Layer, Names]]
 """From the path of another run to its scene as it was found, and the names of its parts."""
 MOST_MOMENTS = 100_000
 """A film that is longer, if only while it is edited, is a slip."""
+ROUND = 256
+"""Moments: films are edited in multiples of these, so that a new length seldom compiles anything."""
 _INSTANT = 1e-6  # seconds; rounding must not add a moment
-_ROUND = 256  # moments: films are edited in multiples of these, so that a new length seldom compiles anything
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +119,7 @@ def _edited(
     longest = max(last for _, lasts in plan for last in lasts)
     dtype = layer.trajectory.times.dtype
     longer = _reaching(times, step, longest + step)
-    longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % _ROUND))
+    longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % ROUND))
     recorded = eqx.tree_at(
         lambda t: t.times, layer.trajectory, layer.trajectory.times - layer.trajectory.times[0]
     )

@@ -110,7 +110,7 @@ def open_viewer(
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=_BRAND)
     server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(330)
+    server.gui.main_panel.set_width(330 if scene.editing is None else 400)
     server.scene.set_up_direction(scene_up(scene))
     server.scene.world_axes.visible = False
     pose = first_pose(scene)

@@ -1,6 +1,7 @@
 """What the page of a viewer says, as Markdown and HTML."""
 
 import html
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -111,7 +112,7 @@ def lines(told: Sequence[str], color: str = "inherit") -> str:
 
 def explained(told: Sequence[str]) -> str:
     """What an operation does and what its keys want ("key: what"), as HTML."""
-    does, *keys = (html.escape(line) for line in told)
+    does, *keys = (re.sub("`(.+?)`", r"<b>\1</b>", html.escape(line)) for line in told)
     pairs = (line.partition(": ") for line in keys)
     return _small(
         "".join([f"<div>{does}</div>", *(f"<div><b>{key}</b> {wants}</div>" for key, _, wants in pairs)])
