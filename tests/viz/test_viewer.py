@@ -218,6 +218,9 @@ class Api:
                 api.sent.append(name)
                 api.nodes[name] = arrays
 
+            def remove(self):
+                del api.nodes[name]
+
         self.nodes[name] = (centers, covariances, rgbs, opacities)
         self.sent.append(name)
         return Node()
@@ -425,7 +428,8 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
     assert len(traces) == 1
     drawer(gaussians, at(0, 0.9))
     assert len(traces) == 2
-    (plan,) = drawer._plans.values()
+    (plans,) = drawer._plans.values()
+    (plan,) = plans.values()
     reference = jax.jit(
         lambda camera: render(gaussians, camera, plan, backgrounds=jnp.array([[0.2, 0.4, 0.6]]))
     )
@@ -437,6 +441,18 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
         assert (drawn.depths[drawn.alphas <= 0.5] == 0).all()
         assert (drawn.depths[drawn.alphas > 0.5] > 0).all()
     assert len(traces) == 2
+
+
+def test_scenes_of_fewer_gaussians_compile_nothing(monkeypatch):
+    """Nor does one of a few more, once there was one of more; and their pictures are their own."""
+    traces, drawer = counted(monkeypatch), Drawer()
+    for count, compiled in ((100, 1), (60, 1), (120, 2), (140, 2), (100, 2), (1, 2)):
+        gaussians = cloud(count)
+        drawn = drawer(gaussians, ahead())
+        assert len(traces) == compiled
+        alone = render(gaussians, ahead(), plan_render(gaussians, ahead()))
+        np.testing.assert_allclose(drawn.colors, alone.colors[0], atol=1e-5)
+        np.testing.assert_allclose(drawn.alphas, alone.alphas[0], atol=1e-5)
 
 
 def test_pictures_of_what_was_drawn():

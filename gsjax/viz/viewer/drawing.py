@@ -91,8 +91,8 @@ def _filled_up(gaussians: Gaussians, room: int) -> Gaussians:
         return gaussians
     rows = np.minimum(np.arange(room), gaussians.num - 1)
     more = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
-    logits = np.where(np.arange(room) < gaussians.num, more.logit_opacities, np.float32(_INVISIBLE))
-    return eqx.tree_at(lambda g: g.logit_opacities, more, logits)
+    more.logit_opacities[gaussians.num :] = _INVISIBLE
+    return jax.tree.map(jnp.asarray, more)
 
 
 def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any) -> tuple[jax.Array, ...]:
