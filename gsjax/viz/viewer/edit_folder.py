@@ -21,7 +21,8 @@ class EditFolder:
         gui: viser's, of one browser.
         editing: what can be done.
         show: called with the film that edits make, or None: there are none.
-        closing: set when films that are being kept are to end.
+        closing: set when a film that is being kept is to end.
+        filming: held while one is.
     """
 
     def __init__(
@@ -30,10 +31,11 @@ class EditFolder:
         editing: Editing,
         show: Callable[[Viewable | None], None],
         closing: threading.Event,
+        filming: threading.Lock,
     ):
-        self._editing, self._show, self._closing = editing, show, closing
+        self._editing, self._show = editing, show
+        self._closing, self._filming = closing, filming
         self._previewed: list[str] = []
-        self._keeping = threading.Lock()
         with gui.add_folder("Edit"):
             self._operation = gui.add_dropdown("Operation", tuple(editing.operations))
             self._part = gui.add_dropdown("Part", tuple(editing.parts))
@@ -95,7 +97,8 @@ class EditFolder:
 
     def _keep(self) -> None:
         """Save the film that the list describes; runs in a thread of viser's."""
-        if not self._keeping.acquire(blocking=False):
+        if not self._filming.acquire(blocking=False):
+            self._kept.content = words.lines(["one film at a time: wait until that which is made is kept"])
             return
         try:
             self._save.disabled, self._progress.value, self._progress.visible = True, 0, True
@@ -109,7 +112,7 @@ class EditFolder:
             self._kept.content = words.lines([f"{error}"], _RED)
         finally:
             self._save.disabled = self._progress.visible = False
-            self._keeping.release()
+            self._filming.release()
 
     def _filmed(self, done: int, asked: int) -> bool:
         """Told how far a film is; whether it goes on."""

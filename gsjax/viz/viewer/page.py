@@ -51,7 +51,8 @@ class Shared:
         drawer: our rasterizer, with what it has compiled.
         max_gaussians: that a browser gets.
         save: keeps screenshots; None offers them for download only.
-        closing: set when nobody can look any more.
+        closing: set when nobody can look any more, and films that are being kept are to end.
+        filming: held while one is: one at a time, whoever looks.
     """
 
     scene: Viewable
@@ -59,6 +60,7 @@ class Shared:
     max_gaussians: int
     save: Save | None
     closing: threading.Event = field(default_factory=threading.Event)
+    filming: threading.Lock = field(default_factory=threading.Lock)
 
 
 class Page:
@@ -115,7 +117,8 @@ class Page:
                 self._play.on_click(lambda _: self._toggle_play())
         self._edits = None
         if scene.editing is not None and scene.num_frames > 1:
-            self._edits = EditFolder(gui, scene.editing, self._show, self._shared.closing)
+            shared = self._shared
+            self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)

@@ -43,7 +43,7 @@ class Viewer:
             pass
 
     def close(self) -> None:
-        """Let all browsers go, and free the port."""
+        """Let all browsers go, free the port, and end a film that is being kept after its present frame."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -54,6 +54,8 @@ class Viewer:
             page.close()
         with _hushed():
             self._server.stop()
+        with self._shared.filming:
+            pass
 
     def _come(self, client: Any) -> None:
         page = Page(client, self._shared)
