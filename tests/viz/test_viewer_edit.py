@@ -102,8 +102,8 @@ def test_a_list_is_put_together_previewed_and_reset():
         page._slider.value = 3
         folder._add()
         assert folder._list.value == "longer:parts=all"
-        until(lambda: page._slider.max == 7)
-        assert "8 frames, 150 Gaussians" in folder._told.content
+        until(lambda: "8 frames, 150 Gaussians" in folder._told.content)
+        assert page._slider.max == 7
         assert "it goes &lt;far&gt; beyond" in folder._told.content
         assert page._moment.content == "0.30 s of 0.70 s"
         until(lambda: max(color_share(page._picture, GREEN).values()) > 0.02)
@@ -118,17 +118,18 @@ def test_a_list_is_put_together_previewed_and_reset():
         assert (page._slider.max, page._now.scene.num_frames) == (7, 8)
         # A line that is left out is not asked for; what does not move is sent as such.
         folder._list.value = "# longer:parts=all\n\n  fewer:parts=1\n"
-        until(lambda: page._slider.max == 1)
+        until(lambda: "2 frames, 40 Gaussians" in folder._told.content)
+        assert page._slider.max == 1
         assert edits.asked[-1] == ["fewer:parts=1"]
         assert page._frame == 1
         until(lambda: set(page._splats._nodes) == {"still"})
         until(lambda: "all 40 Gaussians" in page._status.content)
         # Reset is the recorded motion.
         folder._list.value = ""
-        until(lambda: page._slider.max == 3)
+        until(lambda: "editing" not in folder._told.content and "frames" not in folder._told.content)
+        assert page._slider.max == 3
         assert page._now.scene is scene
         until(lambda: set(page._splats._nodes) == {"moving"})
-        assert "frames" not in folder._told.content
 
 
 def test_playing_goes_on_with_what_is_previewed():
