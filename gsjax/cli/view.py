@@ -84,7 +84,7 @@ def _say(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -> Non
     if not is_loopback(options.host):
         notes.warn(
             f"--host {options.host}: everyone who reaches this machine over the network can look, and save "
-            "screenshots here; there is no password"
+            "screenshots and films here; there is no password"
         )
     console = Console(highlight=False)
     console.print(f"[bold]scene[/]   {in_words(scene)}", soft_wrap=True)

@@ -1,12 +1,11 @@
 """What `gsjax view` opens: a run of any kind, or a PLY file."""
 
-from functools import partial
 from pathlib import Path
 
-import jax
 import numpy as np
 import yaml
 
+from gsjax.cli.editing import Filmed, camera_names, editing_of
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import open_parts_run, read_parts
 from gsjax.cli.photographs import photographs_of_run
@@ -15,10 +14,9 @@ from gsjax.cli.run_folder import expect_run
 from gsjax.cli.saved_run import open_run, read_tracking
 from gsjax.data.photographs import Photographs
 from gsjax.io.ply import read_ply
-from gsjax.methods.motion_parts import BACKGROUND, PartScene, gaussians_at, moment
-from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.colors import to_uint8
-from gsjax.viz.viewer import Shots, Viewable
+from gsjax.viz.viewer import Shots, Viewable, moved
 
 
 def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
@@ -89,8 +87,7 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
         tracking.scene.gaussians,
         np.asarray(tracking.scene.labels),
         names,
-        means=tracking.means()[:, :count],
-        quats=tracking.quats(),
+        motion=moved(tracking.scene.gaussians, tracking.means()[:, :count], tracking.quats()),
         times=times,
         shots=shots,
         unit="m",
@@ -100,34 +97,19 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
 def _of_parts(path: Path, notes: Notes) -> Viewable:
     """The scene of a run of `gsjax parts` over time, with its cameras where its recording still is."""
     layer, names = read_parts(path)
-    shots, blend = None, "quaternion"
+    saved, shots = None, None
     try:
         saved = open_parts_run(path)
     except ValueError as error:
-        notes.warn(f"its recording is not shown: {error}")
+        notes.warn(f"its recording is not shown, and nothing can be edited: {error}")
     else:
-        blend = saved.blend
         if saved.complete:
             shots = _shots_of_recording(saved.recording)
         else:
             notes.warn("it is a partial run: only the frames that were followed are there, and no cameras")
-    weights = np.asarray(layer.scene.weights)
-    moves = weights[:, BACKGROUND] < 1
-    order = np.argsort(~moves, kind="stable")
-    scene = PartScene(take(layer.scene.gaussians, order), layer.scene.weights[order], layer.scene.centers)
-    placed, count = jax.jit(partial(gaussians_at, blend=blend)), int(moves.sum())
-    frames = [placed(scene, moment(layer.trajectory, t)) for t in range(len(layer.trajectory.times))]
-    return Viewable(
-        path.absolute().name,
-        scene.gaussians,
-        np.asarray(scene.labels),
-        {part: name for name, part in names.items()},  # the true name, which comes last, where it is known
-        means=np.stack([np.asarray(g.means[:count]) for g in frames]),
-        quats=np.stack([np.asarray(g.quats[:count]) for g in frames]),
-        times=np.asarray(layer.trajectory.times),
-        shots=shots,
-        unit="m",
-    )
+    times, blend = np.asarray(layer.trajectory.times), "quaternion" if saved is None else saved.blend
+    filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
+    return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
 
 
 def _read(path: Path, notes: Notes) -> tuple[Gaussians, np.ndarray | None]:
@@ -155,8 +137,7 @@ def _shots_of(photographs: Photographs) -> Shots:
 
 
 def _shots_of_recording(recording: Recording) -> Shots:
-    sequence, held_out = recording.judged, recording.held_out
-    names = [f"camera {c}" + (" (held out)" if c in held_out else "") for c in sequence.camera_ids]
+    sequence, names = recording.judged, camera_names(recording)
     return Shots(
         tuple(names),
         sequence.viewmats,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.edit as edit_command
-from gsjax.cli.edit import shots
+from gsjax.cli import films
+from gsjax.cli.films import shots
 from gsjax.cli.parts_results import write_parts
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.data.video import describe_video
@@ -183,7 +183,7 @@ def test_a_film_that_is_stopped_can_be_watched(gsjax, run, monkeypatch):
                 raise KeyboardInterrupt
             yield shot
 
-    monkeypatch.setattr(edit_command, "shots", stopped)
+    monkeypatch.setattr(films, "shots", stopped)
     code, said = gsjax("edit", run, "--op", "speed:parts=drawer,factor=2")
     assert code == 130
     assert "2 frames of 4 (stopped by Ctrl-C)" in said
@@ -215,7 +215,7 @@ SPEED = ("--op", "speed:parts=drawer,factor=2")
         (("--op", "speed:parts=drawr,factor=2"), "edit 1 (speed): parts:"),
         (("--op", "speed:parts=drawr,factor=2"), "did you mean 'drawer'?"),
         (("--op", "sped:parts=1"), "--op 'sped:parts=1': edit 1: op: expected one of isolate"),
-        ((*SPEED, "--op", "move:parts=1"), "--op 'move:parts=1': edit 1 (move): by: expected metres"),
+        ((*SPEED, "--op", "move:parts=1"), "--op 'move:parts=1': edit 2 (move): by: expected metres"),
         ((*SPEED, "--camera", "7"), "has no camera 7; it has [0, 1, 2]."),
         (("--op", "composite:parts=1,from_run=gone"), "gone: expected the folder of a run of `gsjax parts`"),
     ],

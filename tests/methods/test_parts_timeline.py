@@ -1,5 +1,7 @@
 """Edit scripts: what is written is done, what is wrong is said, and what is saved is read again."""
 
+from dataclasses import fields
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax.methods.motion_parts import edits
+from gsjax.methods.motion_parts.entries import key_of
 from gsjax.methods.motion_parts.film import Layer, film_gaussians
 from gsjax.methods.motion_parts.operations import (
     OPERATIONS,
@@ -26,6 +29,7 @@ from gsjax.methods.motion_parts.operations import (
     Scale,
     Speed,
 )
+from gsjax.methods.motion_parts.signatures import explained, first_line
 from gsjax.methods.motion_parts.timeline import Script, apply, parse_op, parse_script, to_yaml
 from gsjax.methods.motion_parts.trajectory import PartScene
 from tests.methods.made_up_parts import STEP, assert_same, rows, scene_of, trajectory
@@ -198,6 +202,22 @@ class TestScripts:
         with pytest.raises(ValueError) as error:  # noqa: PT011
             parse_op(line)
         assert message in str(error.value)
+
+    @pytest.mark.parametrize("operation", OPERATIONS)
+    def test_a_line_to_begin_with_is_an_edit(self, operation):
+        edit = parse_op(first_line(operation, "[lid, part 2]"))
+        assert type(edit) is OPERATIONS[operation]
+        assert edit.parts == ("lid", "part 2")
+        keys = {key for line in explained(operation)[1:] for key in line.split(":")[0].split(", ")}
+        assert keys == {key_of(f) for f in fields(edit)}
+
+    def test_a_line_has_what_an_operation_is_about(self):
+        assert first_line("echo", "lid") == "echo:parts=lid,copies=3,every=0.2,fade=0.5"
+        assert first_line("move", "all") == "move:parts=all,by=[0,0,0.1]"
+        assert explained("speed")[1] == (
+            "factor: a factor from 0.01 to 100, or from -0.01 to -100 for backwards"
+        )
+        assert explained("speed")[3] == "from, to: seconds from the film's start, 0 or more"
 
 
 numbers = st.floats(0.01, 50.0)

@@ -12,7 +12,7 @@ from gsjax.geometry.cameras import look_at
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 from gsjax.viz.colors import label_color
-from gsjax.viz.viewer import Shots, Viewable, pick, words
+from gsjax.viz.viewer import Shots, Viewable, moved, pick, words
 from gsjax.viz.viewer.cameras import (
     browser_camera,
     extent,
@@ -30,7 +30,7 @@ from gsjax.viz.viewer.page import frame_pause, over, unique
 from gsjax.viz.viewer.pick import Picked
 from gsjax.viz.viewer.server import free_port, is_loopback
 from gsjax.viz.viewer.shot_nodes import shrunk
-from gsjax.viz.viewer.splat_nodes import Look, SplatNodes
+from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
 from gsjax.viz.viewer.splats import Palette, browser_scale, depth_range, splats
 from gsjax.viz.viewer.viewable import most_opaque
 
@@ -218,6 +218,9 @@ class Api:
                 api.sent.append(name)
                 api.nodes[name] = arrays
 
+            def remove(self):
+                del api.nodes[name]
+
         self.nodes[name] = (centers, covariances, rgbs, opacities)
         self.sent.append(name)
         return Node()
@@ -229,31 +232,37 @@ def moving_scene(frames=4, moving=8):
     means = np.asarray(gaussians.means)[None, :moving] + steps
     quats = np.repeat(np.asarray(gaussians.quats)[None, :moving], frames, axis=0)
     times = np.arange(frames) / 10.0
-    return Viewable("x", gaussians, means=means.astype(np.float32), quats=quats, times=times)
+    return Viewable("x", gaussians, motion=moved(gaussians, means.astype(np.float32), quats), times=times)
+
+
+def now(scene, frame):
+    """A frame of a scene, as it is shown."""
+    return Present(scene, Palette(scene), frame, scene.at(frame))
 
 
 def test_only_what_differs_is_sent_again():
     scene, api = moving_scene(), Api()
     nodes = SplatNodes(api, scene, 1000)
     look = Look("colour")
-    nodes.show(scene.at(0), 0, look)
-    nodes.show(scene.at(0), 0, Look("colour"))
+    nodes.show(now(scene, 0), look)
+    nodes.show(now(scene, 0), Look("colour"))
     assert api.sent == ["/splats/moving", "/splats/still"]
-    nodes.show(scene.at(2), 2, look)
+    nodes.show(now(scene, 2), look)
     assert api.sent[2:] == ["/splats/moving"]
     scale = browser_scale(scene.gaussians)
-    np.testing.assert_allclose(api.nodes["/splats/moving"][0] * scale, scene.means[2], atol=1e-5)
+    there = np.asarray(scene.gaussians.means)[:8] + np.array([0.4, 0, 0])
+    np.testing.assert_allclose(api.nodes["/splats/moving"][0] * scale, there, atol=1e-5)
     viewmat = np.asarray(ahead().viewmat[0], float)
-    nodes.show(scene.at(2), 2, Look("depth", viewmat, (1.0, 3.0)))
-    nodes.show(scene.at(2), 2, Look("depth", viewmat.copy(), (1.0, 3.0)))
+    nodes.show(now(scene, 2), Look("depth", viewmat, (1.0, 3.0)))
+    nodes.show(now(scene, 2), Look("depth", viewmat.copy(), (1.0, 3.0)))
     assert api.sent[3:] == ["/splats/moving", "/splats/still"]
-    nodes.show(scene.at(2), 2, Look("depth", viewmat + 0.1, (1.0, 3.0)))
+    nodes.show(now(scene, 2), Look("depth", viewmat + 0.1, (1.0, 3.0)))
     assert api.sent[5:] == ["/splats/moving", "/splats/still"]
 
 
 def test_thinned_splats_keep_the_moving_ones_apart():
     scene, api = moving_scene(), Api()
-    SplatNodes(api, scene, 10).show(scene.at(0), 0, Look("colour"))
+    SplatNodes(api, scene, 10).show(now(scene, 0), Look("colour"))
     sizes = {name: len(arrays[0]) for name, arrays in api.nodes.items()}
     assert sum(sizes.values()) == 10
     assert sizes["/splats/moving"] == (most_opaque(scene.gaussians, 10) < 8).sum()
@@ -266,7 +275,7 @@ def test_frames_move_the_first_gaussians_only():
     scene = moving_scene()
     assert scene.num_frames == 4
     later = scene.at(3)
-    np.testing.assert_allclose(later.means[:8], scene.means[3], atol=1e-6)
+    np.testing.assert_allclose(later.means[:8], scene.gaussians.means[:8] + np.array([0.6, 0, 0]), atol=1e-6)
     np.testing.assert_array_equal(later.means[8:], scene.gaussians.means[8:])
     assert later.features is None
 
@@ -275,15 +284,19 @@ def test_frames_move_the_first_gaussians_only():
     ("change", "says"),
     [
         ({"labels": np.zeros(3, int)}, r"labels: got shape \(3,\), want \(24,\)"),
-        ({"means": np.zeros((2, 5, 3))}, "means and quats over time"),
-        ({"means": np.zeros((2, 25, 3)), "quats": np.zeros((2, 25, 4))}, r"\[T,M,3\], T from 1 on, M to 24"),
-        ({"means": np.zeros((2, 5, 3)), "quats": np.zeros((2, 4, 4))}, "quats: got shape"),
         ({"times": np.zeros(2)}, r"times: got shape \(2,\), want \(1,\)"),
     ],
 )
 def test_bad_scenes_are_refused(change, says):
     with pytest.raises(ValueError, match=says):
         Viewable("x", cloud(), **change)
+
+
+def test_bad_motions_are_refused():
+    with pytest.raises(ValueError, match=r"\[T,M,3\], T from 1 on, M to 24"):
+        moved(cloud(), np.zeros((2, 25, 3)), np.zeros((2, 25, 4)))
+    with pytest.raises(ValueError, match="quats: got shape"):
+        moved(cloud(), np.zeros((2, 5, 3)), np.zeros((2, 4, 4)))
 
 
 def test_what_cannot_be_drawn_is_refused():
@@ -415,7 +428,8 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
     assert len(traces) == 1
     drawer(gaussians, at(0, 0.9))
     assert len(traces) == 2
-    (plan,) = drawer._plans.values()
+    (plans,) = drawer._plans.values()
+    (plan,) = plans.values()
     reference = jax.jit(
         lambda camera: render(gaussians, camera, plan, backgrounds=jnp.array([[0.2, 0.4, 0.6]]))
     )
@@ -427,6 +441,18 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
         assert (drawn.depths[drawn.alphas <= 0.5] == 0).all()
         assert (drawn.depths[drawn.alphas > 0.5] > 0).all()
     assert len(traces) == 2
+
+
+def test_scenes_of_fewer_gaussians_compile_nothing(monkeypatch):
+    """Nor does one of a few more, once there was one of more; and their pictures are their own."""
+    traces, drawer = counted(monkeypatch), Drawer()
+    for count, compiled in ((100, 1), (60, 1), (120, 2), (140, 2), (100, 2), (1, 2)):
+        gaussians = cloud(count)
+        drawn = drawer(gaussians, ahead())
+        assert len(traces) == compiled
+        alone = render(gaussians, ahead(), plan_render(gaussians, ahead()))
+        np.testing.assert_allclose(drawn.colors, alone.colors[0], atol=1e-5)
+        np.testing.assert_allclose(drawn.alphas, alone.alphas[0], atol=1e-5)
 
 
 def test_pictures_of_what_was_drawn():

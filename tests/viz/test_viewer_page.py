@@ -11,7 +11,7 @@ import pytest
 
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.viz.colors import label_color
-from gsjax.viz.viewer import Shots, Viewable, open_viewer
+from gsjax.viz.viewer import Shots, Viewable, moved, open_viewer
 from gsjax.viz.viewer.cameras import first_pose
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -63,8 +63,11 @@ def scene() -> Viewable:
         gaussians,
         np.repeat([1, 2], 150),
         {1: "red ball", 2: "green ball"},
-        means=(means[None, :150] + rise).astype(np.float32),
-        quats=np.tile(np.array([1.0, 0, 0, 0], np.float32), (4, 150, 1)),
+        motion=moved(
+            gaussians,
+            (means[None, :150] + rise).astype(np.float32),
+            np.tile(np.array([1.0, 0, 0, 0], np.float32), (4, 150, 1)),
+        ),
         times=np.arange(4) / 10,
         shots=Shots(
             ("front", "left"),

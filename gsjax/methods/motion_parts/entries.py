@@ -1,7 +1,8 @@
 """Entries of a script: frozen dataclasses whose fields' metadata say how values are checked.
 
 `metadata["check"]` returns a value as it is kept, or raises a ValueError that says what was expected and what
-was found. `metadata["key"]` is the field's name in scripts where that is another one.
+was found. `metadata["wanted"]` says what that is, `metadata["key"]` is the field's name in scripts where that
+is another one, and `metadata["example"]` a value to begin with where there is no default.
 """
 
 import math
@@ -89,23 +90,24 @@ def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = f
             raise ValueError(f"expected {wanted}, found {told(value)}")
         return found
 
-    return {"check": check}
+    return {"check": check, "wanted": wanted}
 
 
 def whole(low: int, high: int) -> Checked:
     """A whole number from `low` to `high`."""
+    wanted = f"a whole number from {low} to {high}"
 
     def check(value: Any) -> int:
         if type(value) is not int or not low <= value <= high:
-            raise ValueError(f"expected a whole number from {low} to {high}, found {told(value)}")
+            raise ValueError(f"expected {wanted}, found {told(value)}")
         return value
 
-    return {"check": check}
+    return {"check": check, "wanted": wanted}
 
 
 def vector(wanted: str, least: float = 0.0) -> Checked:
     """Three numbers, of length `least` at least."""
-    one = number("")["check"]
+    one, wanted = number("")["check"], f"{wanted} as [x, y, z]"
 
     def check(value: Any) -> Vector:
         try:
@@ -114,9 +116,9 @@ def vector(wanted: str, least: float = 0.0) -> Checked:
                 return x, y, z
         except (TypeError, ValueError):
             pass
-        raise ValueError(f"expected {wanted} as [x, y, z], found {told(value)}")
+        raise ValueError(f"expected {wanted}, found {told(value)}")
 
-    return {"check": check}
+    return {"check": check, "wanted": wanted}
 
 
 def instance(kind: type, wanted: str) -> Checked:
@@ -127,7 +129,7 @@ def instance(kind: type, wanted: str) -> Checked:
             raise ValueError(f"expected {wanted}, found {told(value)}")
         return value
 
-    return {"check": check}
+    return {"check": check, "wanted": wanted}
 
 
 def part_list(value: Any) -> tuple[str | int, ...]:

@@ -46,7 +46,9 @@ class Edit(Entry):
         begin, end: `from` and `to`; None is the film's own.
     """
 
-    parts: tuple[str | int, ...] = field(metadata={"check": part_list})
+    parts: tuple[str | int, ...] = field(
+        metadata={"check": part_list, "wanted": "a name, a number, all, or several as [drawer, 2]"}
+    )
     begin: float | None = field(default=None, metadata=_SECONDS | {"key": "from"})
     end: float | None = field(default=None, metadata=_SECONDS | {"key": "to"})
 
@@ -99,7 +101,7 @@ class TimeEdit(Edit):
 class Speed(TimeEdit):
     """Parts go faster, slower or backwards."""
 
-    factor: float = field(metadata=_RATE)
+    factor: float = field(metadata=_RATE | {"example": 2})
 
     def ends(self, last: float) -> float:
         begin, end = self.stretch(last)
@@ -198,7 +200,7 @@ class Ghost(Fade):
 class Scale(LookEdit):
     """Parts are larger or smaller, about their handles."""
 
-    factor: float = field(metadata=_SIZE)
+    factor: float = field(metadata=_SIZE | {"example": 0.5})
 
     def changed(self, layer, parts, share):
         return edits.scale(layer.trajectory, parts, self.factor, share)
@@ -208,7 +210,7 @@ class Scale(LookEdit):
 class Move(LookEdit):
     """Parts are elsewhere, `by` so many metres along the axes of the world."""
 
-    by: Vector = field(metadata=vector("metres"))
+    by: Vector = field(metadata=vector("metres") | {"example": (0, 0, 0.1)})
 
     def changed(self, layer, parts, share):
         return edits.move(layer.trajectory, parts, jnp.array(self.by), share)
@@ -218,8 +220,8 @@ class Move(LookEdit):
 class Rotate(LookEdit):
     """Parts are turned on top of what they do, about their handles or a point of the canonical scene."""
 
-    axis: Vector = field(metadata=_AXIS)
-    degrees: float = field(metadata=_DEGREES)
+    axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
+    degrees: float = field(metadata=_DEGREES | {"example": 30})
     about: Vector | None = field(default=None, metadata=_POINT)
 
     def changed(self, layer, parts, share):
@@ -231,8 +233,8 @@ class Rotate(LookEdit):
 class Redirect(LookEdit):
     """What parts do is turned, not the parts: a lid opens to another side, a drawer slides another way."""
 
-    axis: Vector = field(metadata=_AXIS)
-    degrees: float = field(metadata=_DEGREES)
+    axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
+    degrees: float = field(metadata=_DEGREES | {"example": 30})
     about: Vector | None = field(default=None, metadata=_POINT)
     at: float | None = field(default=None, metadata=_SECONDS)
 
@@ -245,7 +247,7 @@ class Redirect(LookEdit):
 class Amplify(LookEdit):
     """Parts go so many times as far from where they were `at` a time, the film's start unless given."""
 
-    factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0))
+    factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
     at: float | None = field(default=None, metadata=_SECONDS)
 
     def changed(self, layer, parts, share):
@@ -288,12 +290,17 @@ class Place(Entry):
 class Composite(LookEdit):
     """Parts of another run are brought in, after `edits` of their own, and put in their `place`."""
 
-    from_run: str = field(metadata=instance(str, "the folder of a run"))
+    from_run: str = field(metadata=instance(str, "the folder of a run") | {"example": "runs/other"})
     place: Place = field(
         default=Place(),
-        metadata={"check": lambda value: value if isinstance(value, Place) else read(Place, value)},
+        metadata={
+            "check": lambda value: value if isinstance(value, Place) else read(Place, value),
+            "wanted": "where they are put, {to: [x, y, z], axis: [x, y, z], degrees: 90, scale: 1}",
+        },
     )
-    edits: tuple[Edit, ...] = field(default=(), metadata={"check": lambda value: read_edits(value)})
+    edits: tuple[Edit, ...] = field(
+        default=(), metadata={"check": lambda value: read_edits(value), "wanted": "a list of edits"}
+    )
 
     def joined(self, film: Film, other: Film, parts: list[int]) -> Film:
         """The film with `parts` of the other's first layer in it, and its further layers whole."""
@@ -318,15 +325,18 @@ OPERATIONS: dict[str, type[Edit]] = {
 """By their names in scripts."""
 
 
-def read_edits(found: Any) -> tuple[Edit, ...]:
+def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
     """Edits from a list of mappings, or of edits.
+
+    Args:
+        first: the number that messages call the first of them by.
 
     Raises:
         ValueError: an entry is not as expected; the message begins with its number and operation.
     """
     if not isinstance(found, (list, tuple)):
         raise ValueError(f"expected a list of edits, found {told(found)}")
-    return tuple(_read_edit(entry, number) for number, entry in enumerate(found, 1))
+    return tuple(_read_edit(entry, number) for number, entry in enumerate(found, first))
 
 
 def label(number: int, operation: str) -> str:

@@ -34,8 +34,9 @@ LoadScene = Callable[[str], tuple[Layer, Names]]
 """From the path of another run to its scene as it was found, and the names of its parts."""
 MOST_MOMENTS = 100_000
 """A film that is longer, if only while it is edited, is a slip."""
+ROUND = 256
+"""Moments: films are edited in multiples of these, so that a new length seldom compiles anything."""
 _INSTANT = 1e-6  # seconds; rounding must not add a moment
-_ROUND = 256  # moments: films are edited in multiples of these, so that a new length seldom compiles anything
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,15 +65,18 @@ def parse_script(text: str) -> Script:
     return read(Script, {} if found is None else found)
 
 
-def parse_op(text: str) -> Edit:
+def parse_op(text: str, number: int = 1) -> Edit:
     """One edit from one line: `speed:parts=drawer,factor=2` or `scale:parts=[1, lid],factor=0.5,from=1`.
+
+    Args:
+        number: that messages call it by.
 
     Raises:
         ValueError: as for `parse_script`.
     """
     operation, _, pairs = text.partition(":")
     pairs = re.sub(r"(^|,)\s*(\w+)\s*=", r"\1 \2: ", pairs)
-    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")])
+    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
     return edit
 
 
@@ -115,7 +119,7 @@ def _edited(
     longest = max(last for _, lasts in plan for last in lasts)
     dtype = layer.trajectory.times.dtype
     longer = _reaching(times, step, longest + step)
-    longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % _ROUND))
+    longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % ROUND))
     recorded = eqx.tree_at(
         lambda t: t.times, layer.trajectory, layer.trajectory.times - layer.trajectory.times[0]
     )

@@ -2,11 +2,23 @@
 
 The browser draws splats in one colour; beside them stands our own rasterizer's picture from the same camera.
 Files in the order in which the data flows: viewable (what is shown), pick, cameras, splats (what the browser
-gets), drawing (our picture), newest (threads), words, splat_nodes and shot_nodes, page, server.
+gets), drawing (our picture), newest (threads), words, splat_nodes and shot_nodes, edit_folder, page,
+server.
 """
 
 from gsjax.viz.viewer.pick import Picked, pick
 from gsjax.viz.viewer.server import Viewer, open_viewer
-from gsjax.viz.viewer.viewable import Shots, Viewable
+from gsjax.viz.viewer.viewable import Editing, Motion, Preview, Shots, Viewable, moved
 
-__all__ = ["Picked", "Shots", "Viewable", "Viewer", "open_viewer", "pick"]
+__all__ = [
+    "Editing",
+    "Motion",
+    "Picked",
+    "Preview",
+    "Shots",
+    "Viewable",
+    "Viewer",
+    "moved",
+    "open_viewer",
+    "pick",
+]

@@ -18,6 +18,8 @@ from gsjax.viz.colors import colorize_depth, to_uint8
 
 Shown = Literal["colour", "depth", "alpha", "label", "features"]
 
+_ROOM = 1.25  # times as many Gaussians as the first scene that has more than those before it
+_INVISIBLE = -40.0  # a logit
 _HEADROOM = 1.5  # what a plan holds more than its first camera needs: the next ones need about as much
 _OPAQUE = 0.5  # pixels with less alpha have no depth
 
@@ -37,7 +39,8 @@ class Drawn(NamedTuple):
 
 
 class Drawer:
-    """Draws scenes of one kind; any thread may call it.
+    """Draws scenes of one kind; any thread may call it. One that has fewer Gaussians than one before it is
+    filled up with what cannot be seen, for a number of Gaussians costs seconds to compile.
 
     Args:
         background: RGB, 0 to 1.
@@ -53,7 +56,7 @@ class Drawer:
     ):
         self._background = np.array([background], np.float32)
         self._mode = "antialiased" if antialiased else "classic"
-        self._plans: dict[tuple[int, ...], Any] = {}
+        self._plans: dict[tuple[int, ...], dict[int, Any]] = {}
         self._lock = threading.Lock()
         self._program: Callable = jax.jit(_draw, compiler_options=compiler_options or {})
 
@@ -63,9 +66,12 @@ class Drawer:
         Raises:
             ValueError: no plan can hold what the camera sees.
         """
-        kind = (camera.width, camera.height, gaussians.num, gaussians.sh_degree)
+        kind, count = (camera.width, camera.height, gaussians.sh_degree), gaussians.num
         with self._lock:
-            plan = self._plans.get(kind)
+            plans = self._plans.setdefault(kind, {})
+            anew = int(_ROOM * count) if plans else count
+            room = min((known for known in plans if known >= count), default=anew)
+            gaussians, plan = _filled_up(gaussians, room), plans.get(room)
             if plan is None:
                 options = {"headroom": _HEADROOM, "rasterize_mode": self._mode}
                 plan = plan_render(gaussians, camera, **options)
@@ -74,9 +80,19 @@ class Drawer:
                     self._program(gaussians, camera, self._background, plan)
                 )
                 if not overflow:
-                    self._plans[kind] = plan
+                    plans[room] = plan
                     return Drawn(*images)
                 plan = plan.grown(int(needed), _HEADROOM)
+
+
+def _filled_up(gaussians: Gaussians, room: int) -> Gaussians:
+    """So many Gaussians, the last of which cannot be seen. On the host, where nothing is compiled for it."""
+    if room == gaussians.num:
+        return gaussians
+    rows = np.minimum(np.arange(room), gaussians.num - 1)
+    more = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
+    more.logit_opacities[gaussians.num :] = _INVISIBLE
+    return jax.tree.map(jnp.asarray, more)
 
 
 def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any) -> tuple[jax.Array, ...]:

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer import words
 from gsjax.viz.viewer.cameras import (
     Pose,
@@ -22,10 +21,11 @@ from gsjax.viz.viewer.cameras import (
     pose_of,
 )
 from gsjax.viz.viewer.drawing import Drawer, Shown, picture_of, recolored
+from gsjax.viz.viewer.edit_folder import EditFolder
 from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.pick import Picked, pick
 from gsjax.viz.viewer.shot_nodes import ShotNodes, shrunk
-from gsjax.viz.viewer.splat_nodes import Look, SplatNodes
+from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
 from gsjax.viz.viewer.splats import Palette, depth_range
 from gsjax.viz.viewer.viewable import Shots, Viewable
 
@@ -51,12 +51,16 @@ class Shared:
         drawer: our rasterizer, with what it has compiled.
         max_gaussians: that a browser gets.
         save: keeps screenshots; None offers them for download only.
+        closing: set when nobody can look any more, and films that are being kept are to end.
+        filming: held while one is: one at a time, whoever looks.
     """
 
     scene: Viewable
     drawer: Drawer
     max_gaussians: int
     save: Save | None
+    closing: threading.Event = field(default_factory=threading.Event)
+    filming: threading.Lock = field(default_factory=threading.Lock)
 
 
 class Page:
@@ -68,18 +72,18 @@ class Page:
     """
 
     def __init__(self, client: Any, shared: Shared):
-        self._client, self._shared, self._scene = client, shared, shared.scene
-        self._frame, self._picture, self._at = 0, None, (-1, self._scene.at(0))
+        self._client, self._shared, scene = client, shared, shared.scene
+        self._frame, self._picture = 0, None
+        self._now = Present(scene, Palette(scene), 0, scene.at(0))
         self._picked: Picked | None = None
         self._shot: int | None = None
-        self._photographed: tuple[int, int] | None = None
-        self._start = first_pose(self._scene)
+        self._photographed: tuple[Shots, int, int] | None = None
+        self._start = first_pose(scene)
         self._playing = threading.Event()
         self._closed = threading.Event()
         self._lock = threading.Lock()
-        self._palette = Palette(self._scene)
-        self._splats = SplatNodes(client.scene, self._scene, shared.max_gaussians)
-        self._shots = None if self._scene.shots is None else self._frusta(self._scene.shots)
+        self._splats = SplatNodes(client.scene, scene, shared.max_gaussians)
+        self._shots = None if scene.shots is None else self._frusta(scene.shots)
         self._build()
         self._send_splats()
         self._sender = Newest(self._send_splats, 0.0, 0.0)
@@ -93,13 +97,15 @@ class Page:
         self._closed.set()
         self._sender.close()
         self._renderer.close()
+        if self._edits is not None:
+            self._edits.close()
         if self._shots is not None:
             self._shots.close()
 
     # What stands on the page.
 
     def _build(self) -> None:
-        gui, scene = self._client.gui, self._scene
+        gui, scene = self._client.gui, self._shared.scene
         gui.add_markdown(words.heading(scene, min(scene.gaussians.num, self._shared.max_gaussians)))
         if scene.num_frames > 1:
             with gui.add_folder("Time"):
@@ -109,6 +115,10 @@ class Page:
                 self._play = gui.add_button("Play", color="gray")
                 self._slider.on_update(lambda _: self._to_frame(int(self._slider.value)))
                 self._play.on_click(lambda _: self._toggle_play())
+        self._edits = None
+        if scene.editing is not None and scene.num_frames > 1:
+            shared = self._shared
+            self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)
@@ -128,7 +138,9 @@ class Page:
         with panel.add_tab("Render by gsjax"):
             self._image = gui.add_image(np.full((208, 320, 3), 40, np.uint8), format="png")
             self._status = gui.add_markdown("compiling ...")
-            self._shown = gui.add_dropdown("Shows", self._shows())
+            extra = tuple(name for name in scene.colorings if name in ("label", "features"))
+            shows: tuple[Shown, ...] = ("colour", "depth", "alpha", *extra)
+            self._shown = gui.add_dropdown("Shows", shows)
             self._width = gui.add_dropdown("Width", WIDTHS, initial_value=_WIDTH, hint="In pixels")
             self._photograph = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
             self._shown.on_update(lambda _: self._renderer.ask())
@@ -150,11 +162,7 @@ class Page:
         def go(shot: int) -> None:
             self._visited.value = self._names[shot]  # which goes there
 
-        return ShotNodes(self._client.scene, shots, frustum_size(self._scene), go)
-
-    def _shows(self) -> tuple[Shown, ...]:
-        extra = tuple(name for name in self._scene.colorings if name in ("label", "features"))
-        return ("colour", "depth", "alpha", *extra)
+        return ShotNodes(self._client.scene, shots, frustum_size(self._shared.scene), go)
 
     # What happens when it is touched.
 
@@ -163,11 +171,24 @@ class Page:
         self._renderer.ask()
         self._sender.ask()
 
+    def _show(self, scene: Viewable | None) -> None:
+        """Show another film of the scene, or None: the scene itself again."""
+        scene = self._shared.scene if scene is None else scene
+        first, last = scene.at(0), scene.num_frames - 1  # what has to be compiled is, before it is shown
+        with self._lock:
+            self._frame = min(self._frame, last)
+            self._now = Present(scene, Palette(scene), 0, first)
+        self._slider.value = min(int(self._slider.value), last)
+        self._slider.max = max(last, 1)  # sliders have some length
+        self._to_frame(self._frame)
+
     def _to_frame(self, frame: int) -> None:
-        self._frame = frame
-        self._moment.content = words.moment(self._scene, frame)
-        if self._shots is not None:
-            self._shots.move(frame)
+        with self._lock:
+            scene = self._now.scene
+            self._frame = frame = min(frame, scene.num_frames - 1)
+        self._moment.content = words.moment(scene, frame)
+        if self._shots is not None and scene.shots is not None:
+            self._shots.move(scene.shots, frame)
         if self._picked is not None:  # it may have moved away from under the mark
             self._mark(None)
             self._told.content = words.HOW_TO_PICK
@@ -183,20 +204,20 @@ class Page:
 
     def _run(self) -> None:
         """Frame after frame, from the first again after the last."""
-        pause = frame_pause(self._scene.times)
-        while self._playing.is_set() and not self._closed.wait(pause):
-            self._slider.value = (int(self._slider.value) + 1) % self._scene.num_frames
+        while self._playing.is_set() and not self._closed.wait(frame_pause(self._now.scene.times)):
+            self._slider.value = (int(self._slider.value) + 1) % self._now.scene.num_frames
         self._play.label = "Play"
 
     def _visit_named(self, name: str) -> None:
-        if self._scene.shots is not None and name in self._names:
-            self._visit(self._scene.shots, self._names.index(name))
+        now = self._present()
+        if now.scene.shots is not None and name in self._names:
+            self._visit(now, now.scene.shots, self._names.index(name))
 
-    def _visit(self, shots: Shots, shot: int) -> None:
+    def _visit(self, now: Present, shots: Shots, shot: int) -> None:
         """Look from where a photograph was taken; what draws shows it beside."""
         self._shot = shot
-        distance = distance_along(self._gaussians(), shots.viewmats[shots.at(self._frame), shot])
-        self._go(pose_of(shots, self._frame, shot, distance))
+        distance = distance_along(now.gaussians, shots.viewmats[shots.at(now.frame), shot])
+        self._go(pose_of(shots, now.frame, shot, distance))
         self._renderer.ask()
 
     def _go(self, pose: Pose) -> None:
@@ -208,9 +229,10 @@ class Page:
             camera.fov = pose.fov
 
     def _clicked(self, event: Any) -> None:
-        picked = pick(self._gaussians(), np.array(event.ray_origin), np.array(event.ray_direction))
+        now = self._present()
+        picked = pick(now.gaussians, np.array(event.ray_origin), np.array(event.ray_direction))
         self._mark(picked)
-        self._told.content = words.described(self._scene, picked, self._frame)
+        self._told.content = words.described(now.scene, picked, now.frame)
 
     def _mark(self, picked: Picked | None) -> None:
         """Show the shape of a picked Gaussian, or of none."""
@@ -219,7 +241,7 @@ class Page:
         self._picked = picked
         if picked is None:
             return
-        gaussians, row = self._gaussians(), picked.index
+        (scene, _, _, gaussians), row = self._present(), picked.index
         center = np.asarray(gaussians.means, np.float64)[row]
         quat = np.asarray(gaussians.quats, np.float64)[row]
         self._client.scene.add_icosphere(
@@ -231,26 +253,26 @@ class Page:
             position=center,
             cast_shadow=False,
         )
-        name = self._scene.name_of(row)
+        name = scene.name_of(row)
         text = f"{row}" if name is None else f"{name}, {row}"
         self._client.scene.add_label("/picked/name", text, position=center, anchor="bottom-left")
 
     # What two threads do.
 
-    def _gaussians(self) -> Gaussians:
-        """The scene in the present frame."""
+    def _present(self) -> Present:
+        """What is to be shown now."""
         with self._lock:
-            if self._at[0] != self._frame:
-                frame = self._frame
-                self._at = (frame, self._scene.at(frame))
-            return self._at[1]
+            if self._now.frame != self._frame:
+                gaussians = self._now.scene.at(self._frame)
+                self._now = self._now._replace(frame=self._frame, gaussians=gaussians)
+            return self._now
 
-    def _view(self, width: int) -> tuple[Any, tuple[float, float] | None]:
+    def _view(self, now: Present, width: int) -> tuple[Any, tuple[float, float] | None]:
         """The browser's camera in a picture so wide, and the scale of depth in it."""
         camera = self._client.camera
         width, height = picture_size(width, (camera.image_width, camera.image_height))
         seen = browser_camera(camera.wxyz, camera.position, camera.fov, width, height)
-        means = np.asarray(self._gaussians().means)
+        means = np.asarray(now.gaussians.means)
         return seen, depth_range(means, np.asarray(seen.viewmat[0]), camera.fov, width / height)
 
     def _send_splats(self) -> None:
@@ -260,53 +282,54 @@ class Page:
             self._say("The splats cannot be shown", str(error), color="red")
 
     def _recolor(self) -> None:
-        coloring = self._coloring.value
+        now, coloring = self._present(), self._coloring.value
         look = Look(coloring)
         if coloring == "depth":
-            seen, depths = self._view(int(_WIDTH))
+            seen, depths = self._view(now, int(_WIDTH))
             look = Look(coloring, np.asarray(seen.viewmat[0], np.float64), depths)
-        self._splats.show(self._gaussians(), self._frame, look)
-        labels = [] if self._scene.labels is None else np.unique(self._scene.labels).tolist()
-        self._legend.content = words.legend(self._scene, coloring, look.depths, labels)
+        self._splats.show(now, look)
+        labels = [] if now.scene.labels is None else np.unique(now.scene.labels).tolist()
+        self._legend.content = words.legend(now.scene, coloring, look.depths, labels)
         self._legend.visible = bool(self._legend.content)
 
     def _render(self) -> None:
         try:
-            camera, depths = self._view(int(self._width.value))
-            gaussians, shown = self._gaussians(), self._shown.value
+            now, shown = self._present(), self._shown.value
+            camera, depths = self._view(now, int(self._width.value))
+            gaussians = now.gaussians
             if shown in ("label", "features"):
                 rows = np.arange(gaussians.num)
-                colors = self._palette(shown, np.asarray(gaussians.means), rows, None, None)
+                colors = now.palette(shown, np.asarray(gaussians.means), rows, None, None)
                 gaussians = recolored(gaussians, colors)
             drawn = self._shared.drawer(gaussians, camera)
             picture = picture_of(drawn, shown, depths)
             self._image.image = picture
             told = f"{camera.width} x {camera.height} pixels, all {gaussians.num:,} Gaussians"
             if shown == "depth" and depths is not None:
-                near, far = (words.length(value, self._scene.unit) for value in depths)
+                near, far = (words.length(value, now.scene.unit) for value in depths)
                 told += f"; bright: {near} away, dark: {far}"
             self._status.content = told
             self._picture = picture  # once all is said of it
-            self._show_photograph()
+            self._show_photograph(now)
         except Exception as error:  # in a thread of its own nobody else would hear of it
             self._status.content = f"This cannot be drawn: {error}"
 
-    def _show_photograph(self) -> None:
+    def _show_photograph(self, now: Present) -> None:
         """The photograph that was last gone to, of the present frame."""
-        shots, shot = self._scene.shots, self._shot
+        shots, shot = now.scene.shots, self._shot
         if shots is None or shots.load_image is None or shot is None:
             return
-        wanted = (shots.at(self._frame), shot)
-        if wanted == self._photographed:
+        row = shots.at(now.frame)
+        if (shots, row, shot) == self._photographed:
             return
-        self._photographed = wanted
+        self._photographed = (shots, row, shot)
         try:
-            picture = shots.load_image(*wanted)
+            picture = shots.load_image(row, shot)
         except (ValueError, OSError) as error:
             self._photograph.visible = False
             self._say("The photograph cannot be shown", str(error), color="red")
             return
-        when = f", frame {wanted[0]}" if len(shots.viewmats) > 1 else ""
+        when = f", {words.moment(now.scene, row)}" if len(shots.viewmats) > 1 else ""
         self._photograph.label = f"photograph {self._names[shot]}{when}"
         self._photograph.image = shrunk(picture, _PHOTOGRAPH)
         self._photograph.visible = True
@@ -321,7 +344,7 @@ class Page:
             )
         except (RuntimeError, TimeoutError):
             return None
-        return over(picture, self._scene.background)
+        return over(picture, self._shared.scene.background)
 
     def _keep(self, kind: str, picture: np.ndarray | None) -> None:
         if picture is None:

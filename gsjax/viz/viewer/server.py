@@ -30,7 +30,7 @@ class Viewer:
     def __init__(self, server: Any, shared: Shared, host: str):
         self._server, self._pages, self._lock = server, {}, threading.Lock()
         self._shared = shared
-        self._closed = threading.Event()
+        self._closed = shared.closing
         self.port: int = server.get_port()
         shown = f"[{host}]" if ":" in host else host
         self.url: str = f"http://{shown}:{self.port}"
@@ -43,7 +43,7 @@ class Viewer:
             pass
 
     def close(self) -> None:
-        """Let all browsers go, and free the port."""
+        """Let all browsers go, free the port, and end a film that is being kept after its present frame."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -54,6 +54,8 @@ class Viewer:
             page.close()
         with _hushed():
             self._server.stop()
+        with self._shared.filming:
+            pass
 
     def _come(self, client: Any) -> None:
         page = Page(client, self._shared)
@@ -110,7 +112,7 @@ def open_viewer(
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=_BRAND)
     server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(330)
+    server.gui.main_panel.set_width(330 if scene.editing is None else 400)
     server.scene.set_up_direction(scene_up(scene))
     server.scene.world_axes.visible = False
     pose = first_pose(scene)

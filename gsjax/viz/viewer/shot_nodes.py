@@ -41,8 +41,9 @@ class ShotNodes:
         for node in self._nodes:
             node.visible = visible
 
-    def move(self, frame: int) -> None:
-        """Put them where they stand in a frame."""
+    def move(self, shots: Shots, frame: int) -> None:
+        """Put them where they stand in a frame; `shots` are the same, perhaps at other times."""
+        self._shots = shots
         if len(self._shots.viewmats) > 1:
             for v, node in enumerate(self._nodes):
                 node.wxyz, node.position = self._pose(v, frame)

@@ -32,44 +32,68 @@ class Look(NamedTuple):
         )
 
 
+class Present(NamedTuple):
+    """What is shown at the moment.
+
+    Attributes:
+        scene: one of those that a page shows, one after the other.
+        palette: its colours.
+        frame: of it.
+        gaussians: all of the scene, in that frame.
+    """
+
+    scene: Viewable
+    palette: Palette
+    frame: int
+    gaussians: Gaussians
+
+
 class SplatNodes:
     """Splats of one browser; for one thread.
 
     Args:
         api: viser's scene of that browser.
-        scene: what is shown.
+        scene: what is shown at first.
         max_gaussians: the most opaque ones that are sent.
     """
 
     def __init__(self, api: Any, scene: Viewable, max_gaussians: int):
-        self._api, self._scene = api, scene
-        rows = most_opaque(scene.gaussians, max_gaussians)
+        self._api, self._most = api, max_gaussians
+        self._scale = browser_scale(scene.gaussians)
+        self._nodes: dict[str, Any] = {}
+        self._begin(scene)
+
+    def show(self, now: Present, look: Look) -> None:
+        """Send what differs from what the browser has.
+
+        Args:
+            now: what is shown; another scene than before takes its place.
+            look: how it is coloured.
+        """
+        if now.scene is not self._scene:
+            self._begin(now.scene)
+        for name, rows in self._rows.items():
+            if len(rows) == 0:
+                self._remove(name)
+            elif not self._has(name, now.frame, look):
+                part = splats(rows_of(now.gaussians, rows), self._scale)
+                means = np.asarray(now.gaussians.means)
+                colors = now.palette(look.coloring, means, rows, look.viewmat, look.depths)
+                self._send(name, part.centers, part.covariances, colors, part.opacities)
+                self._sent[name] = (now.frame, look)
+
+    def _begin(self, scene: Viewable) -> None:
+        rows = most_opaque(scene.gaussians, self._most)
+        self._scene = scene
         self._rows = {
             "moving": rows[rows < scene.num_moving],
             "still": rows[rows >= scene.num_moving],
         }
-        self._scale = browser_scale(scene.gaussians)
-        self._palette = Palette(scene)
         self._sent: dict[str, tuple[int, Look]] = {}
-        self._nodes: dict[str, Any] = {}
 
-    def show(self, gaussians: Gaussians, frame: int, look: Look) -> None:
-        """Send what differs from what the browser has.
-
-        Args:
-            gaussians: all of the scene, in that frame.
-            frame: which.
-            look: how they are coloured.
-        """
-        for name, rows in self._rows.items():
-            if len(rows) == 0 or self._has(name, frame, look):
-                continue
-            part = splats(rows_of(gaussians, rows), self._scale)
-            colors = self._palette(
-                look.coloring, np.asarray(gaussians.means), rows, look.viewmat, look.depths
-            )
-            self._send(name, part.centers, part.covariances, colors, part.opacities)
-            self._sent[name] = (frame, look)
+    def _remove(self, name: str) -> None:
+        if name in self._nodes:
+            self._nodes.pop(name).remove()
 
     def _has(self, name: str, frame: int, look: Look) -> bool:
         if name not in self._sent:

@@ -1,8 +1,9 @@
-"""What a viewer shows, as arrays: Gaussians, where they go, their names, and who photographed them."""
+"""What a viewer shows: Gaussians, where they go, their names, who photographed them, and how to edit them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -49,6 +50,69 @@ class Shots:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """How a scene changes from frame to frame; `moved` makes it from arrays.
+
+    Attributes:
+        num_frames: how many there are.
+        num_moving: so many Gaussians, from the first on, may differ between frames, but for their colours.
+        at: frame -> all Gaussians.
+    """
+
+    num_frames: int
+    num_moving: int
+    at: Callable[[int], Gaussians] = field(repr=False)
+
+
+def moved(gaussians: Gaussians, means: Float[np.ndarray, "..."], quats: Float[np.ndarray, "..."]) -> Motion:
+    """The first M Gaussians go elsewhere in each frame, and the others stand still.
+
+    Args:
+        gaussians: N of them.
+        means: centres of the first M, [T,M,3].
+        quats: their orientations, [T,M,4].
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+    frames, moving = means.shape[:2]
+    if frames == 0 or moving > gaussians.num:
+        raise ValueError(f"means: got shape {means.shape}, want [T,M,3], T from 1 on, M to {gaussians.num}")
+    _check("means", means, (frames, moving, 3))
+    _check("quats", quats, (frames, moving, 4))
+
+    def at(frame: int) -> Gaussians:
+        there = jnp.asarray(gaussians.means).at[:moving].set(means[frame])
+        turned = jnp.asarray(gaussians.quats).at[:moving].set(quats[frame])
+        return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (there, turned))
+
+    return Motion(frames, moving, at)
+
+
+@dataclass(frozen=True, eq=False)
+class Editing:
+    """How a scene can be edited. An edit is a line of text; they are done one after the other.
+
+    Attributes:
+        operations: by name, lines that say what each does and what it wants.
+        parts: what lines call the things that can be edited, by what to call them on the page.
+        cameras: names of those that can film; the first does unless told otherwise.
+        begin: (operation, part) -> a line to begin with.
+        preview: lines -> what they make of the scene. A ValueError or an OSError of it says what cannot be
+            done, as do those of `save`.
+        save: (lines, name, camera, goes_on) -> where the film is kept that they make; none is written over.
+            `goes_on(done, asked)` is asked after each frame, and ends the film where it is False.
+    """
+
+    operations: Mapping[str, Sequence[str]]
+    parts: Mapping[str, str]
+    cameras: tuple[str, ...]
+    begin: Callable[[str, str], str]
+    preview: Callable[[Sequence[str]], "Preview"]
+    save: Callable[[Sequence[str], str, str, Callable[[int, int], bool]], Path]
+
+
+@dataclass(frozen=True, eq=False)
 class Viewable:
     """A scene to look at. What it does not have is None, and the page does not offer it.
 
@@ -57,14 +121,14 @@ class Viewable:
         gaussians: the scene, of the first frame where there is time; rows that cannot be drawn are an error.
         labels: of each Gaussian, [N] integers; 0 is the background.
         names: of the labels.
-        means: centres of the first M Gaussians over time, [T,M,3]; the others stand still.
-        quats: their orientations, [T,M,4].
+        motion: where they go, in T frames.
         times: seconds of each frame, [T].
         shots: the photographs.
         up: which way is up, [3]; taken from the photographs, else +z, unless given.
         background: RGB behind the scene, 0 to 1.
         antialiased: whether it was fitted with `rasterize_mode="antialiased"`.
         unit: of lengths, as in "m"; empty where only their proportions are known.
+        editing: how it can be edited.
 
     Raises:
         ValueError: shapes disagree, there is no Gaussian, or one holds a number that is not finite.
@@ -74,14 +138,14 @@ class Viewable:
     gaussians: Gaussians
     labels: Int[np.ndarray, "..."] | None = None
     names: Mapping[int, str] = field(default_factory=dict)
-    means: Float[np.ndarray, "..."] | None = None
-    quats: Float[np.ndarray, "..."] | None = None
+    motion: Motion | None = None
     times: Float[np.ndarray, "..."] | None = None
     shots: Shots | None = None
     up: Float[np.ndarray, "..."] | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antialiased: bool = False
     unit: str = ""
+    editing: Editing | None = None
 
     def __post_init__(self):
         count = self.gaussians.num
@@ -94,28 +158,18 @@ class Viewable:
             )
         if self.labels is not None:
             _check("labels", self.labels, (count,))
-        if (self.means is None) != (self.quats is None):
-            raise ValueError("means and quats over time: expected both or none, found one of them")
-        if self.means is not None:
-            frames, moving = self.means.shape[:2]
-            if frames == 0 or moving > count:
-                raise ValueError(
-                    f"means: got shape {self.means.shape}, want [T,M,3], T from 1 on, M to {count}"
-                )
-            _check("means", self.means, (frames, moving, 3))
-            _check("quats", self.quats, (frames, moving, 4))
         if self.times is not None:
             _check("times", self.times, (self.num_frames,))
 
     @property
     def num_frames(self) -> int:
         """How many frames there are; 1 where nothing moves."""
-        return 1 if self.means is None else len(self.means)
+        return 1 if self.motion is None else self.motion.num_frames
 
     @property
     def num_moving(self) -> int:
         """How many Gaussians, from the first on, may differ from frame to frame."""
-        return 0 if self.means is None or self.num_frames == 1 else self.means.shape[1]
+        return 0 if self.motion is None or self.num_frames == 1 else self.motion.num_moving
 
     @property
     def colorings(self) -> tuple[Coloring, ...]:
@@ -129,13 +183,8 @@ class Viewable:
 
     def at(self, frame: int) -> Gaussians:
         """The Gaussians in a frame, without features, which are not drawn."""
-        gaussians = eqx.tree_at(lambda g: g.features, self.gaussians, None, is_leaf=lambda leaf: leaf is None)
-        if self.means is None or self.quats is None:
-            return gaussians
-        moving = self.means.shape[1]
-        means = jnp.asarray(self.gaussians.means).at[:moving].set(self.means[frame])
-        quats = jnp.asarray(self.gaussians.quats).at[:moving].set(self.quats[frame])
-        return eqx.tree_at(lambda g: (g.means, g.quats), gaussians, (means, quats))
+        gaussians = self.gaussians if self.motion is None else self.motion.at(frame)
+        return eqx.tree_at(lambda g: g.features, gaussians, None, is_leaf=lambda leaf: leaf is None)
 
     def name_of(self, index: int) -> str | None:
         """What the thing is called that a Gaussian belongs to; None without labels."""
@@ -143,6 +192,18 @@ class Viewable:
             return None
         label = int(self.labels[index])
         return self.names.get(label, "background" if label == 0 else f"object {label}")
+
+
+class Preview(NamedTuple):
+    """What edits make of a scene.
+
+    Attributes:
+        scene: to look at.
+        doubts: what may look wrong in it, a sentence each.
+    """
+
+    scene: Viewable
+    doubts: Sequence[str] = ()
 
 
 def most_opaque(gaussians: Gaussians, count: int) -> Int[np.ndarray, "kept"]:

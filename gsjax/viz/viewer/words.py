@@ -1,6 +1,7 @@
 """What the page of a viewer says, as Markdown and HTML."""
 
 import html
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -44,6 +45,13 @@ def moment(scene: Viewable, frame: int) -> str:
         return f"frame {frame} of 0 to {scene.num_frames - 1}"
     since = scene.times[frame] - scene.times[0]
     return f"{since:.2f} s of {scene.times[-1] - scene.times[0]:.2f} s"
+
+
+def length_of(scene: Viewable) -> str:
+    """How long a film is, and of how much."""
+    frames, count = scene.num_frames, scene.gaussians.num
+    lasts = "" if scene.times is None else f"{scene.times[-1] - scene.times[0]:.2f} s, "
+    return f"{lasts}{frames} frames, {count:,} Gaussians"
 
 
 def described(scene: Viewable, picked: Picked | None, frame: int) -> str:
@@ -95,6 +103,20 @@ def _chip(label: int, scene: Viewable) -> str:
     name = scene.names.get(label, "background" if label == 0 else f"object {label}")
     dot = f'<span style="color: {color}; font-size: 1.3em; vertical-align: -0.08em">&#9679;</span>'
     return f'<span style="white-space: nowrap; margin-right: 0.5em">{dot} {html.escape(name)}</span>'
+
+
+def lines(told: Sequence[str], color: str = "inherit") -> str:
+    """Sentences as HTML, one below the other."""
+    return _small("".join(f'<div style="color: {color}">{html.escape(line)}</div>' for line in told))
+
+
+def explained(told: Sequence[str]) -> str:
+    """What an operation does and what its keys want ("key: what"), as HTML."""
+    does, *keys = (re.sub("`(.+?)`", r"<b>\1</b>", html.escape(line)) for line in told)
+    pairs = (line.partition(": ") for line in keys)
+    return _small(
+        "".join([f"<div>{does}</div>", *(f"<div><b>{key}</b> {wants}</div>" for key, _, wants in pairs)])
+    )
 
 
 def _small(text: str) -> str:

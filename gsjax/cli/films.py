@@ -1,0 +1,153 @@
+"""The film that edits make of a run of `gsjax parts`, and its folder, whoever asks for it."""
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.messages import Notes
+from gsjax.cli.parts_run import PartsRun, read_parts
+from gsjax.geometry.cameras import Camera
+from gsjax.io.atomic import atomic_write, write_json
+from gsjax.io.ply import write_ply
+from gsjax.io.video import VideoWriter
+from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
+from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.motion_parts.timeline import ROUND, Script, apply, to_yaml
+from gsjax.methods.motion_parts.trajectory import Trajectory
+from gsjax.optim.compiler import host_options
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import render_with_room
+
+SCRIPT = "edit.yaml"
+"""What tells the folder of a film from others."""
+_VIDEO, _METRICS, _PLY = "video.mp4", "metrics.json", "ply"
+
+
+class Shot(NamedTuple):
+    """A frame of a film.
+
+    Attributes:
+        image: as the camera sees it.
+        gaussians: what is there.
+        seconds: that both took; None where something was compiled.
+    """
+
+    image: Float[np.ndarray, "height width 3"]
+    gaussians: Gaussians
+    seconds: float | None
+
+
+Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
+"""Passes on the frames of a film, of which there are so many; a KeyboardInterrupt from it ends the film."""
+
+
+def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
+    """The film that a script makes of a run, and what makes it doubtful, a sentence each.
+
+    Raises:
+        ValueError, OSError: there is no such part or other run, or the edits cannot be done.
+    """
+    film = apply(script, saved.layer, saved.names, read_parts)
+    recorded, now = saved.layer, film[0].trajectory
+    doubts = []
+    if not saved.complete:
+        frames = len(recorded.trajectory.times)
+        doubts.append(f"{saved.path} is a partial run: only {frames} of its frames are there")
+    beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
+    if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
+        doubts.append(". ".join(beyond))
+    return film, doubts
+
+
+def write_film(
+    folder: Path,
+    script: Script,
+    film: Film,
+    saved: PartsRun,
+    camera: int,
+    notes: Notes,
+    *,
+    watch: Watch,
+    ply: bool = False,
+) -> dict[str, Any]:
+    """Film it: the script, a video and what is known of it take the place of an earlier film in the folder.
+
+    Args:
+        camera: the id of that which films.
+        notes: of the film.
+        ply: write the Gaussians of each frame too.
+
+    Returns:
+        What is known of it, as in its metrics.json. It is not `complete` if it was stopped; what there is of
+        it can be watched.
+    """
+    _clear(folder)
+    with atomic_write(folder / SCRIPT) as temporary:
+        temporary.write_text(to_yaml(script), encoding="utf-8")
+    sequence = saved.recording.judged
+    view = sequence.camera(0, sequence.camera_ids.index(camera))
+    fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
+    seconds, stopped = [], False
+    with VideoWriter(folder / _VIDEO, fps) as video:
+        try:
+            for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
+                if ply:
+                    write_ply(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians)
+                video.write(shot.image)
+                seconds.append(shot.seconds)
+        except KeyboardInterrupt:
+            stopped = True
+            notes.add(f"This film is not complete: it was stopped after {len(seconds)} frames by Ctrl-C.")
+    warm = [each for each in seconds if each is not None]
+    found = {
+        "kind": "edit",
+        "dataset": sequence.name,
+        "run": str(saved.path.absolute()),
+        "complete": not stopped,
+        "camera": camera,
+        "frames": len(seconds),
+        "fps": fps,
+        "seconds": len(seconds) / fps,
+        "num_gaussians": sum(layer.scene.gaussians.num for layer in film),
+        "render_hz": 1 / float(np.median(warm)) if warm else None,
+        "machine": describe_machine(),
+        "notes": notes.all,
+    }
+    write_json(folder / _METRICS, found)
+    return found
+
+
+def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
+    """A film as a camera sees it, frame by frame."""
+    placed = jax.jit(film_gaussians, static_argnames="blend", compiler_options=host_options())
+    cameras, plan = jax.tree.map(lambda leaf: leaf[None], camera), None
+    for t in range(len(film[0].trajectory.times)):
+        begun, before = perf_counter(), plan
+        gaussians = placed(film, jnp.asarray(t), blend=saved.blend)
+        drawn, plan = render_with_room(gaussians, cameras, plan)
+        image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
+        yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)
+
+
+def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
+    """`beyond_captured`, of a film of any length by a program that is there already."""
+    length = len(now.times)
+    rows = np.minimum(np.arange(length + -length % ROUND), length - 1)
+    longer = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), now)
+    return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
+
+
+def _clear(folder: Path) -> None:
+    """Removes what an earlier film left there."""
+    for name in (SCRIPT, _VIDEO, _METRICS):
+        (folder / name).unlink(missing_ok=True)
+    if (folder / _PLY).is_dir():
+        shutil.rmtree(folder / _PLY)
