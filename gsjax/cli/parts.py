@@ -3,11 +3,13 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
+from jaxtyping import Bool, Int
 from rich.console import Console
 
 from gsjax.cli import fit as fit_command
@@ -17,7 +19,7 @@ from gsjax.cli.parts_results import finished, print_results, write_results
 from gsjax.cli.parts_resume import Saver, load
 from gsjax.cli.recording import Recording, located, open_recording, parse_frames
 from gsjax.cli.run_folder import RunFolder, expect_dataset, expect_run, is_run
-from gsjax.data import ReadOptions
+from gsjax.data import ReadOptions, Sequence
 from gsjax.io.ply import read_ply
 from gsjax.methods.motion_parts import (
     Anchor,
@@ -26,10 +28,13 @@ from gsjax.methods.motion_parts import (
     begin,
     choose_anchor,
     first_parts,
+    masks_of_labels,
     moved_pixels,
     without_needless,
 )
+from gsjax.methods.protocols import Segmenter
 from gsjax.methods.reconstruction import FitConfig, StartConfig
+from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
@@ -57,6 +62,12 @@ class Options:
     """Look at pictures this many times smaller, as in 0.5; all of them, the held-out ones too."""
     anchor: int | None = None
     """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
+    masks: Literal["segment", "files"] = "segment"
+    """Who says what belongs together in the anchor's pictures: a segmenter, or the recording's own masks,
+    whose labels must mean the same in all cameras."""
+    sam: Path | None = None
+    """Folder of SAM's weights (as of facebook/sam-vit-base): let it segment, and not the segmenter that needs
+    none. Takes the extra `foundation`."""
     scene: Path | None = None
     """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Fitted unless
     given, into RUN/canonical."""
@@ -92,6 +103,7 @@ def run(options: Options) -> int:
             options.scale,
         )
         _check(options, recording)
+        segmenter = _segmenter(options)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
@@ -109,6 +121,7 @@ def run(options: Options) -> int:
                 frames=discover.frames,
                 threshold=discover.threshold,
             )
+        masks = _masks(tracked, anchor, moved, options)
         notes.add(
             f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
         )
@@ -119,7 +132,7 @@ def run(options: Options) -> int:
         seconds["canonical"], at = perf_counter() - at, perf_counter()
         with stage(console, "finding what may move, in all views"):
             key = jax.random.key(options.parts.seed)
-            start = begin(tracked, gaussians, anchor, moved, options.parts, PieceSegmenter(), key)
+            start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
         _say_if_odd(start, moved.mean(), options, notes)
         parts = first_parts(start, tracked.num_frames, options.parts)
         seconds["discovery"] = perf_counter() - at
@@ -163,8 +176,40 @@ def _check(options: Options, recording: Recording) -> None:
         raise ValueError(
             f"--frames: expected 2 or more, between which something moves, found {options.frames}"
         )
+    if options.sam is not None and options.masks == "files":
+        raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
     if options.scene is not None and options.anchor is None:
         raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
+
+
+def _segmenter(options: Options) -> Segmenter:
+    try:
+        return PieceSegmenter() if options.sam is None else load_sam(options.sam)
+    except ImportError as error:
+        raise ValueError(f"--sam: {error}") from error
+
+
+def _masks(
+    sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C H W"], options: Options
+) -> Int[np.ndarray, "C H W"] | None:
+    """What moves by the recording's own masks; None where a segmenter is to say."""
+    if options.masks == "segment":
+        return None
+    labels = [sequence.mask(anchor.frame, c) for c in range(sequence.num_cameras)]
+    missing = [camera for camera, mask in zip(sequence.camera_ids, labels, strict=True) if mask is None]
+    if missing:
+        raise ValueError(
+            f"--masks files: expected a mask of frame {sequence.frame_ids[anchor.frame]} for each camera, "
+            f"found none for {', '.join(map(str, missing))}; name other --cameras, or use --masks segment"
+        )
+    known = [label for label in labels if label is not None]
+    masks = masks_of_labels(np.stack(known), moved, options.parts.discover.most_parts)
+    if not masks.any():
+        raise ValueError(
+            "--masks files: expected a label of which a third of the pixels changes in other frames, found "
+            "none; use --masks segment"
+        )
+    return masks
 
 
 def _canonical(

@@ -1,12 +1,15 @@
 """`gsjax parts` from a built-in scene to a report; stopped in the middle it goes on to the same bits."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import gsjax.cli.parts
 import gsjax.cli.parts_loop
 from gsjax.cli import main
+from gsjax.cli.recording import open_recording
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
 
@@ -141,7 +144,33 @@ def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
     code, said = gsjax_parts("--frames", "0:3", "--anchor", "7")
     assert code == 2
     assert "anchor: expected a frame from 0 to 2, found 7" in said
+    code, said = gsjax_parts("--frames", "0:3", "--masks", "files", "--sam", str(tmp_path))
+    assert code == 2
+    assert "--sam: expected --masks segment" in said
+    code, said = gsjax_parts("--frames", "0:3", "--sam", str(tmp_path / "nowhere"))
+    assert code == 2
+    assert f"{tmp_path / 'nowhere'}: expected a folder of SAM's weights" in said
     assert not (tmp_path / "run" / "parts.npz").exists()
+
+
+def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
+    def maskless(*arguments):
+        recording = open_recording(*arguments)
+        return replace(recording, tracked=replace(recording.tracked, load_mask=None))
+
+    monkeypatch.setattr(gsjax.cli.parts, "open_recording", maskless)
+    code, said = gsjax_parts("--frames", "0:24:8", "--masks", "files")
+    assert code == 2
+    assert "--masks files: expected a mask of frame" in said
+    assert "for each camera, found none for 0, 1, 2, 3" in said
+
+
+@pytest.mark.slow
+def test_masks_of_the_recording_say_which_parts_there_are(gsjax_parts, tmp_path):
+    code, said = gsjax_parts(*QUICK, "--masks", "files", "--parts.unify.every", "0")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert 2 <= found["pieces"] <= 4  # drawer, door, lid and box, but for what does not change enough
 
 
 def test_a_scene_in_which_nothing_moves(gsjax_parts, tmp_path):

@@ -9,7 +9,12 @@ from gsjax.methods.motion_parts.anchor import choose_anchor, difference_image, m
 from gsjax.methods.motion_parts.config import DiscoverConfig, PartsConfig
 from gsjax.methods.motion_parts.discover import begin, pixel_width
 from gsjax.methods.motion_parts.lift import label_votes, lift_masks
-from gsjax.methods.motion_parts.masks import moving_segments, order_of_views, propagated_masks
+from gsjax.methods.motion_parts.masks import (
+    masks_of_labels,
+    moving_segments,
+    order_of_views,
+    propagated_masks,
+)
 from gsjax.methods.motion_parts.stream import skinning_weights
 from gsjax.methods.motion_parts.weights import new_field, saying, weights_of
 from gsjax.scene.feature_grid import FeatureGridConfig
@@ -91,6 +96,18 @@ def test_segments_count_by_the_share_that_changed():
     moved = np.zeros((1, 40), bool)
     moved[0, :10] = moved[0, 10:12] = moved[0, 20:24] = True
     np.testing.assert_array_equal(np.unique(moving_segments(segments, moved)), [0, 2])
+
+
+def test_labels_of_all_views_count_by_what_changed_in_all():
+    """Number 1 is the largest; what changed in one view alone may change too little over all."""
+    labels = np.array([[[7, 7, 7, 7], [3, 3, 5, -1]], [[7, 7, 5, 5], [5, 5, 5, 3]]])
+    moved = labels == 7
+    moved[0, 1, :2] = True  # two of three pixels of 3, none of 5
+    np.testing.assert_array_equal(
+        masks_of_labels(labels, moved, 9), [[[1, 1, 1, 1], [2, 2, 0, 0]], [[1, 1, 0, 0], [0, 0, 0, 2]]]
+    )
+    np.testing.assert_array_equal(masks_of_labels(labels, moved, 1), labels == 7)
+    assert not masks_of_labels(labels, np.zeros_like(moved), 9).any()
 
 
 def test_views_are_taken_around():

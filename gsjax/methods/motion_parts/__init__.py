@@ -27,6 +27,7 @@ from gsjax.methods.motion_parts.config import (
 from gsjax.methods.motion_parts.discover import Start, Views, begin
 from gsjax.methods.motion_parts.finish import outcome, without_needless
 from gsjax.methods.motion_parts.follow import Followed, Parts, first_parts, follow
+from gsjax.methods.motion_parts.masks import masks_of_labels
 from gsjax.methods.motion_parts.refine import Refined, refine
 from gsjax.methods.motion_parts.stream import Canonical, StreamBatch, StreamParams, stream_loss, stream_step
 from gsjax.methods.motion_parts.trajectory import (
@@ -64,6 +65,7 @@ __all__ = [
     "first_parts",
     "follow",
     "gaussians_at",
+    "masks_of_labels",
     "moment",
     "moved_pixels",
     "outcome",

@@ -95,6 +95,21 @@ def propagated_masks(
     return _by_size(np.stack([masks[c] for c in range(len(pictures))]), most)
 
 
+def masks_of_labels(
+    labels: Int[np.ndarray, "C H W"], moved: Bool[np.ndarray, "C H W"], most: int
+) -> Int[np.ndarray, "C H W"]:
+    """Masks from labels that mean the same in all views: those of which enough changed, over all views, by
+    numbers from the largest to the smallest.
+
+    Args:
+        labels: 0 and below is nothing.
+        moved: from `moved_pixels`.
+        most: how many numbers there may be; those of fewest pixels are dropped.
+    """
+    flat = np.maximum(labels, 0).reshape(-1, labels.shape[-1])
+    return _by_size(moving_segments(flat, moved.reshape(flat.shape)).reshape(labels.shape), most)
+
+
 def _by_size(masks: Int[np.ndarray, "C H W"], most: int) -> Int[np.ndarray, "C H W"]:
     sizes = np.bincount(masks.ravel())
     sizes[0] = 0
