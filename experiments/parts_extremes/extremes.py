@@ -68,7 +68,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
             row = discovered(case)
         except ValueError as error:
             nothing = dict.fromkeys(("skipped", "parts", "block_mm", "box_mm", "update_s"))
-            return nothing | {"finite": "-", "said": f"error: {error}"}
+            return nothing | {"finite": None, "said": f"error: {error}"}
     told = dict.fromkeys(str(one.message) for one in caught if one.category is UserWarning)
     return row | {"said": "; ".join(told)}
 
@@ -90,7 +90,7 @@ def discovered(case: Case) -> dict[str, Any]:
     everything = jax.tree.leaves(eqx.filter((scene, trajectory), eqx.is_inexact_array))
     block, box = (_error_mm(case, scene, trajectory, label) for label in (BLOCK, BOX))
     return {
-        "finite": "yes" if all(bool(jnp.isfinite(leaf).all()) for leaf in everything) else "NO",
+        "finite": all(bool(jnp.isfinite(leaf).all()) for leaf in everything),
         "skipped": skipped,
         "parts": len(np.unique(np.asarray(scene.labels))) - 1,
         "block_mm": block,
