@@ -23,6 +23,8 @@ from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.optical_flow import DisFlow
 from gsjax.scene.gaussians import Gaussians
 
+FOUND_IOU = 0.5
+
 
 def canonical_of(options: Options, folder: Path) -> Path:
     """The run of `gsjax fit` at the options' anchor, made once for several cells; beside `folder`.
@@ -31,7 +33,7 @@ def canonical_of(options: Options, folder: Path) -> Path:
         options: of `gsjax parts`, with an anchor.
         folder: of a cell.
     """
-    assert options.anchor is not None
+    assert (options.anchor is not None, options.frames, options.scale) == (True, ":", 1.0)
     asked = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
     path = folder.parent / f"canonical-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
     if not (path / "report.html").is_file():
@@ -53,19 +55,21 @@ def canonical_of(options: Options, folder: Path) -> Path:
 def discovered(options: Options) -> dict[str, Any]:
     """What `gsjax parts` found, in a row: parts, motion and joints against the truth, and pictures.
 
-    `joints` counts parts whose kind of joint was found, of those that have one; errors are over the parts
-    that were found.
+    `true_found` counts true parts with which half of a found one overlaps (IoU of Gaussians), `joints` those
+    whose kind of joint was found, of those that have one. Errors are over all true parts that overlap with a
+    found one at all; one that does not is in no mean, and `parts` and the index tell.
     """
     run_parts(options)
     found = json.loads((options.out / "metrics.json").read_text())
     matched = [row for row in found["parts"] if row.get("true_name")]
+    whole = [row for row in matched if row["iou"] >= FOUND_IOU]
     jointed = [row for row in matched if row.get("same_kind")]
     points = [row["median_point_error_mm"] for row in matched]
     turning = [row for row in jointed if row["kind"] == "revolute"]
     row = {
         "ari": found["ari"],
         "parts": found["num_parts"],
-        "true_found": None if found["ari"] is None else len(matched),
+        "true_found": None if found["ari"] is None else len(whole),
         "point_mm": float(np.mean(points)) if points else None,
         "worst_point_mm": max(points, default=None),
         "joints": len(jointed),

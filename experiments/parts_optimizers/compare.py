@@ -34,7 +34,8 @@ from gsjax.methods.motion_parts import (
     stream_step,
 )
 from gsjax.methods.motion_parts.follow import seen_at
-from gsjax.methods.motion_parts.residual import motions_of_handles, pose_of, pose_residual
+from gsjax.methods.motion_parts.residual import pose_residual
+from gsjax.methods.motion_parts.screws import motions_of, pose_of
 from gsjax.methods.motion_parts.stream import posed, skinning_weights
 from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
@@ -90,7 +91,8 @@ class Update(NamedTuple):
     def batch(self, size: int, cameras: tuple[int, ...], derivative: str) -> StreamBatch:
         """For one iteration that looks through some of the cameras."""
         frame = self.frames[size]
-        seen = seen_at(frame, self.canonical, self.weights, self.start, TILE // size)
+        at = self.canonical, self.weights, self.start
+        seen = seen_at(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
         plan = plan_render(posed(self.canonical, self.weights, self.start), frame.cameras, headroom=1.6)
         seen = jax.tree.map(lambda a: a[np.array(cameras)], seen)
         return StreamBatch(self.canonical, seen, replace(plan, derivative=derivative), self.weights)
@@ -197,7 +199,7 @@ def least_squares(
         return step.update(motions, state, batch, step=1.0, key=None)
 
     groups = np.random.default_rng(0).permutation(update.cameras).reshape(-1, most or len(update.cameras))
-    motions, poses, ms = motions_of_handles(update.start), [], []
+    motions, poses, ms = motions_of(update.start), [], []
     for size, count in ((HALF, COUNTS[-2]), (WHOLE, COUNTS[-1] - COUNTS[-2])):
         batches = [update.batch(size, tuple(sorted(group)), "forward") for group in groups.tolist()]
         state = step.init(motions)  # another problem from here on

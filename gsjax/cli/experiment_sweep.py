@@ -28,6 +28,7 @@ import yaml
 from gsjax.cli import machine
 from gsjax.cli.messages import describe
 from gsjax.io.atomic import write_json
+from gsjax.optim.compiler import forget_programs
 
 CONFIG, RESULTS = "config.yaml", "results.json"
 FIGURES = (".png", ".svg", ".jpg", ".webp")
@@ -216,6 +217,7 @@ def run_cell(experiment: Experiment, cell: Cell, script_run: Callable, debug: bo
     shutil.rmtree(folder, ignore_errors=True)  # a run that was stopped may have left half of something
     folder.mkdir(parents=True, exist_ok=True)
     made_with = experiment.made_with
+    forget_programs()  # of earlier cells
     result, error, trace, begun = None, None, [], perf_counter()
     try:
         result = script_run(copy.deepcopy(cell.options), cell.seed, folder)

@@ -108,7 +108,7 @@ def run(options: Options) -> int:
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
             folder.check_config(settings, but=_OF_NO_BEARING)
-        folder.write_config(settings)
+        given = None if options.scene is None else _read_scene(options.scene)
         seconds: dict[str, float] = {}
         tracked = recording.tracked
         with stage(console, "looking for what moves"):
@@ -122,11 +122,12 @@ def run(options: Options) -> int:
                 threshold=discover.threshold,
             )
         masks = _masks(tracked, anchor, moved, options)
+        folder.write_config(settings)  # from here on an earlier run is gone
         notes.add(
             f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
         )
         at = perf_counter()
-        gaussians = _canonical(settings, folder, anchor, recording, console)
+        gaussians = _fitted(settings, folder, anchor, recording, console) if given is None else given
         if gaussians is None:
             return 130
         seconds["canonical"], at = perf_counter() - at, perf_counter()
@@ -148,7 +149,9 @@ def run(options: Options) -> int:
                 parts, pairs = without_needless(tracked, parts, options.parts)
                 following.joined += pairs
             seconds["finish"], at = perf_counter() - at, perf_counter()
-            parts = refine_parts(tracked, parts, options.parts, notes, console)
+            if not np.asarray(parts.weights)[:, 1:].any():
+                notes.warn("no part is left that any picture needs; the outcome is the canonical scene")
+            parts = refine_parts(tracked, parts, following, options.parts, notes, console)
             seconds["refine"] = perf_counter() - at
         found = finished(folder, recording, start, parts, following, options.parts, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
@@ -178,6 +181,12 @@ def _check(options: Options, recording: Recording) -> None:
         )
     if options.sam is not None and options.masks == "files":
         raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
+    inside = options.scene is not None and options.out.resolve() in options.scene.resolve().parents
+    if inside and options.overwrite:
+        raise ValueError(
+            f"--scene {options.scene}: expected one outside of --out, which --overwrite replaces, found it "
+            "in there; name another --out"
+        )
     if options.scene is not None and options.anchor is None:
         raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
 
@@ -212,18 +221,21 @@ def _masks(
     return masks
 
 
-def _canonical(
+def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
 ) -> Gaussians | None:
-    """The scene at the anchor frame, given or fitted; None where fitting was stopped by Ctrl-C."""
-    path = options.scene
-    if path is None:
-        path = folder.path / "canonical"
-        if not RunFolder(path, overwrite=True).finished:
-            console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
-            code = fit_command.run(_fit_options(options, path, anchor, recording))
-            if code == 130:
-                return None
+    """The scene at the anchor frame; None where fitting was stopped by Ctrl-C."""
+    path = folder.path / "canonical"
+    if not RunFolder(path, overwrite=True).finished:
+        console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
+        code = fit_command.run(_fit_options(options, path, anchor, recording))
+        if code == 130:
+            return None
+    return _read_scene(path)
+
+
+def _read_scene(path: Path) -> Gaussians:
+    """The Gaussians of a PLY file, or of a run of `gsjax fit`."""
     if path.is_dir():
         expect_run(path, "`gsjax fit`")
         path = path / "scene.ply"

@@ -69,8 +69,11 @@ def follow_parts(
     return following
 
 
-def refine_parts(views: Sequence, parts: Parts, config: PartsConfig, notes: Notes, console: Console) -> Parts:
-    """Parts with the scene and all poses fitted to all frames, as far as it came where it was stopped."""
+def refine_parts(
+    views: Sequence, parts: Parts, following: Following, config: PartsConfig, notes: Notes, console: Console
+) -> Parts:
+    """Parts with the scene and all poses fitted to all frames, as far as it came where it was stopped.
+    `following` is told of Ctrl-C."""
     done, skipped, steps = 0, [], config.refine.iterations
     columns = (TextColumn("refining the scene over all frames"), BarColumn(), MofNCompleteColumn())
     if steps and not console.is_terminal:
@@ -86,6 +89,7 @@ def refine_parts(views: Sequence, parts: Parts, config: PartsConfig, notes: Note
             notes.warn(
                 f"the scene was refined by {done} of {steps} steps, and then stopped by {reason(stopped)}"
             )
+            following.stopped = stopped if isinstance(stopped, KeyboardInterrupt) else None
     if lost := int(np.sum(skipped)):
         notes.warn(f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite")
     return parts

@@ -42,7 +42,8 @@ _WIDE = ("gaussians", "confidence", "line_mm", "point_error_mm", "iou")  # what 
 _PART_NOTE = (
     "Joints are fitted to the motion since the canonical frame, in the world. 'Off' is against the true part "
     "that most of the Gaussians are of; points off is over the Gaussians that are truly of it, whatever part "
-    "they were given to. 'Sure' is how much better the joint explains the motion than the next best kind."
+    "they were given to. 'Sure' is how much better the joint explains the motion than the next best kind; of "
+    "a free part, by how much it is off any joint."
 )
 
 
@@ -83,16 +84,21 @@ def finished(
                         film.add(view)
         except (KeyboardInterrupt, OSError) as error:
             notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
+            following.stopped = error if isinstance(error, KeyboardInterrupt) else None
     rows = part_rows(scene, trajectory, joints)
     told = (
-        score_parts(scene, trajectory, joints, rows, recording, start.anchor.frame, notes) if complete else {}
+        score_parts(
+            scene, trajectory, joints, rows, recording, start.anchor.frame, config.stream.blend, notes
+        )
+        if complete
+        else {}
     )
     sequence = recording.tracked
     return {
         "kind": "parts",
         "dataset": sequence.name,
-        "complete": complete,
-        "stopped": None if stopped is None else reason(stopped),
+        "complete": following.stopped is None,
+        "stopped": None if following.stopped is None else reason(following.stopped),
         "anchor": start.anchor.frame,
         "frames": {
             "followed": len(frames),

@@ -11,14 +11,15 @@ from gsjax.cli.recording import Recording
 from gsjax.cli.scoring import motion_metrics
 from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory
+from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
 from gsjax.methods.motion_parts.unify import motions_of
 from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
-from gsjax.scene.handles import HandlePose, skin_means
+from gsjax.scene.handles import Blend
 
 _POINTS = 500  # of a part, by which its joint is fitted ...
 _FAR = 3.0  # ... none so many times as far from its middle as half of them: there, noise of a turn is large
+_AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres about an object of which nothing is drawn
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
 
@@ -87,6 +88,7 @@ def score_parts(
     rows: list[dict[str, Any]],
     recording: Recording,
     anchor: int,
+    blend: Blend,
     notes: Notes,
 ) -> dict[str, Any]:
     """Scores of the whole, and in each row those of the part; nothing where the recording has no truth.
@@ -104,9 +106,12 @@ def score_parts(
         return {}
     labels = _true_labels(scene, recording, anchor)
     poses = {int(label): truth.poses[:, k] for k, label in enumerate(truth.label_ids)}
-    scores = score_tracks(_tracks(scene, trajectory), labels, poses, anchor)
+    scores = score_tracks(_tracks(scene, trajectory, blend), labels, poses, anchor)
     means = np.asarray(scene.gaussians.means, np.float64)
-    far = {k: _farthest_mm(relative_motion(pose, anchor), means[labels == k]) for k, pose in poses.items()}
+    # By where the object truly is: one that no Gaussian shows moves all the same, and is missed.
+    ways = {k: relative_motion(pose, anchor) for k, pose in poses.items()}
+    around = {k: pose[anchor, :3, 3] + _AROUND for k, pose in poses.items()}
+    far = {k: _farthest_mm(ways[k], means[labels == k] if k in labels else around[k]) for k in poses}
     moving = [label for label in poses if far[label] > _STILL_MM]
     still = [truth.names[list(poses).index(label)] for label in poses if label not in moving]
     if still:
@@ -145,12 +150,10 @@ def _true_labels(scene: PartScene, recording: Recording, anchor: int) -> Int[np.
     return true_labels(np.asarray(scene.gaussians.means), masks, depths, *views)
 
 
-def _tracks(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T N 3"]:
+def _tracks(scene: PartScene, trajectory: Trajectory, blend: Blend) -> Float[np.ndarray, "T N 3"]:
     """Where all Gaussians are at all times."""
-    moved, poses = jax.jit(skin_means), trajectory.poses
-    known = scene.gaussians.means, scene.weights, scene.centers
-    every = zip(poses.quats, poses.translations, strict=True)
-    return np.stack([moved(*known, HandlePose(*one)) for one in every])
+    means = jax.jit(lambda now: gaussians_at(scene, now, blend).means)
+    return np.stack([means(moment(trajectory, t)) for t in range(len(trajectory.times))])
 
 
 def _farthest_mm(motions: Float[np.ndarray, "T 4 4"], points: Float[np.ndarray, "n 3"]) -> float:

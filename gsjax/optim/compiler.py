@@ -54,6 +54,19 @@ def has_avx512() -> bool:
     return cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
 
 
+def forget_programs(most_maps: int = 30_000) -> bool:
+    """Drop all compiled programs if this process has more memory maps than that; whether it did.
+
+    Each program takes some. Linux allows a process 65,530, and then compiling fails ("Cannot allocate
+    memory") with all memory free: for who runs one job after the other for hours in one process.
+    """
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") <= most_maps:
+        return False
+    jax.clear_caches()
+    return True
+
+
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _KEPT = 2**30  # bytes: the largest array, and how much freed memory
 

@@ -13,25 +13,12 @@ from gsjax.cli.recording import open_recording
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
 
-SCENE = "simulated:articulated?width=96&height=72&cameras=4"
-QUICK = ("--frames", "0:24:8", "--eval-cameras", "3", "--fit.steps", "30", "--fit.cap", "1500")
-QUICK += (
-    "--fit.start.count",
-    "1500",
-    "--parts.stream.iterations",
-    "4",
-    "--parts.discover.lift-iterations",
-    "3",
-)
-QUICK += (
-    "--parts.refine.iterations",
-    "5",
-    "--parts.discover.most-parts",
-    "6",
-    "--parts.stream.coarse",
-    "0",
-    "--fit.coarse-until",
-    "0",
+SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
+QUICK = (
+    *("--frames", "0:16:5", "--eval-cameras", "3", "--masks", "files"),
+    *("--fit.steps", "120", "--fit.cap", "1500", "--fit.start.count", "1500", "--fit.coarse-until", "0"),
+    *("--parts.stream.iterations", "30", "--parts.stream.coarse", "0", "--parts.refine.iterations", "5"),
+    *("--parts.discover.lift-iterations", "3", "--parts.discover.most-parts", "6"),
 )
 
 
@@ -49,17 +36,18 @@ def gsjax_parts(tmp_path, capfd):
 
 
 def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
-    code, said = gsjax_parts(*QUICK)
+    code, said = gsjax_parts(*QUICK, "--anchor", "0")
     assert code == 0, said
     run = tmp_path / "run"
     found = json.loads((run / "metrics.json").read_text())
     assert found["complete"]
-    assert found["frames"]["followed"] == 3
+    assert found["frames"]["followed"] == 4
     assert found["held_out"]["psnr"] > 8
-    assert -1 <= found["ari"] <= 1
-    assert {"drawer", "shut door"} & set(" ".join(found["notes"]).replace(",", " ").split()) or found[
-        "missed"
-    ]
+    box = next(row for row in found["parts"] if row.get("true_name") == "box")
+    assert box["moved_mm"] > 200
+    assert box["median_point_error_mm"] < 50
+    assert box["iou"] > 0.6
+    assert found["ari"] > 0.3
     arrays = dict(np.load(run / "parts.npz"))
     count, parts = arrays["weights"].shape
     shapes = {name: array.shape for name, array in arrays.items()}
@@ -69,9 +57,9 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
         "weights": (count, parts),
         "labels": (count,),
         "centres": (parts, 3),
-        "R": (3, parts, 3, 3),
-        "t": (3, parts, 3),
-        "times": (3,),
+        "R": (4, parts, 3, 3),
+        "t": (4, parts, 3),
+        "times": (4,),
     }
     np.testing.assert_allclose(arrays["weights"].sum(-1), 1, rtol=1e-5)
     np.testing.assert_array_equal(arrays["labels"], arrays["weights"].argmax(-1))
@@ -79,12 +67,13 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
         arrays["R"][int(arrays["anchor"])], np.tile(np.eye(3), (parts, 1, 1)), atol=1e-6
     )
     np.testing.assert_array_equal(arrays["t"][:, 0], 0)
-    np.testing.assert_allclose(arrays["times"], np.array([0, 8, 16]) / 15)
+    assert np.linalg.norm(arrays["t"][-1, box["part"]]) > 0.1
+    np.testing.assert_allclose(arrays["times"], np.array([0, 5, 10, 15]) / 15)
     assert parts == found["num_parts"] + 1
     gaussians, _ = read_ply(run / "scene.ply")
     np.testing.assert_allclose(gaussians.means, arrays["means0"], atol=1e-6)
     for camera in range(4):
-        assert describe_video(run / f"video_{camera}.mp4").frames == 3
+        assert describe_video(run / f"video_{camera}.mp4").frames == 4
     assert (run / "canonical" / "report.html").is_file()
     assert not (run / "resume").exists()
     page = (run / "report.html").read_text()
@@ -121,6 +110,24 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     code, said = gsjax_parts(*QUICK, *given, "--resume", name="stopped")
     assert code == 0, said
     again = dict(np.load(tmp_path / "stopped" / "parts.npz"))
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(again[name], array, err_msg=name)
+
+    refine = gsjax.cli.parts_loop.refine
+
+    def stopped_refining(*arguments):
+        yield next(refine(*arguments))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gsjax.cli.parts_loop, "refine", stopped_refining)
+    code, said = gsjax_parts(*QUICK, *given, name="late")
+    assert code == 130
+    assert "refined by 1 of 5 steps, and then stopped by Ctrl-C" in said
+    assert not json.loads((tmp_path / "late" / "metrics.json").read_text())["complete"]
+    monkeypatch.undo()
+    code, said = gsjax_parts(*QUICK, *given, "--resume", name="late")
+    assert code == 0, said
+    again = dict(np.load(tmp_path / "late" / "parts.npz"))
     for name, array in arrays.items():
         np.testing.assert_array_equal(again[name], array, err_msg=name)
 
@@ -166,11 +173,19 @@ def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
 
 
 @pytest.mark.slow
-def test_masks_of_the_recording_say_which_parts_there_are(gsjax_parts, tmp_path):
-    code, said = gsjax_parts(*QUICK, "--masks", "files", "--parts.unify.every", "0")
+def test_a_segmenter_says_which_parts_there_are(gsjax_parts, tmp_path):
+    code, said = gsjax_parts(*QUICK, "--masks", "segment", "--parts.unify.least-gain", "0")
     assert code == 0, said
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert 2 <= found["pieces"] <= 4  # drawer, door, lid and box, but for what does not change enough
+    assert found["pieces"] >= 2
+    assert found["num_parts"] >= 1
+
+
+def test_a_scene_is_not_read_from_what_is_replaced(gsjax_parts, tmp_path):
+    inside = ("--scene", str(tmp_path / "run" / "canonical"), "--anchor", "0")
+    code, said = gsjax_parts(*QUICK, *inside, "--overwrite")
+    assert code == 2
+    assert "expected one outside of --out, which --overwrite replaces" in said
 
 
 def test_a_scene_in_which_nothing_moves(gsjax_parts, tmp_path):

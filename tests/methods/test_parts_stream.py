@@ -11,7 +11,8 @@ import optimistix
 import pytest
 
 from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
-from gsjax.methods.motion_parts.residual import motions_of_handles, pose_of, pose_residual
+from gsjax.methods.motion_parts.residual import pose_residual
+from gsjax.methods.motion_parts.screws import motions_of, pose_of
 from gsjax.methods.motion_parts.stream import (
     Canonical,
     Seen,
@@ -260,7 +261,7 @@ def test_half_the_squares_are_the_loss_without_ssim(boxes, depth):
     certain = StreamParams(pose, SimplexTable(batch.weights))
     loss = stream_loss(config)(certain, batch, step=0.5, key=None)[0]
     residuals, told = pose_residual(
-        motions_of_handles(pose), batch, step=0.5, key=None, config=config, block=1, softness=1e-6
+        motions_of(pose), batch, step=0.5, key=None, config=config, block=1, softness=1e-6
     )
     assert residuals.keys() == ({"color", "tear", "depth"} if depth else {"color", "tear"})
     assert half_squares(residuals) / batch.now.counts.sum() == pytest.approx(float(loss), rel=2e-3)
@@ -270,7 +271,7 @@ def test_half_the_squares_are_the_loss_without_ssim(boxes, depth):
 @pytest.mark.usefixtures("x64")
 def test_the_derivative_of_residuals_is_that_of_differences(boxes):
     batch = forward(batch_of(boxes, jnp.float64, past=False)[0])
-    start = motions_of_handles(shifted(0.01, jnp.float64))
+    start = motions_of(shifted(0.01, jnp.float64))
 
     @jax.jit
     def values(twists):
@@ -305,7 +306,7 @@ def test_gauss_newton_brings_handles_home(boxes, solver):
         return pose_residual(motions, batch, step=step, key=key, config=CONFIG, block=2)
 
     step = least_squares_step(residual, solver)
-    motions = motions_of_handles(shifted(0.01))
+    motions = motions_of(shifted(0.01))
     update, state = jax.jit(lambda *of: step.update(*of, batch, step=0.0, key=None)), step.init(motions)
     for _ in range(8):
         motions, state, info = update(motions, state)

@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.optim.compiler import in_memory
+from gsjax.optim.compiler import forget_programs, in_memory
 
 
 def read(image, x, finite):
@@ -73,3 +74,14 @@ def test_programs_are_kept_where_nothing_else_was_said(tmp_path):
     (tmp_path / "file").touch()
     assert said(tmp_path / "file").stdout.strip() == "None"
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells")
+def test_programs_are_forgotten_only_where_there_are_too_many():
+    twice = jax.jit(lambda x: 2 * x)
+    twice(1.0)
+    assert not forget_programs(10**9)
+    assert twice._cache_size() == 1
+    assert forget_programs(0)
+    assert twice._cache_size() == 0
+    assert twice(2.0) == 4

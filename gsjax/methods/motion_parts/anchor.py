@@ -26,13 +26,11 @@ class Anchor(NamedTuple):
         frame: its index.
         farthest: the frame that differs most from it.
         differences: mean difference of each frame from it, 0 to 1, [T].
-        noise: what pixels differ by where nothing moves, 0 to 1.
     """
 
     frame: int
     farthest: int
     differences: Float[np.ndarray, "T"]
-    noise: float
 
 
 def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = None) -> Anchor:
@@ -64,8 +62,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
             f"{best} by {apart[best].mean():.3f}; parts that hardly move from the anchor are found badly",
             stacklevel=2,
         )
-    steps = np.linalg.norm(np.diff(flat, axis=0), axis=-1) / np.sqrt(3)
-    return Anchor(chosen, int(apart[chosen].argmax()), apart[chosen], float(np.median(steps)))
+    return Anchor(chosen, int(apart[chosen].argmax()), apart[chosen])
 
 
 def moved_pixels(
@@ -88,10 +85,14 @@ def moved_pixels(
     count = len(anchor.differences)
     spread = np.linspace(0, count - 1, min(count, frames or _MOST_FRAMES)).round().astype(int)
     others = {anchor.farthest} if frames == 1 else {*spread.tolist(), anchor.farthest} - {anchor.frame}
-    limit = max(threshold, _NOISE_FACTOR * anchor.noise)
-    moved = []
-    for c in range(cameras):
-        here = _blurred(load(anchor.frame, c))
+    beside = [t for t in (anchor.frame - 1, anchor.frame + 1) if 0 <= t < count]
+    heres = [_blurred(load(anchor.frame, c)) for c in range(cameras)]
+    # Half of a picture stands still from frame to frame: what it differs by is noise.
+    steps = [
+        np.median(difference_image(_blurred(load(t, c)), heres[c])) for c in range(cameras) for t in beside
+    ]
+    limit, moved = max(threshold, _NOISE_FACTOR * float(np.median(steps))), []
+    for c, here in enumerate(heres):
         largest = np.max([difference_image(_blurred(load(t, c)), here) for t in sorted(others)], axis=0)
         moved.append(largest > limit)
     share = np.mean(moved)

@@ -83,10 +83,15 @@ def begin(
         masks: of the pieces in every view, where they are known.
 
     Raises:
-        ValueError: there is one camera only.
+        ValueError: there is one camera only, next to no Gaussian, or nothing that may move.
     """
     if views.num_cameras < 2:
         raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in space")
+    if gaussians.num <= _NEIGHBORS:
+        raise ValueError(
+            f"gaussians: expected a scene of more than {_NEIGHBORS}, found {gaussians.num}; fit one to the "
+            "anchor frame"
+        )
     frame = views.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
     if masks is None:
@@ -95,6 +100,11 @@ def begin(
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
         masks = find_masks(views, gaussians, frame, plan, anchor, moved, config, segmenter)
+    if not (masks > 0).any():
+        raise ValueError(
+            "masks: expected a piece of which a third changed in other frames, found none; choose another "
+            "anchor, a lower discover.threshold, or discover.difference off"
+        )
     slots = config.discover.most_parts + 1
     logits, lifting = lift_masks(
         gaussians, frame.cameras, plan, masks, slots, config.discover.lift_iterations
@@ -103,6 +113,11 @@ def begin(
     order, count = _movable_first(np.asarray(gaussians.means), weights)
     weights = weights[order[:count]]
     labels = weights.argmax(-1)
+    if not (labels != BACKGROUND).any():
+        raise ValueError(
+            f"gaussians: expected some that show the {masks.max()} pieces that changed, found none among "
+            f"{gaussians.num}; is this the scene at frame {anchor.frame}?"
+        )
     movable, fixed = take(gaussians, order[:count]), take(gaussians, order[count:])
     alive = np.isin(np.arange(slots), [BACKGROUND, *np.unique(labels)])
     weights = np.where(alive, weights, 0)

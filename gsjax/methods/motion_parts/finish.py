@@ -1,6 +1,7 @@
 """The end of a discovery: parts that no picture needs are given up, and the others are what edits work on."""
 
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -50,13 +51,12 @@ def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[P
                 weights, here = ways[best], losses[best]
                 into[into == part] = best
     parts, pairs = joined(parts, into)
-    return settled(parts), pairs
+    return settled(parts, weights), pairs
 
 
-def settled(parts: Parts) -> Parts:
-    """With a table of weights, without those that are so small that they only tie parts to each other."""
-    weights = np.asarray(parts.weights)
-    kept = np.where(weights < _LEAST_WEIGHT, 0.0, weights)
+def settled(parts: Parts, weights: Float[np.ndarray, "M P"]) -> Parts:
+    """With a table of weights, without those so small that they only tie parts to each other."""
+    kept = np.where((weights < _LEAST_WEIGHT) | ~np.asarray(parts.canonical.alive), 0.0, weights)
     table = SimplexTable(jnp.asarray(kept / kept.sum(-1, keepdims=True), weights.dtype))
     return parts._replace(params=parts.params._replace(field=table))
 
@@ -94,16 +94,24 @@ class _Judge:
         for i, t in enumerate(frames.tolist()):
             frame = part_of(views.frame(t), (), _SHRINK)
             cameras = [(i + k * views.num_cameras // _CAMERAS) % views.num_cameras for k in range(_CAMERAS)]
-            seen = seen_at(frame, parts.canonical, parts.weights, parts.pose(t), TILE // _SHRINK)
+            at = parts.canonical, parts.weights, parts.pose(t)
+            seen = seen_at(frame, *at, TILE // _SHRINK, blend=config.stream.blend)
             self._seen += [(t, one_camera(seen, c)) for c in sorted(set(cameras))]
         scene = posed(parts.canonical, parts.weights, parts.pose(int(done[0])))
-        self._plan = plan_render(scene, frame.cameras, headroom=2 * config.headroom)
+        self._headroom = 2 * config.headroom
+        self._plan = plan_render(scene, frame.cameras, headroom=self._headroom)
 
     def __call__(self, parts: Parts, weights: Float[np.ndarray, "M P"]) -> float:
         arguments = parts.canonical, jnp.asarray(weights)
-        return float(
-            np.mean([self._loss(*arguments, parts.pose(t), seen, self._plan) for t, seen in self._seen])
-        )
+        return float(np.mean([self._of(*arguments, parts.pose(t), seen) for t, seen in self._seen]))
+
+    def _of(self, *arguments: Any) -> float:
+        """The loss in one picture, by a plan that holds it."""
+        while True:
+            loss, overflow, needed = self._loss(*arguments, self._plan)
+            if not bool(overflow):
+                return float(loss)
+            self._plan = self._plan.grown(int(needed), self._headroom)
 
 
 @lru_cache(maxsize=2)
@@ -111,7 +119,8 @@ def _compiled(config: StreamConfig):
     @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
     def loss(canonical: Canonical, weights, pose, seen, plan):
         scene = posed(canonical, weights, pose, config.blend)
-        return picture_loss(render(scene, seen.frame.cameras, plan, roi=seen.counts), seen, config)
+        drawn = render(scene, seen.frame.cameras, plan, roi=seen.counts)
+        return picture_loss(drawn, seen, config), drawn.meta.overflow.any(), drawn.meta.needed.max()
 
     return loss
 

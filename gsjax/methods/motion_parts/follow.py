@@ -31,7 +31,7 @@ from gsjax.methods.motion_parts.weights import saying
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame, one_camera, part_of
-from gsjax.scene.handles import HandlePose, at_rest, skin
+from gsjax.scene.handles import Blend, HandlePose, at_rest, skin
 from gsjax.scene.region import TILE, tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
@@ -181,11 +181,13 @@ class _Frames:
         weights = parts.weights
         frame = self._views.frame(t)
         now = {
-            size: seen_at(part_of(frame, (), size), canonical, weights, params.pose, TILE // size)
+            size: seen_at(
+                part_of(frame, (), size), canonical, weights, params.pose, TILE // size, blend=config.blend
+            )
             for size in (_HALF, _WHOLE)
         }
         past = np.flatnonzero(parts.found >= parts.born[np.asarray(canonical.alive)].max())
-        past = past if len(past) else np.flatnonzero(parts.done)[-1:]
+        past = past if len(past) else np.array([parts.found.argmax()])
         looks, losses, skipped, compiling = _turns(rng, len(frame.images)), [], 0, 0.0
         for i in range(config.iterations):
             size = _HALF if i < config.coarse * config.iterations else _WHOLE
@@ -222,7 +224,8 @@ class _Frames:
             self._past[u] = _on_host(part_of(self._views.frame(u), (), _HALF))
         frame = one_camera(self._past[u], c)
         frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
-        return seen_at(frame, canonical, weights, parts.pose(u), TILE // _HALF), parts.pose(u)
+        blend = self._config.stream.blend
+        return seen_at(frame, canonical, weights, parts.pose(u), TILE // _HALF, blend=blend), parts.pose(u)
 
     def _plan(self, size: int, now: dict[int, Seen], parts: Parts, weights: Array) -> Plan:
         if size not in self._plans:
@@ -264,11 +267,13 @@ def _predicted(parts: Parts, t: int, way: int, before: HandlePose) -> HandlePose
     return HandlePose(quats, 2 * before.translations - first.translations)
 
 
-@partial(jax.jit, static_argnames="tile")
-def seen_at(frame: Frame, canonical: Canonical, weights: Array, pose: HandlePose, tile: int = TILE) -> Seen:
+@partial(jax.jit, static_argnames=("tile", "blend"))
+def seen_at(
+    frame: Frame, canonical: Canonical, weights: Array, pose: HandlePose, tile: int = TILE, *, blend: Blend
+) -> Seen:
     """Pixels count where what moves is, and where it was in the canonical scene."""
     moves = weights[:, BACKGROUND] < 0.5
-    moved = skin(canonical.movable, weights, canonical.centers, pose).means
+    moved = skin(canonical.movable, weights, canonical.centers, pose, blend).means
     # What stands still is put behind all cameras' backs, where it touches nothing.
     nowhere = jnp.full_like(moved, jnp.nan)
     places = [jnp.where(moves[:, None], means, nowhere) for means in (moved, canonical.movable.means)]

@@ -15,7 +15,7 @@ from gsjax.scene.frame import one_camera
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
-_RATE = 0.5  # of Adam, logits
+_OPTIMIZER = optax.adam(0.5)
 _LEAST_ALPHA = 0.5  # a pixel in which less of the scene shows tells nothing
 _SURE = 10.0  # the logit by which what all pixels agree on begins above the others
 
@@ -71,18 +71,17 @@ def lift_masks(
     total = jnp.asarray(label_votes(gaussians, cameras, plan, masks, count))
     shares = total / jnp.maximum(total.sum(-1, keepdims=True), 1e-6)
     logits = _SURE * shares.at[:, 0].add(jnp.where(total.sum(-1) < 1e-3, 1.0, 0.0))
-    optimizer = optax.adam(_RATE)
-    state, losses = optimizer.init(logits), []
+    state, losses = _OPTIMIZER.init(logits), []
     for i in range(iterations):
         c = i % len(masks)
         one = one_camera(cameras, c)
-        logits, state, loss = _lift_step(logits, state, gaussians, one, plan, masks[c : c + 1], optimizer)
+        logits, state, loss = _lift_step(logits, state, gaussians, one, plan, masks[c : c + 1])
         losses.append(loss)
     return logits, np.asarray(losses)
 
 
-@partial(jax.jit, static_argnames=("plan", "optimizer"), compiler_options=host_options())
-def _lift_step(logits, state, gaussians, cameras, plan, masks, optimizer):
+@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+def _lift_step(logits, state, gaussians, cameras, plan, masks):
     def loss(logits):
         shares, alphas = _shares(gaussians, cameras, plan, logits)
         picked = jnp.take_along_axis(shares, jnp.maximum(masks, 0)[..., None], axis=-1)[..., 0]
@@ -90,7 +89,7 @@ def _lift_step(logits, state, gaussians, cameras, plan, masks, optimizer):
         return -jnp.sum(jnp.log(jnp.maximum(picked, 1e-4)) * counts) / jnp.maximum(counts.sum(), 1)
 
     value, gradient = jax.value_and_grad(loss)(logits)
-    updates, state = optimizer.update(gradient, state)
+    updates, state = _OPTIMIZER.update(gradient, state)
     return optax.apply_updates(logits, updates), state, value
 
 

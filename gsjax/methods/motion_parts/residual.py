@@ -9,6 +9,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from gsjax.methods.motion_parts.config import StreamConfig
+from gsjax.methods.motion_parts.screws import pose_of
 from gsjax.methods.motion_parts.stream import FINAL_TEAR, StreamBatch, gaps_between, posed
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
 from gsjax.optim.residuals import block_residual
@@ -16,16 +17,6 @@ from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import render
 
 _LIMIT = 1.0  # of differences of colour: none is left out, as in the loss
-
-
-def motions_of_handles(pose: HandlePose) -> jaxlie.SE3:
-    """Of each handle, what turns it about its own place and shifts it."""
-    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3(pose.quats), pose.translations)
-
-
-def pose_of(motions: jaxlie.SE3) -> HandlePose:
-    """The inverse of `motions_of_handles`."""
-    return HandlePose(motions.rotation().wxyz, motions.translation())
 
 
 def pose_residual(
@@ -42,7 +33,7 @@ def pose_residual(
     loss for each pixel that counts, but for differences that `block_residual` rounds off.
 
     Args:
-        motions: of all P handles; the background's stays.
+        motions: of all P handles, `screws.motions_of` their pose; the background's stays.
         batch: with a plan whose derivative is "forward", for the Jacobian is made by columns, 6 P of them.
             Its weights are taken as they are, and the past tells nothing of a pose.
         step: share of the iterations that is done, which `tear_weight` falls over.
