@@ -379,6 +379,25 @@ class TestFilms:
         shows(film, 2, [8, 7, 6, 5, 4, 3, 2, 1, 0, 0, 0])
         shows(film, 3, [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8])
 
+    @pytest.mark.parametrize("edit", [Speed, Loop])
+    def test_what_is_over_stands_still_whatever_is_done_to_all(self, edit):
+        """The drawer is done after 0.25 s, when all others begin to go backwards."""
+        keys = {"factor": -1} if edit is Speed else {"bounce": True, "times": 1}
+        first = Speed(parts=("drawer",), factor=4)
+        film = film_of(first, edit(parts=("all",), begin=0.25, **keys), length=1.125)
+        alone = film_of(edit(parts=("lid",), begin=0.25, **keys), length=1.125)
+        shows(film, 1, [0, 4, 8, 8, 8, 8, 8, 8, 8])
+        assert_same(rows(film[0].trajectory, [2], range(9)), rows(alone[0].trajectory, [2], range(9)))
+
+    def test_it_is_an_error_only_if_none_of_them_moves(self):
+        first = Speed(parts=("drawer", "lid"), factor=4)
+        then = {"factor": 2, "begin": 0.5}
+        assert len(film_of(first, Speed(parts=("all",), **then))[0].trajectory.times) == 7
+        with pytest.raises(
+            ValueError, match=r"edit 2 \(speed\): from: .* before 0\.25, .* of lid, part 1 ends, found"
+        ):
+            film_of(first, Speed(parts=("lid", 1), **then))
+
     def test_a_loop_fills_the_film(self):
         shows(film_of(Loop(parts=(2,)), length=2.5), 2, [*range(8), *range(8), *range(4)])
 
@@ -461,7 +480,7 @@ class TestFilms:
             (Fade(parts=(4,)), "edit 2 (fade): parts: expected numbers from 0 to 3, found 4"),
             (
                 Speed(parts=(1,), factor=2, begin=1.5),
-                "edit 2 (speed): from: expected a time before 1, where the motion ends, found 1.5",
+                "edit 2 (speed): from: expected a time before 1, where the motion of part 1 ends, found 1.5",
             ),
             (Loop(parts=(1,), begin=1), "edit 2 (loop): from: expected a time before 1"),
             (

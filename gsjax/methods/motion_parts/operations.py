@@ -57,8 +57,8 @@ class Edit(Entry):
         if self.begin is not None and self.end is not None and not self.begin < self.end:
             raise ValueError(f"to: expected a time after from, {self.begin:g}, found {self.end:g}")
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
-        """Which parts change."""
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        """Which parts change, if these are named and the motion of each part of the scene ends at `lasts`."""
         return parts
 
     def ends(self, last: float) -> float:
@@ -79,6 +79,16 @@ class Edit(Entry):
 class TimeEdit(Edit):
     """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
 
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        """Those that still move at `from`: what is over stands still, whatever is done to all."""
+        begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
+        moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
+        if not moving:
+            told = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
+            expected = f"a time before {last:g}, where the motion of {told} ends"
+            raise ValueError(f"from: expected {expected}, found {begin:g}")
+        return moving
+
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         trajectory = film[0].trajectory
         for part in parts:
@@ -87,10 +97,7 @@ class TimeEdit(Edit):
 
     def stretch(self, last: float) -> tuple[float, float]:
         """From when to when, for a part whose motion ends at `last`."""
-        begin, end = self.begin or 0.0, last if self.end is None else self.end
-        if not begin < end:
-            raise ValueError(f"from: expected a time before {end:g}, where the motion ends, found {begin:g}")
-        return begin, end
+        return self.begin or 0.0, last if self.end is None else self.end
 
     def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
         """The trajectory after it."""
@@ -136,6 +143,9 @@ class Freeze(TimeEdit):
 
     at: float | None = field(default=None, metadata=_SECONDS)
 
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        return parts
+
     def stretch(self, last: float) -> tuple[float, float]:
         begin = self.begin if self.begin is not None else self.at or 0.0
         end = math.inf if self.end is None else self.end
@@ -156,7 +166,7 @@ class Freeze(TimeEdit):
 class Isolate(Freeze):
     """Only these parts keep moving: all others freeze."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 
@@ -192,7 +202,7 @@ class Fade(LookEdit):
 class Ghost(Fade):
     """Only these parts are shown: all others, the background too, vanish or become translucent."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 

@@ -158,7 +158,9 @@ def _planned(edits: Sequence[Edit], layer: Layer, names: Names) -> list[tuple[li
     for place, edit in enumerate(edits):
         with _said_of(place, edit):
             brings = isinstance(edit, Composite)  # parts of another scene
-            parts = [] if brings else edit.concerned(layer.trajectory, _numbers(edit.parts, names, num))
+            parts = (
+                [] if brings else edit.concerned(layer.trajectory, _numbers(edit.parts, names, num), lasts)
+            )
             plan.append((parts, lasts))
             lasts = [edit.ends(last) if p in parts else last for p, last in enumerate(lasts)]
     return [*plan, ([], lasts)]
