@@ -302,7 +302,10 @@ class TestLength:
             (Freeze(parts=(1,), begin=0.25, end=0.75), 13),
             (Freeze(parts=(1,), at=0.875, begin=0.25, end=0.75), 9),
             (Isolate(parts=(1,), begin=0.25, end=0.75), 13),
-            (Echo(parts=(1,)), 9),
+            (Echo(parts=(1,), copies=2, every=0.25), 13),  # the last copy ends at 1.5 s
+            (Echo(parts=(1,), copies=2, every=0.25, end=1.25), 11),
+            (Echo(parts=(1,), copies=2, every=0.25, end=0.5), 9),
+            (Echo(parts=(1,), copies=2, every=-0.25), 9),
         ],
     )
     def test_a_film_is_as_long_as_edits_need_it(self, edit, moments):
@@ -322,6 +325,20 @@ class TestLength:
         """At the end of the film the part still moves."""
         before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats[-2:, 1])
         assert np.abs(last - before).max() > 1e-3
+
+    def test_copies_are_seen_to_their_end(self):
+        film = film_of(Echo(parts=(1,), copies=2, every=0.25))
+        np.testing.assert_array_equal(
+            film[2].trajectory.poses.quats[:, 1], layer_of().trajectory.poses.quats[[0] * 4 + [*range(9)], 1]
+        )
+
+    def test_of_copies_the_scene_itself_knows_nothing(self):
+        """It goes backwards from its own end."""
+        shows(
+            film_of(Echo(parts=(1,), copies=2, every=0.25), Speed(parts=(1,), factor=-1), length=1),
+            1,
+            range(8, 0, -1),
+        )
 
     def test_length_and_fps_say_otherwise(self):
         for options, times in (
@@ -457,7 +474,7 @@ class TestFilms:
         )
 
     def test_echo_adds_layers_of_the_part_alone(self):
-        film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5))
+        film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5), length=1.125)
         assert [layer.scene.gaussians.num for layer in film] == [8, 2, 2]
         opacities = np.asarray(layer_of().trajectory.opacities[:, 3])
         first, second = (np.asarray(layer.trajectory.opacities[:, 3]) for layer in film[1:])
@@ -540,6 +557,31 @@ class TestComposite:
         film = self.film(begin=0.5, end=0.75)
         shown = np.asarray(film[1].trajectory.opacities[:, 1]) > 0
         np.testing.assert_array_equal(shown, [0, 0, 0, 0, 1, 1, 0, 0, 0])
+
+    @pytest.mark.parametrize(
+        ("keys", "moments"),
+        [
+            ({}, 9),  # 0.5 s of another run, in a film of 1 s
+            ({"edits": (Speed(parts=("cup",), factor=0.25),)}, 17),
+            ({"edits": (Speed(parts=("cup",), factor=0.25),), "end": 1.5}, 13),
+            ({"edits": (Speed(parts=("hand",), factor=0.25),)}, 9),  # which is not brought in
+            ({"edits": (Echo(parts=("hand",), copies=1, every=0.75),)}, 11),  # but a copy of it is
+            (
+                {"edits": (Composite(parts=(1,), from_run="elsewhere", edits=(Loop(parts=(1,), times=4),)),)},
+                17,
+            ),
+        ],
+    )
+    def test_they_are_seen_to_the_end_of_their_motion(self, keys, moments):
+        film = self.film(**keys)
+        assert [len(layer.trajectory.times) for layer in film] == [moments] * len(film)
+
+    def test_a_run_that_is_longer_is_seen_to_its_end_too(self):
+        longer = layer_of(5, moments=13)
+        film = film_of(Composite(parts=(1,), from_run="x"), load_scene=lambda path: (longer, NAMES))
+        np.testing.assert_allclose(
+            film[1].trajectory.opacities[:, 1], longer.trajectory.opacities[:, 1], rtol=1e-6
+        )
 
     def test_a_part_is_looked_up_there(self):
         with pytest.raises(

@@ -65,6 +65,10 @@ class Edit(Entry):
         """When the motion of a part that concerns it ends, if it ended at `last`, seconds."""
         return last
 
+    def adds_until(self, last: float) -> float:
+        """When the motion ends of what it adds to the film, which is that of a part that ends at `last`."""
+        return 0.0
+
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         """The film after it.
 
@@ -272,6 +276,9 @@ class Echo(LookEdit):
     every: float = field(default=0.2, metadata=number("seconds other than 0", 1e-3, 1e4, of=abs))
     fade: float = field(default=0.5, metadata=_OPACITY)
 
+    def adds_until(self, last: float) -> float:
+        return min(last + max(self.copies * self.every, 0.0), math.inf if self.end is None else self.end)
+
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         scene, trajectory = film[0].scene, film[0].trajectory
         copies = [
@@ -311,6 +318,9 @@ class Composite(LookEdit):
     edits: tuple[Edit, ...] = field(
         default=(), metadata={"check": lambda value: read_edits(value), "wanted": "a list of edits"}
     )
+
+    def adds_until(self, last: float) -> float:
+        return last if self.end is None else min(last, self.end)
 
     def joined(self, film: Film, other: Film, parts: list[int]) -> Film:
         """The film with `parts` of the other's first layer in it, and its further layers whole."""
