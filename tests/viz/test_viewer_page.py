@@ -192,11 +192,11 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         page._slider.value = 0
         until(lambda: page._client.scene.get_handle_by_name("/picked/shape") is None)
         # Time goes on by itself, and stops.
-        page._toggle_play()
+        page._player.toggle()
         assert page._play.label == "Stop"
         until(lambda: page._frame == 3)
         until(lambda: page._frame == 0)
-        page._toggle_play()
+        page._player.toggle()
         until(lambda: page._play.label == "Play")
         # Photographs: where they were taken, and going there.
         page._shots.show(True, 0)
