@@ -191,8 +191,8 @@ def _edited(plan: _Plan, times: Float[np.ndarray, "T"], step: float) -> Film:
 
 
 def _begun(trajectory: Trajectory, moments: int) -> Trajectory:
-    """Its first moments. On the host, where nothing is compiled for it."""
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:moments]), trajectory)
+    """Its first moments. On the host, where nothing is compiled for it (`jnp.asarray` would)."""
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[:moments]), trajectory)
 
 
 def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
