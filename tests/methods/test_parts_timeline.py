@@ -120,6 +120,18 @@ class TestScripts:
             ("edits: [{op: fade, parts: []}]", "parts: expected names or numbers of parts, or all, found []"),
             ("edits: [{op: fade, parts: [1.5]}]", "parts: expected names or numbers of parts, or all, found"),
             ("edits: [{op: fade, parts: [yes]}]", "parts: expected names or numbers of parts, or all, found"),
+            (f"fps: {'1' * 400}", "fps: expected frames a second, 0.1 to 1000, found 1111"),
+            (
+                f"edits: [{{op: move, parts: 1, by: [0, 0, {'9' * 400}]}}]",
+                "by: expected metres as [x, y, z], found",
+            ),
+            (
+                f"edits: [{{op: loop, parts: 1, times: {'9' * 400}}}]",
+                "times: expected a whole number from 1 to 1000",
+            ),
+            (f"fps: {'1' * 5000}", "expected YAML, found a value that cannot be read"),
+            ("length: 2026-02-30", "expected YAML, found a value that cannot be read: day is out of range"),
+            ("edits: " + "[" * 5000 + "]" * 5000, "found lists or mappings nested too deeply to be read"),
             (
                 "edits: [{op: fade, parts: 1, opacity: 2}]",
                 "opacity: expected a factor on opacities, 0 to 1, found 2",
@@ -195,6 +207,8 @@ class TestScripts:
             ("sped:parts=1", "did you mean 'speed'?"),
             ("speed", "parts: expected names or numbers of parts, or all, found nothing"),
             ("speed:parts=1,factor=[", "expected YAML, found"),
+            (f"speed:parts=1,factor={'1' * 400}", "factor: expected a factor from 0.01 to 100"),
+            ("speed:parts=" + "[" * 900 + "]" * 900, "found lists or mappings nested too deeply to be read"),
             ("", "op: expected one of isolate, freeze"),
         ],
     )
@@ -202,6 +216,17 @@ class TestScripts:
         with pytest.raises(ValueError) as error:  # noqa: PT011
             parse_op(line)
         assert message in str(error.value)
+
+    @pytest.mark.parametrize("depth", [10, 30, 60, 90, 120, 200, 1000])
+    def test_edits_in_edits_are_read_or_refused(self, depth):
+        """Wherever it is that Python cannot follow any more."""
+        line = "{op: composite, parts: 1, from_run: a, edits: [" * depth + "]}" * depth
+        try:
+            script = parse_script(f"edits: [{line}]")
+        except ValueError as error:
+            assert str(error) == "expected edits, found lists or mappings nested too deeply to be read"  # noqa: PT017
+        else:
+            assert parse_script(to_yaml(script)) == script
 
     @pytest.mark.parametrize("operation", OPERATIONS)
     def test_a_line_to_begin_with_is_an_edit(self, operation):

@@ -61,8 +61,9 @@ def parse_script(text: str) -> Script:
         ValueError: it is no YAML, or an entry is not as expected; the message names the edit by its number,
             the operation and the key.
     """
-    found = _yaml(text)
-    return read(Script, {} if found is None else found)
+    with _not_too_deep():
+        found = _yaml(text)
+        return read(Script, {} if found is None else found)
 
 
 def parse_op(text: str, number: int = 1) -> Edit:
@@ -76,8 +77,9 @@ def parse_op(text: str, number: int = 1) -> Edit:
     """
     operation, _, pairs = text.partition(":")
     pairs = re.sub(r"(^|,)\s*(\w+)\s*=", r"\1 \2: ", pairs)
-    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
-    return edit
+    with _not_too_deep():
+        (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
+        return edit
 
 
 def to_yaml(script: Script) -> str:
@@ -251,6 +253,17 @@ def _yaml(text: str) -> Any:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         said = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
         raise ValueError(f"expected YAML, found {said}") from None
+    except (ValueError, OverflowError) as error:  # of a date that is none, a number too long to read
+        raise ValueError(f"expected YAML, found a value that cannot be read: {error}") from None
+
+
+@contextmanager
+def _not_too_deep() -> Iterator[None]:
+    """What is nested deeper than Python can follow is said to be."""
+    try:
+        yield
+    except RecursionError:
+        raise ValueError("expected edits, found lists or mappings nested too deeply to be read") from None
 
 
 @contextmanager
