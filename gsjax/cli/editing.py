@@ -3,27 +3,25 @@
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Bool, Int
 from rich.console import Console
 
-from gsjax.cli.films import Shot, edited, write_film
+from gsjax.cli.films import Shot, edited, frames_of, write_film
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import PartsRun
 from gsjax.cli.recording import Recording
 from gsjax.methods.motion_parts.entries import ALL
-from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
+from gsjax.methods.motion_parts.film import Film, Layer
 from gsjax.methods.motion_parts.operations import OPERATIONS
 from gsjax.methods.motion_parts.signatures import explained, first_line
 from gsjax.methods.motion_parts.timeline import Names, Script, parse_op
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
-from gsjax.optim.compiler import host_options
-from gsjax.scene.gaussians import Gaussians, concatenate, take
+from gsjax.scene.gaussians import concatenate, take
 from gsjax.scene.handles import Blend
 from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable
 
@@ -56,19 +54,12 @@ class Filmed:
         order = np.argsort(~moves, kind="stable")
         labels, names = _labels(film, self.names)
         scenes = tuple(layer.scene for layer in film)
-        trajectories = jax.tree.map(np.asarray, tuple(layer.trajectory for layer in film))
-
-        def at(frame: int) -> Gaussians:
-            # One moment, taken on the host: then the length of a film is nothing that is compiled.
-            now = jax.tree.map(lambda leaf: leaf[frame : frame + 1], trajectories)
-            return _placing()(tuple(map(Layer, scenes, now)), order, blend=self.blend)
-
         return Viewable(
             self.title,
             take(concatenate([scene.gaussians for scene in scenes]), order),
             labels[order],
             names,
-            motion=Motion(len(times), int(moves.sum()), at),
+            motion=Motion(len(times), int(moves.sum()), frames_of(film, self.blend, order)),
             times=times,
             shots=None if self.shots is None else _at_times(self.shots, self.times, times - times[0]),
             unit="m",
@@ -147,15 +138,6 @@ def camera_names(recording: Recording) -> dict[str, int]:
     """What the cameras of a recording are called, with their ids."""
     held_out = recording.held_out
     return {f"camera {c}" + (" (held out)" if c in held_out else ""): c for c in recording.judged.camera_ids}
-
-
-@cache
-def _placing() -> Callable[..., Gaussians]:
-    return jax.jit(_placed, static_argnames="blend", compiler_options=host_options())
-
-
-def _placed(film: Film, order: Int[Array, "n"], blend: Blend) -> Gaussians:
-    return take(film_gaussians(film, 0, blend), order)
 
 
 def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
@@ -23,7 +24,8 @@ from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_
 from gsjax.methods.motion_parts.timeline import ROUND, Script, apply, to_yaml
 from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
-from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.handles import Blend
 from gsjax.scene.render import render_with_room
 
 SCRIPT = "edit.yaml"
@@ -125,13 +127,40 @@ def write_film(
     return found
 
 
+def frames_of(
+    film: Film, blend: Blend, order: Int[np.ndarray, "n"] | None = None
+) -> Callable[[int], Gaussians]:
+    """From the number of a frame to the Gaussians of a film in it, in another order if given.
+
+    One moment is taken on the host: then the length of a film is nothing that is compiled.
+    """
+    scenes = tuple(layer.scene for layer in film)
+    trajectories = jax.tree.map(np.asarray, tuple(layer.trajectory for layer in film))
+
+    def at(frame: int) -> Gaussians:
+        now = jax.tree.map(lambda leaf: leaf[frame : frame + 1], trajectories)
+        return _placing()(tuple(map(Layer, scenes, now)), order, blend=blend)
+
+    return at
+
+
+@cache
+def _placing() -> Callable[..., Gaussians]:
+    return jax.jit(_placed, static_argnames="blend", compiler_options=host_options())
+
+
+def _placed(film: Film, order: Int[Array, "n"] | None, blend: Blend) -> Gaussians:
+    gaussians = film_gaussians(film, 0, blend)
+    return gaussians if order is None else take(gaussians, order)
+
+
 def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
     """A film as a camera sees it, frame by frame."""
-    placed = jax.jit(film_gaussians, static_argnames="blend", compiler_options=host_options())
+    at = frames_of(film, saved.blend)
     cameras, plan = jax.tree.map(lambda leaf: leaf[None], camera), None
     for t in range(len(film[0].trajectory.times)):
         begun, before = perf_counter(), plan
-        gaussians = placed(film, jnp.asarray(t), blend=saved.blend)
+        gaussians = at(t)
         drawn, plan = render_with_room(gaussians, cameras, plan)
         image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
         yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)

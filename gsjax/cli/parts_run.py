@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 
 from gsjax.cli.recording import Recording
-from gsjax.cli.run_files import chosen_camera, read_arrays, read_scene, reopen
+from gsjax.cli.run_files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.cli.run_folder import expect_run
 from gsjax.methods.motion_parts import PartScene, trajectory_of
 from gsjax.methods.motion_parts.film import Layer
@@ -18,7 +18,14 @@ from gsjax.methods.motion_parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
 
 _FILES = ("parts.npz", "scene.ply", "metrics.json")
-_ARRAYS = ("anchor", "weights", "centres", "R", "t", "times")
+_ARRAYS = {
+    "anchor": (),
+    "weights": ("N", "P"),
+    "centres": ("P", 3),
+    "times": ("T",),
+    "R": ("T", "P", 3, 3),
+    "t": ("T", "P", 3),
+}
 _AGAIN = "run gsjax parts again with this version of gsjax, or name another folder"
 
 
@@ -82,11 +89,11 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
         raise FileNotFoundError(
             f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
         )
-    arrays = read_arrays(path / "parts.npz", _ARRAYS, _AGAIN)
-    names, followed = _of_metrics(path / "metrics.json")
+    arrays = _arrays(path / "parts.npz")
     num, parts = arrays["weights"].shape
-    gaussians = read_scene(path, num, "parts.npz", _AGAIN)
     anchor, frames = int(arrays["anchor"]), len(arrays["times"])
+    names, followed = _of_metrics(path / "metrics.json", frames)
+    gaussians = read_scene(path, num, "parts.npz", _AGAIN)
     # The others stand there as at the anchor, which they were not.
     done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
     R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
@@ -97,14 +104,32 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     return layer, names, len(done) == frames
 
 
-def _of_metrics(file: Path) -> tuple[dict[str, int], int]:
-    """Parts by name, and how many frames were followed."""
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of parts.npz, which fit each other."""
+    arrays = read_arrays(file, tuple(_ARRAYS), _AGAIN)
+    frames = check_arrays(file, arrays, _ARRAYS, _AGAIN)["T"]
+    anchor = arrays["anchor"]
+    if anchor.dtype.kind not in "iu" or not 0 <= anchor < frames:
+        expected = f"the index of one of {frames} frames, 0 to {frames - 1}"
+        raise ValueError(f"{file}: anchor: expected {expected}, found {anchor}; {_AGAIN}")
+    return arrays
+
+
+def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
+    """Parts by name, and how many of the frames were followed."""
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
-        rows, followed = metrics["parts"], int(metrics["frames"]["followed"])
-        names = {row["name"]: int(row["part"]) for row in rows}
-        true = {row["true_name"]: int(row["part"]) for row in rows if row.get("true_name")}
+        rows, followed = metrics["parts"], metrics["frames"]["followed"]
+        called = [(row["part"], row["name"], row.get("true_name")) for row in rows]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
+    for part, name, true in called:
+        if type(part) is not int or part < 0 or not isinstance(name, str) or not isinstance(true, str | None):
+            expected = "part, name and true_name to be a number, a text and a text or null"
+            raise ValueError(f"{file}: expected {expected}, found {part!r}, {name!r} and {true!r}; {_AGAIN}")
+    if type(followed) is not int or not 1 <= followed <= frames:
+        expected = f"1 to {frames} frames to be followed, as parts.npz has {frames}"
+        raise ValueError(f"{file}: expected {expected}, found {followed!r}; {_AGAIN}")
     # The true names last: of two names, messages say the last.
-    return names | {name.lower().replace(" ", "_"): part for name, part in true.items()}, followed
+    names = {name: part for part, name, _ in called}
+    return names | {true.lower().replace(" ", "_"): part for part, _, true in called if true}, followed

@@ -2,6 +2,7 @@
 recording. `again` is what each advises where a file is not as it was written."""
 
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -28,7 +29,7 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
     try:
         with np.load(file, allow_pickle=False) as saved:
             arrays = dict(saved)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(
             f"{file}: expected plain arrays, found a file that cannot be read; {again}"
         ) from error
@@ -36,6 +37,40 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
     if missing:
         raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {again}")
     return arrays
+
+
+def check_arrays(
+    file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[str | int]], again: str
+) -> dict[str, int]:
+    """Check that arrays of a file hold finite numbers and fit each other.
+
+    Args:
+        shapes: of each that is checked. A letter is as many as where it first stands, one at least.
+
+    Returns:
+        How many each letter is.
+
+    Raises:
+        ValueError: one has another shape, is of something else, or is not finite everywhere.
+    """
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.dtype.kind not in "iuf":
+            raise ValueError(f"{file}: {name}: expected numbers, found {array.dtype}; {again}")
+        known = [sizes.get(n, n) if isinstance(n, str) else n for n in shape]
+        fits = len(known) == array.ndim and all(
+            size > 0 if isinstance(n, str) else size == n for n, size in zip(known, array.shape, strict=True)
+        )
+        if not fits:
+            wanted, found = (",".join(map(str, each)) for each in (known, array.shape))
+            raise ValueError(f"{file}: {name}: expected the shape [{wanted}], found [{found}]; {again}")
+        sizes |= {n: found for n, found in zip(shape, array.shape, strict=True) if isinstance(n, str)}
+        wrong = int((~np.isfinite(array)).sum())
+        if wrong:
+            found = f"{wrong} of {array.size} that are not"
+            raise ValueError(f"{file}: {name}: expected finite numbers, found {found}; {again}")
+    return sizes
 
 
 def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:

@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -144,6 +145,21 @@ def test_what_is_frozen_looks_the_same_in_all_frames(run):
     moving = images("{op: freeze, parts: [drawer]}")
     assert np.abs(moving[-1] - moving[0]).max() > 0.1
     np.testing.assert_array_equal(moving[0], frozen[0])
+
+
+def test_a_film_of_another_length_compiles_nothing(run, caplog):
+    saved = open_parts_run(run)
+    camera = saved.recording.judged.camera(0, 0)
+
+    def filmed(factor):
+        film = apply(parse_script(f"edits: [{{op: speed, parts: 1, factor: {factor}}}]"), saved.layer, {})
+        return len([*shots(film, camera, saved)])
+
+    assert filmed(0.5) == 7
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        assert filmed(0.25) == 13
+    compiled = [one.message for one in caplog.records if one.message.startswith("Compiling ")]
+    assert compiled == []
 
 
 def test_edits_without_a_script_from_another_camera(gsjax, run):

@@ -120,6 +120,18 @@ class TestScripts:
             ("edits: [{op: fade, parts: []}]", "parts: expected names or numbers of parts, or all, found []"),
             ("edits: [{op: fade, parts: [1.5]}]", "parts: expected names or numbers of parts, or all, found"),
             ("edits: [{op: fade, parts: [yes]}]", "parts: expected names or numbers of parts, or all, found"),
+            (f"fps: {'1' * 400}", "fps: expected frames a second, 0.1 to 1000, found 1111"),
+            (
+                f"edits: [{{op: move, parts: 1, by: [0, 0, {'9' * 400}]}}]",
+                "by: expected metres as [x, y, z], found",
+            ),
+            (
+                f"edits: [{{op: loop, parts: 1, times: {'9' * 400}}}]",
+                "times: expected a whole number from 1 to 1000",
+            ),
+            (f"fps: {'1' * 5000}", "expected YAML, found a value that cannot be read"),
+            ("length: 2026-02-30", "expected YAML, found a value that cannot be read: day is out of range"),
+            ("edits: " + "[" * 5000 + "]" * 5000, "found lists or mappings nested too deeply to be read"),
             (
                 "edits: [{op: fade, parts: 1, opacity: 2}]",
                 "opacity: expected a factor on opacities, 0 to 1, found 2",
@@ -195,6 +207,8 @@ class TestScripts:
             ("sped:parts=1", "did you mean 'speed'?"),
             ("speed", "parts: expected names or numbers of parts, or all, found nothing"),
             ("speed:parts=1,factor=[", "expected YAML, found"),
+            (f"speed:parts=1,factor={'1' * 400}", "factor: expected a factor from 0.01 to 100"),
+            ("speed:parts=" + "[" * 900 + "]" * 900, "found lists or mappings nested too deeply to be read"),
             ("", "op: expected one of isolate, freeze"),
         ],
     )
@@ -202,6 +216,17 @@ class TestScripts:
         with pytest.raises(ValueError) as error:  # noqa: PT011
             parse_op(line)
         assert message in str(error.value)
+
+    @pytest.mark.parametrize("depth", [10, 30, 60, 90, 120, 200, 1000])
+    def test_edits_in_edits_are_read_or_refused(self, depth):
+        """Wherever it is that Python cannot follow any more."""
+        line = "{op: composite, parts: 1, from_run: a, edits: [" * depth + "]}" * depth
+        try:
+            script = parse_script(f"edits: [{line}]")
+        except ValueError as error:
+            assert str(error) == "expected edits, found lists or mappings nested too deeply to be read"  # noqa: PT017
+        else:
+            assert parse_script(to_yaml(script)) == script
 
     @pytest.mark.parametrize("operation", OPERATIONS)
     def test_a_line_to_begin_with_is_an_edit(self, operation):
@@ -302,7 +327,10 @@ class TestLength:
             (Freeze(parts=(1,), begin=0.25, end=0.75), 13),
             (Freeze(parts=(1,), at=0.875, begin=0.25, end=0.75), 9),
             (Isolate(parts=(1,), begin=0.25, end=0.75), 13),
-            (Echo(parts=(1,)), 9),
+            (Echo(parts=(1,), copies=2, every=0.25), 13),  # the last copy ends at 1.5 s
+            (Echo(parts=(1,), copies=2, every=0.25, end=1.25), 11),
+            (Echo(parts=(1,), copies=2, every=0.25, end=0.5), 9),
+            (Echo(parts=(1,), copies=2, every=-0.25), 9),
         ],
     )
     def test_a_film_is_as_long_as_edits_need_it(self, edit, moments):
@@ -322,6 +350,20 @@ class TestLength:
         """At the end of the film the part still moves."""
         before, last = np.asarray(film_of(edit)[0].trajectory.poses.quats[-2:, 1])
         assert np.abs(last - before).max() > 1e-3
+
+    def test_copies_are_seen_to_their_end(self):
+        film = film_of(Echo(parts=(1,), copies=2, every=0.25))
+        np.testing.assert_array_equal(
+            film[2].trajectory.poses.quats[:, 1], layer_of().trajectory.poses.quats[[0] * 4 + [*range(9)], 1]
+        )
+
+    def test_of_copies_the_scene_itself_knows_nothing(self):
+        """It goes backwards from its own end."""
+        shows(
+            film_of(Echo(parts=(1,), copies=2, every=0.25), Speed(parts=(1,), factor=-1), length=1),
+            1,
+            range(8, 0, -1),
+        )
 
     def test_length_and_fps_say_otherwise(self):
         for options, times in (
@@ -378,6 +420,25 @@ class TestFilms:
         shows(film, 1, [8, 7, 6, 5, 4, 3, 2, 2, 2, 1, 0])
         shows(film, 2, [8, 7, 6, 5, 4, 3, 2, 1, 0, 0, 0])
         shows(film, 3, [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8])
+
+    @pytest.mark.parametrize("edit", [Speed, Loop])
+    def test_what_is_over_stands_still_whatever_is_done_to_all(self, edit):
+        """The drawer is done after 0.25 s, when all others begin to go backwards."""
+        keys = {"factor": -1} if edit is Speed else {"bounce": True, "times": 1}
+        first = Speed(parts=("drawer",), factor=4)
+        film = film_of(first, edit(parts=("all",), begin=0.25, **keys), length=1.125)
+        alone = film_of(edit(parts=("lid",), begin=0.25, **keys), length=1.125)
+        shows(film, 1, [0, 4, 8, 8, 8, 8, 8, 8, 8])
+        assert_same(rows(film[0].trajectory, [2], range(9)), rows(alone[0].trajectory, [2], range(9)))
+
+    def test_it_is_an_error_only_if_none_of_them_moves(self):
+        first = Speed(parts=("drawer", "lid"), factor=4)
+        then = {"factor": 2, "begin": 0.5}
+        assert len(film_of(first, Speed(parts=("all",), **then))[0].trajectory.times) == 7
+        with pytest.raises(
+            ValueError, match=r"edit 2 \(speed\): from: .* before 0\.25, .* of lid, part 1 ends, found"
+        ):
+            film_of(first, Speed(parts=("lid", 1), **then))
 
     def test_a_loop_fills_the_film(self):
         shows(film_of(Loop(parts=(2,)), length=2.5), 2, [*range(8), *range(8), *range(4)])
@@ -438,7 +499,7 @@ class TestFilms:
         )
 
     def test_echo_adds_layers_of_the_part_alone(self):
-        film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5))
+        film = film_of(Echo(parts=("faucet",), copies=2, every=0.25, fade=0.5, begin=0.5), length=1.125)
         assert [layer.scene.gaussians.num for layer in film] == [8, 2, 2]
         opacities = np.asarray(layer_of().trajectory.opacities[:, 3])
         first, second = (np.asarray(layer.trajectory.opacities[:, 3]) for layer in film[1:])
@@ -461,7 +522,7 @@ class TestFilms:
             (Fade(parts=(4,)), "edit 2 (fade): parts: expected numbers from 0 to 3, found 4"),
             (
                 Speed(parts=(1,), factor=2, begin=1.5),
-                "edit 2 (speed): from: expected a time before 1, where the motion ends, found 1.5",
+                "edit 2 (speed): from: expected a time before 1, where the motion of part 1 ends, found 1.5",
             ),
             (Loop(parts=(1,), begin=1), "edit 2 (loop): from: expected a time before 1"),
             (
@@ -521,6 +582,31 @@ class TestComposite:
         film = self.film(begin=0.5, end=0.75)
         shown = np.asarray(film[1].trajectory.opacities[:, 1]) > 0
         np.testing.assert_array_equal(shown, [0, 0, 0, 0, 1, 1, 0, 0, 0])
+
+    @pytest.mark.parametrize(
+        ("keys", "moments"),
+        [
+            ({}, 9),  # 0.5 s of another run, in a film of 1 s
+            ({"edits": (Speed(parts=("cup",), factor=0.25),)}, 17),
+            ({"edits": (Speed(parts=("cup",), factor=0.25),), "end": 1.5}, 13),
+            ({"edits": (Speed(parts=("hand",), factor=0.25),)}, 9),  # which is not brought in
+            ({"edits": (Echo(parts=("hand",), copies=1, every=0.75),)}, 11),  # but a copy of it is
+            (
+                {"edits": (Composite(parts=(1,), from_run="elsewhere", edits=(Loop(parts=(1,), times=4),)),)},
+                17,
+            ),
+        ],
+    )
+    def test_they_are_seen_to_the_end_of_their_motion(self, keys, moments):
+        film = self.film(**keys)
+        assert [len(layer.trajectory.times) for layer in film] == [moments] * len(film)
+
+    def test_a_run_that_is_longer_is_seen_to_its_end_too(self):
+        longer = layer_of(5, moments=13)
+        film = film_of(Composite(parts=(1,), from_run="x"), load_scene=lambda path: (longer, NAMES))
+        np.testing.assert_allclose(
+            film[1].trajectory.opacities[:, 1], longer.trajectory.opacities[:, 1], rtol=1e-6
+        )
 
     def test_a_part_is_looked_up_there(self):
         with pytest.raises(

@@ -1,6 +1,7 @@
 """The logic of `gsjax view`'s page, without a browser: rays, colours, cameras, pictures, words."""
 
 import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ from gsjax.viz.viewer.drawing import Drawer, Drawn, picture_of, recolored
 from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.page import frame_pause, over, unique
 from gsjax.viz.viewer.pick import Picked
+from gsjax.viz.viewer.player import Player
 from gsjax.viz.viewer.server import free_port, is_loopback
 from gsjax.viz.viewer.shot_nodes import shrunk
 from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
@@ -508,6 +510,33 @@ def test_what_never_settles_is_done_at_last():
             break
     assert done.is_set()
     worker.close()
+
+
+# playing
+
+
+def test_play_stop_play_at_once_is_one_player():
+    """The first has not heard yet that it is to stop when the second begins."""
+    waits, told = [], []
+
+    def pause():
+        waits.append(threading.current_thread())
+        return 0.3
+
+    player = Player(lambda: None, pause, told.append)
+    for _ in range(3):
+        player.toggle()
+    assert told == [True, False, True]
+    until = time.monotonic() + 30
+    while len(set(waits)) < 2 or sum(thread.is_alive() for thread in set(waits)) > 1:
+        assert time.monotonic() < until, "two play"
+        time.sleep(0.01)
+    player.close()
+    for thread in set(waits):
+        thread.join(30)
+        assert not thread.is_alive()
+    player.toggle()
+    assert told == [True, False, True]
 
 
 # words

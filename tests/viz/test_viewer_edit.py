@@ -135,14 +135,14 @@ def test_a_list_is_put_together_previewed_and_reset():
 def test_playing_goes_on_with_what_is_previewed():
     scene = rising(ball(RED, 0.0), 4, Edits().editing())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
-        page._toggle_play()
+        page._player.toggle()
         page._edits._list.value = "longer:"
         until(lambda: page._frame == 7)
         page._edits._list.value = ""
         until(lambda: page._slider.max == 3)
         until(lambda: page._frame == 2)
         until(lambda: page._frame == 0)
-        page._toggle_play()
+        page._player.toggle()
 
 
 def test_a_film_is_kept_with_its_progress():

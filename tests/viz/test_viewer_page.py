@@ -13,6 +13,7 @@ from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.viz.colors import label_color
 from gsjax.viz.viewer import Shots, Viewable, moved, open_viewer
 from gsjax.viz.viewer.cameras import first_pose
+from gsjax.viz.viewer.page import Page
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.2)
@@ -192,11 +193,11 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         page._slider.value = 0
         until(lambda: page._client.scene.get_handle_by_name("/picked/shape") is None)
         # Time goes on by itself, and stops.
-        page._toggle_play()
+        page._player.toggle()
         assert page._play.label == "Stop"
         until(lambda: page._frame == 3)
         until(lambda: page._frame == 0)
-        page._toggle_play()
+        page._player.toggle()
         until(lambda: page._play.label == "Play")
         # Photographs: where they were taken, and going there.
         page._shots.show(True, 0)
@@ -216,6 +217,23 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         page._keep("render", page._picture)
         assert saved.pictures[0][0] == "render"
         assert saved.pictures[0][1].shape == (104, 160, 3)
+
+
+def test_a_page_can_be_touched_while_it_is_built(scene, monkeypatch):
+    built = Page._build_shots
+
+    def touched(page, nodes):
+        """The slider and the colours are there, the render is not yet."""
+        built(page, nodes)
+        page._slider.value = 2
+        page._coloring.value = "label"
+        time.sleep(0.5)
+
+    monkeypatch.setattr(Page, "_build_shots", touched)
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        until(lambda: page._now.frame == 2 and "300 Gaussians" in page._status.content)
+        drawn_after(page, lambda: setattr(page._shown, "value", "alpha"))
+        until(lambda: "green ball" in page._legend.content)
 
 
 def test_a_page_of_a_plain_scene_offers_no_more_than_it_has(scene):

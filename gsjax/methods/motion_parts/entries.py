@@ -16,6 +16,7 @@ ALL = "all"
 Vector = tuple[float, ...]
 Checked = dict[str, Any]
 """Metadata of a field."""
+_LONG = 200  # letters of what was found, in a message
 _FAR = 1e6  # more metres, degrees or seconds than anybody means
 
 
@@ -69,7 +70,8 @@ def _checked(f: Field, value: Any) -> Any:
 
 def told(found: Any) -> str:
     """What was found, in a message."""
-    return "nothing" if found is None else repr(found)
+    text = "nothing" if found is None else repr(found)
+    return text if len(text) <= _LONG else f"{text[:_LONG]} ..."
 
 
 def did_you_mean(found: Any, known: Collection[str]) -> str:
@@ -84,7 +86,7 @@ def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = f
     def check(value: Any) -> float:
         try:
             found = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):  # that of a whole number of hundreds of digits
             found = math.nan
         if not low <= of(found) <= high:
             raise ValueError(f"expected {wanted}, found {told(value)}")

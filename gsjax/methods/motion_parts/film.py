@@ -50,7 +50,7 @@ def trimmed(film: Film) -> Film:
     for layer in film:
         scene = layer.scene
         # How visible a shown part is makes no difference: a faded one shall not change all shapes.
-        shown = jnp.any(layer.trajectory.opacities > 0, axis=0).astype(scene.weights.dtype)
+        shown = (np.asarray(layer.trajectory.opacities) > 0).any(axis=0).astype(scene.weights.dtype)
         rows = np.flatnonzero(scene.gaussians.opacities * (scene.weights @ shown) >= _FAINTEST)
         if len(rows) or not layers:
             seen = PartScene(take(scene.gaussians, rows), scene.weights[rows], scene.centers)

@@ -57,13 +57,17 @@ class Edit(Entry):
         if self.begin is not None and self.end is not None and not self.begin < self.end:
             raise ValueError(f"to: expected a time after from, {self.begin:g}, found {self.end:g}")
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
-        """Which parts change."""
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        """Which parts change, if these are named and the motion of each part of the scene ends at `lasts`."""
         return parts
 
     def ends(self, last: float) -> float:
         """When the motion of a part that concerns it ends, if it ended at `last`, seconds."""
         return last
+
+    def adds_until(self, last: float) -> float:
+        """When the motion ends of what it adds to the film, which is that of a part that ends at `last`."""
+        return 0.0
 
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         """The film after it.
@@ -79,6 +83,16 @@ class Edit(Entry):
 class TimeEdit(Edit):
     """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
 
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        """Those that still move at `from`: what is over stands still, whatever is done to all."""
+        begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
+        moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
+        if not moving:
+            told = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
+            expected = f"a time before {last:g}, where the motion of {told} ends"
+            raise ValueError(f"from: expected {expected}, found {begin:g}")
+        return moving
+
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         trajectory = film[0].trajectory
         for part in parts:
@@ -87,10 +101,7 @@ class TimeEdit(Edit):
 
     def stretch(self, last: float) -> tuple[float, float]:
         """From when to when, for a part whose motion ends at `last`."""
-        begin, end = self.begin or 0.0, last if self.end is None else self.end
-        if not begin < end:
-            raise ValueError(f"from: expected a time before {end:g}, where the motion ends, found {begin:g}")
-        return begin, end
+        return self.begin or 0.0, last if self.end is None else self.end
 
     def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
         """The trajectory after it."""
@@ -136,6 +147,9 @@ class Freeze(TimeEdit):
 
     at: float | None = field(default=None, metadata=_SECONDS)
 
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        return parts
+
     def stretch(self, last: float) -> tuple[float, float]:
         begin = self.begin if self.begin is not None else self.at or 0.0
         end = math.inf if self.end is None else self.end
@@ -156,7 +170,7 @@ class Freeze(TimeEdit):
 class Isolate(Freeze):
     """Only these parts keep moving: all others freeze."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 
@@ -192,7 +206,7 @@ class Fade(LookEdit):
 class Ghost(Fade):
     """Only these parts are shown: all others, the background too, vanish or become translucent."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int]) -> list[int]:
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 
@@ -262,6 +276,9 @@ class Echo(LookEdit):
     every: float = field(default=0.2, metadata=number("seconds other than 0", 1e-3, 1e4, of=abs))
     fade: float = field(default=0.5, metadata=_OPACITY)
 
+    def adds_until(self, last: float) -> float:
+        return min(last + max(self.copies * self.every, 0.0), math.inf if self.end is None else self.end)
+
     def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
         scene, trajectory = film[0].scene, film[0].trajectory
         copies = [
@@ -301,6 +318,9 @@ class Composite(LookEdit):
     edits: tuple[Edit, ...] = field(
         default=(), metadata={"check": lambda value: read_edits(value), "wanted": "a list of edits"}
     )
+
+    def adds_until(self, last: float) -> float:
+        return last if self.end is None else min(last, self.end)
 
     def joined(self, film: Film, other: Film, parts: list[int]) -> Film:
         """The film with `parts` of the other's first layer in it, and its further layers whole."""

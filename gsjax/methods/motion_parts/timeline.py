@@ -10,7 +10,7 @@
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -61,8 +61,9 @@ def parse_script(text: str) -> Script:
         ValueError: it is no YAML, or an entry is not as expected; the message names the edit by its number,
             the operation and the key.
     """
-    found = _yaml(text)
-    return read(Script, {} if found is None else found)
+    with _not_too_deep():
+        found = _yaml(text)
+        return read(Script, {} if found is None else found)
 
 
 def parse_op(text: str, number: int = 1) -> Edit:
@@ -76,8 +77,9 @@ def parse_op(text: str, number: int = 1) -> Edit:
     """
     operation, _, pairs = text.partition(":")
     pairs = re.sub(r"(^|,)\s*(\w+)\s*=", r"\1 \2: ", pairs)
-    (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
-    return edit
+    with _not_too_deep():
+        (edit,) = read_edits([_yaml(f"{{op: {operation}, {pairs}}}")], number)
+        return edit
 
 
 def to_yaml(script: Script) -> str:
@@ -100,23 +102,80 @@ def apply(script: Script, layer: Layer, names: Names, load_scene: LoadScene | No
     recorded = np.asarray(layer.trajectory.times, np.float64)
     recorded = recorded - recorded[0]
     step = 1 / script.fps if script.fps else _step(recorded)
-    _, lasts = _planned(script.edits, layer, names)[-1]
-    length = script.length or max(lasts) + step
+    plan = _planned(script.edits, layer, names, load_scene)
+    length = script.length or plan.end(range(layer.scene.num_parts)) + step
     times = _reaching(np.zeros(1) if script.fps else recorded, step, length)
-    return trimmed(_edited(script.edits, layer, names, times[times < length - _INSTANT], step, load_scene))
+    return trimmed(_edited(plan, times[times < length - _INSTANT], step))
 
 
-def _edited(
-    edits: Sequence[Edit],
-    layer: Layer,
-    names: Names,
-    times: Float[np.ndarray, "T"],
-    step: float,
-    load_scene: LoadScene | None,
-) -> Film:
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One edit of a plan.
+
+    Attributes:
+        edit: what is asked for.
+        parts: that it changes, or brings in.
+        lasts: when the motion of each part of the scene ends before it, seconds.
+        brought: what it brings in, if that is what it does.
+    """
+
+    edit: Edit
+    parts: list[int]
+    lasts: list[float]
+    brought: "_Plan | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What edits of a scene come to, before any of them is done.
+
+    Attributes:
+        layer: the scene as it was found.
+        steps: one after the other.
+        lasts: when the motion of each part of the scene ends after all of them, seconds.
+        added: when that of all copies and of all that was brought in ends.
+    """
+
+    layer: Layer
+    steps: list[_Step]
+    lasts: list[float]
+    added: float
+
+    def end(self, parts: Iterable[int]) -> float:
+        """When nothing moves any more of some parts of the scene and of what was added, seconds."""
+        return max([self.added, *(self.lasts[p] for p in parts)])
+
+
+def _planned(edits: Sequence[Edit], layer: Layer, names: Names, load_scene: LoadScene | None) -> _Plan:
+    num, times = layer.scene.num_parts, layer.trajectory.times
+    lasts, steps, added = [float(times[-1] - times[0])] * num, [], 0.0
+    for place, edit in enumerate(edits):
+        with _said_of(place, edit):
+            if isinstance(edit, Composite):
+                parts, brought = _brought(edit, load_scene)
+                steps.append(_Step(edit, parts, lasts, brought))
+                added = max(added, edit.adds_until(brought.end(parts)))
+            else:
+                parts = edit.concerned(layer.trajectory, _numbers(edit.parts, names, num), lasts)
+                steps.append(_Step(edit, parts, lasts))
+                added = max([added, *(edit.adds_until(lasts[p]) for p in parts)])
+                lasts = [edit.ends(last) if p in parts else last for p, last in enumerate(lasts)]
+    return _Plan(layer, steps, lasts, added)
+
+
+def _brought(edit: Composite, load_scene: LoadScene | None) -> tuple[list[int], _Plan]:
+    """The parts that a composite brings in, and what its own edits of them come to."""
+    if load_scene is None:
+        raise ValueError("from_run: expected load_scene, which reads other runs, found none; pass it on")
+    layer, names = load_scene(edit.from_run)
+    parts = _numbers(edit.parts, names, layer.scene.num_parts)
+    return parts, _planned(edit.edits, layer, names, load_scene)
+
+
+def _edited(plan: _Plan, times: Float[np.ndarray, "T"], step: float) -> Film:
     """The film at `times`. While it is edited it is as long as any edit needs it."""
-    plan = _planned(edits, layer, names)
-    longest = max(last for _, lasts in plan for last in lasts)
+    layer = plan.layer
+    longest = max(last for lasts in (*(at.lasts for at in plan.steps), plan.lasts) for last in lasts)
     dtype = layer.trajectory.times.dtype
     longer = _reaching(times, step, longest + step)
     longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % ROUND))
@@ -124,44 +183,18 @@ def _edited(
         lambda t: t.times, layer.trajectory, layer.trajectory.times - layer.trajectory.times[0]
     )
     film: Film = (Layer(layer.scene, at_times(recorded, jnp.asarray(longer, dtype))),)
-    for place, edit in enumerate(edits):
-        parts, lasts = plan[place]
-        with _said_of(place, edit):
-            if isinstance(edit, Composite):
-                film = _composed(edit, film, longer, step, load_scene)
+    for place, at in enumerate(plan.steps):
+        with _said_of(place, at.edit):
+            if isinstance(at.edit, Composite) and at.brought is not None:
+                film = at.edit.joined(film, _edited(at.brought, longer, step), at.parts)
             else:
-                film = edit.edited(film, parts, lasts)
+                film = at.edit.edited(film, at.parts, at.lasts)
     return tuple(Layer(one.scene, _begun(one.trajectory, len(times))) for one in film)
 
 
 def _begun(trajectory: Trajectory, moments: int) -> Trajectory:
-    """Its first moments. On the host, where nothing is compiled for it."""
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:moments]), trajectory)
-
-
-def _composed(
-    edit: Composite, film: Film, times: Float[np.ndarray, "T"], step: float, load_scene: LoadScene | None
-) -> Film:
-    """The film with parts of another run in it."""
-    if load_scene is None:
-        raise ValueError("from_run: expected load_scene, which reads other runs, found none; pass it on")
-    layer, names = load_scene(edit.from_run)
-    parts = _numbers(edit.parts, names, layer.scene.num_parts)
-    return edit.joined(film, _edited(edit.edits, layer, names, times, step, load_scene), parts)
-
-
-def _planned(edits: Sequence[Edit], layer: Layer, names: Names) -> list[tuple[list[int], list[float]]]:
-    """For each edit the parts that it changes, and when the motion of each part ends before it. A last row,
-    of no parts, has when it ends after all edits."""
-    num, times = layer.scene.num_parts, layer.trajectory.times
-    lasts, plan = [float(times[-1] - times[0])] * num, []
-    for place, edit in enumerate(edits):
-        with _said_of(place, edit):
-            brings = isinstance(edit, Composite)  # parts of another scene
-            parts = [] if brings else edit.concerned(layer.trajectory, _numbers(edit.parts, names, num))
-            plan.append((parts, lasts))
-            lasts = [edit.ends(last) if p in parts else last for p, last in enumerate(lasts)]
-    return [*plan, ([], lasts)]
+    """Its first moments. On the host, where nothing is compiled for it (`jnp.asarray` would)."""
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[:moments]), trajectory)
 
 
 def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
@@ -194,7 +227,7 @@ def _reaching(times: Float[np.ndarray, "T"], step: float, until: float) -> Float
         found = f"{until:g} s at {1 / step:g} frames a second"
         raise ValueError(
             f"length: expected at most {MOST_MOMENTS} moments, also between edits, found {found}; "
-            "loop less often or slow down less"
+            "loop or echo less often, or slow down less"
         )
     more = max(0, int(np.ceil((until - times[-1]) / step - _INSTANT)) - 1)
     return np.concatenate([times, times[-1] + step * np.arange(1, more + 1)])
@@ -220,6 +253,17 @@ def _yaml(text: str) -> Any:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         said = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
         raise ValueError(f"expected YAML, found {said}") from None
+    except (ValueError, OverflowError) as error:  # of a date that is none, a number too long to read
+        raise ValueError(f"expected YAML, found a value that cannot be read: {error}") from None
+
+
+@contextmanager
+def _not_too_deep() -> Iterator[None]:
+    """What is nested deeper than Python can follow is said to be."""
+    try:
+        yield
+    except RecursionError:
+        raise ValueError("expected edits, found lists or mappings nested too deeply to be read") from None
 
 
 @contextmanager

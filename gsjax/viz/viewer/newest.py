@@ -15,13 +15,26 @@ class Newest:
         work: what to do; it must not raise.
         settle_s: seconds.
         patience_s: seconds.
+        hold: only note what is asked for, until told to `begin`.
     """
 
-    def __init__(self, work: Callable[[], None], settle_s: float = 0.0, patience_s: float = 0.0):
+    def __init__(
+        self,
+        work: Callable[[], None],
+        settle_s: float = 0.0,
+        patience_s: float = 0.0,
+        hold: bool = False,
+    ):
         self._work, self._settle_s, self._patience_s = work, settle_s, patience_s
         self._changed = threading.Condition()
         self._asked = self._closed = False
-        threading.Thread(target=self._run, name="gsjax viewer", daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name="gsjax viewer", daemon=True)
+        if not hold:
+            self.begin()
+
+    def begin(self) -> None:
+        """Work from now on, also at what was asked for before. Once."""
+        self._thread.start()
 
     def ask(self) -> None:
         """Have it done, soon."""

@@ -24,6 +24,7 @@ from gsjax.viz.viewer.drawing import Drawer, Shown, picture_of, recolored
 from gsjax.viz.viewer.edit_folder import EditFolder
 from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.pick import Picked, pick
+from gsjax.viz.viewer.player import Player
 from gsjax.viz.viewer.shot_nodes import ShotNodes, shrunk
 from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
 from gsjax.viz.viewer.splats import Palette, depth_range
@@ -79,22 +80,24 @@ class Page:
         self._shot: int | None = None
         self._photographed: tuple[Shots, int, int] | None = None
         self._start = first_pose(scene)
-        self._playing = threading.Event()
-        self._closed = threading.Event()
+        self._player = Player(self._step, lambda: frame_pause(self._now.scene.times), self._label_play)
         self._lock = threading.Lock()
         self._splats = SplatNodes(client.scene, scene, shared.max_gaussians)
+        # What stands on the page can be touched before all of it is there.
+        self._sender = Newest(self._send_splats, 0.0, 0.0, hold=True)
+        self._renderer = Newest(self._render, _SETTLE_S, _PATIENCE_S, hold=True)
         self._shots = None if scene.shots is None else self._frusta(scene.shots)
         self._build()
         self._send_splats()
-        self._sender = Newest(self._send_splats, 0.0, 0.0)
-        self._renderer = Newest(self._render, _SETTLE_S, _PATIENCE_S)
+        self._sender.begin()
+        self._renderer.begin()
         client.camera.on_update(lambda _: self._moved())
         client.scene.on_click()(self._clicked)
         self._renderer.ask()
 
     def close(self) -> None:
         """Stop what runs for this page."""
-        self._closed.set()
+        self._player.close()
         self._sender.close()
         self._renderer.close()
         if self._edits is not None:
@@ -114,7 +117,7 @@ class Page:
                 self._moment = gui.add_markdown(words.moment(scene, 0))
                 self._play = gui.add_button("Play", color="gray")
                 self._slider.on_update(lambda _: self._to_frame(int(self._slider.value)))
-                self._play.on_click(lambda _: self._toggle_play())
+                self._play.on_click(lambda _: self._player.toggle())
         self._edits = None
         if scene.editing is not None and scene.num_frames > 1:
             shared = self._shared
@@ -194,19 +197,12 @@ class Page:
             self._told.content = words.HOW_TO_PICK
         self._moved()
 
-    def _toggle_play(self) -> None:
-        if self._playing.is_set():
-            self._playing.clear()
-            return
-        self._playing.set()
-        self._play.label = "Stop"
-        threading.Thread(target=self._run, name="gsjax playing", daemon=True).start()
+    def _step(self) -> None:
+        """To the next frame; after the last, to the first."""
+        self._slider.value = (int(self._slider.value) + 1) % self._now.scene.num_frames
 
-    def _run(self) -> None:
-        """Frame after frame, from the first again after the last."""
-        while self._playing.is_set() and not self._closed.wait(frame_pause(self._now.scene.times)):
-            self._slider.value = (int(self._slider.value) + 1) % self._now.scene.num_frames
-        self._play.label = "Play"
+    def _label_play(self, plays: bool) -> None:
+        self._play.label = "Stop" if plays else "Play"
 
     def _visit_named(self, name: str) -> None:
         now = self._present()
