@@ -5,11 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsjax.geometry.joints import Joint
 from gsjax.methods.motion_parts.trajectory import Moment, PartScene, Trajectory, trajectory_of
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import HandlePose
 
 STEP = 0.125  # seconds between moments: all times are told exactly, so moments can be hit to the bit
+TIMES = STEP * np.arange(9.0)  # 0 to 1 s
+CENTERS = np.array([[0.0, 0.0, 0.0], [0.4, 0.1, 0.2], [-0.5, 0.3, 0.0]])
+"""Handles of a background, a lid and a drawer."""
 
 
 def scene_of(seed, num=7, parts=3):
@@ -48,6 +52,10 @@ def trajectory(seed, moments=9, parts=4):
     opacities, scales = rng.uniform(0.1, 0.9, (moments, parts)), rng.uniform(0.5, 2.0, (moments, parts))
     poses = HandlePose(jnp.asarray(turns), jnp.asarray(shifts))
     return Trajectory(STEP * jnp.arange(float(moments)), poses, jnp.asarray(opacities), jnp.asarray(scales))
+
+
+def hinge(angles, axis=(0.0, 0.0, 1.0), point=(0.0, 0.0, 0.0)):
+    return Joint("revolute", np.array(axis), np.array(point), np.asarray(angles, float))
 
 
 def jointed(joints, centers, times):
