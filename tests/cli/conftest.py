@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-import gsjax.cli.loop
-import gsjax.cli.track
-from gsjax.cli import main
+from gsjax.cli import loop, main, track
 from gsjax.data import write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
@@ -70,8 +68,8 @@ def standing_still(scene, first, frames, config, **how):
 @pytest.fixture
 def still(monkeypatch):
     """Tracking is replaced by standing still, which compiles nothing; that is given."""
-    monkeypatch.setattr(gsjax.cli.track, "start_scene", unfitted)
-    monkeypatch.setattr(gsjax.cli.loop, "track", standing_still)
+    monkeypatch.setattr(track, "start_scene", unfitted)
+    monkeypatch.setattr(loop, "track", standing_still)
     return standing_still
 
 
