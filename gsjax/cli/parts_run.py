@@ -1,12 +1,15 @@
 """A run of `gsjax parts` read back: the scene, where its parts went, and the recording that it came from."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import yaml
 
 from gsjax.cli.recording import Recording
 from gsjax.cli.run_files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
@@ -66,10 +69,20 @@ def open_parts_run(path: Path) -> PartsRun:
         ValueError: a file holds something else than a run writes, or its recording cannot be opened.
     """
     layer, names, complete = _read(path)
-    recording, blend = reopen(
-        path / "config.yml", _AGAIN, lambda settings: settings["parts"]["stream"]["blend"]
-    )
+    recording, blend = reopen(path / "config.yml", _AGAIN, _blend)
     return PartsRun(path, layer, names, complete, recording, blend)
+
+
+def blend_of(path: Path) -> Blend:
+    """How a run blended rotations, whose recording need not be there; as usual where it does not say."""
+    try:
+        return _blend(yaml.safe_load((path / "config.yml").read_text(encoding="utf-8")))
+    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        return "quaternion"
+
+
+def _blend(settings: Mapping[str, Any]) -> Blend:
+    return settings["parts"]["stream"]["blend"]
 
 
 def read_parts(path: str | Path) -> tuple[Layer, Names]:

@@ -7,7 +7,7 @@ import yaml
 
 from gsjax.cli.editing import Filmed, camera_names, editing_of
 from gsjax.cli.messages import Notes
-from gsjax.cli.parts_run import open_parts_run, read_parts
+from gsjax.cli.parts_run import blend_of, open_parts_run, read_parts
 from gsjax.cli.photographs import photographs_of_run
 from gsjax.cli.recording import Recording
 from gsjax.cli.run_folder import expect_run
@@ -107,7 +107,7 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
             shots = _shots_of_recording(saved.recording)
         else:
             notes.warn("it is a partial run: only the frames that were followed are there, and no cameras")
-    times, blend = np.asarray(layer.trajectory.times), "quaternion" if saved is None else saved.blend
+    times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
     return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsjax.cli.parts_run import read_parts
+from gsjax.cli.parts_run import blend_of, read_parts
 from tests.cli.test_edit import write_run
 
 AGAIN = "; run gsjax parts again with this version of gsjax, or name another folder"
@@ -96,3 +96,15 @@ def test_scores_that_do_not_fit(run, change, says):
     (run / "metrics.json").write_text(json.dumps(metrics | change))
     assert said_of(run).startswith("metrics.json: expected ")
     assert says in said_of(run)
+
+
+def test_how_rotations_were_blended_is_known_without_the_recording(run):
+    config = run / "config.yml"
+    text = config.read_text()
+    assert "blend: quaternion" in text
+    config.write_text(text.replace("blend: quaternion", "blend: dual"))
+    assert blend_of(run) == "dual"
+    config.write_text("parts: 3")
+    assert blend_of(run) == "quaternion"
+    config.unlink()
+    assert blend_of(run) == "quaternion"
