@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.motion_parts.anchor import choose_anchor, difference_image, moved_pixels
+from gsjax.methods.motion_parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
 from gsjax.methods.motion_parts.config import DiscoverConfig, PartsConfig
 from gsjax.methods.motion_parts.discover import begin, pixel_width
 from gsjax.methods.motion_parts.lift import label_votes, lift_masks
@@ -83,6 +83,17 @@ def test_what_changed_is_where_it_is_and_where_it_goes(noise):
     pair = moved_pixels(load, anchor._replace(farthest=1), 1, frames=1)[0]
     assert pair[12:24, 18:22].all()
     assert pair[12:24, 30:38].mean() < 0.01
+
+
+@pytest.mark.parametrize("width", [96, 1280])
+def test_noise_is_no_motion_at_any_size(width):
+    def load(t, c):
+        rng = np.random.default_rng(t)
+        return np.clip(rng.normal(128, 0.1 * 255, (width * 9 // 16, width, 3)), 0, 255).astype(np.uint8)
+
+    anchor = Anchor(1, 0, np.ones(3))
+    with pytest.raises(ValueError, match="expected something that moves"):
+        moved_pixels(load, anchor, 1)
 
 
 def test_a_difference_is_that_of_colours():
