@@ -65,5 +65,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
                 front.append((row["update_s"], row[key]))
         axes.plot(*zip(*front, strict=True), color="0.7", zorder=0, drawstyle="steps-post")
         axes.set(xlabel="seconds a frame", ylabel=title, xscale="log")
+        axes.set_xticks([0.5, 1, 2, 4, 8], ["0.5", "1", "2", "4", "8"])
+        axes.set_xticks([], minor=True)
         axes.grid(color="0.9")
     drawing.savefig(path)

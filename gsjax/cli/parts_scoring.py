@@ -19,6 +19,7 @@ from gsjax.scene.handles import Blend
 
 _POINTS = 500  # of a part, by which its joint is fitted ...
 _FAR = 3.0  # ... none so many times as far from its middle as half of them: there, noise of a turn is large
+_NAMED_IOU = 0.25  # overlap with a true part below which a found one does not bear its name
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres about an object of which nothing is drawn
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
@@ -95,7 +96,7 @@ def score_parts(
 
     Returns:
         `ari` (over the Gaussians whose true label is known), `true_parts` (those that move), `missed` (the
-        names of those that no part was matched to).
+        names of those that no part overlaps with by a quarter).
     """
     sequence = recording.tracked
     truth = sequence.truth
@@ -121,9 +122,12 @@ def score_parts(
     match = match_parts(found, known)
     names = dict(zip(poses, truth.names, strict=True))
     joint_of = dict(zip(poses, truth.joints or [None] * len(poses), strict=True))
-    for label, part in match.found.items():
-        if label == BACKGROUND or part == BACKGROUND:
-            continue
+    pairs = {
+        label: part
+        for label, part in match.found.items()
+        if BACKGROUND not in (label, part) and match.ious[label] >= _NAMED_IOU
+    }
+    for label, part in pairs.items():
         row = rows[part - 1]
         row |= {"true_name": names[label], "iou": match.ious[label], **motion_metrics(scores[label])}
         row["moved_mm"] = scores[label].moved_mm
@@ -132,11 +136,13 @@ def score_parts(
             middle = means[found == part].mean(0)
             row |= joint_error(fitted.joint, joint, middle, anchor)._asdict()
             row["value"] = row["value_deg"] if joint.kind == "revolute" else row["value_mm"]
-    matched = {label for label, part in match.found.items() if part != BACKGROUND}
+    missed = [names[label] for label in moving if label not in pairs]
+    if missed:
+        notes.warn(f"of what truly moves, no part that was found is {', '.join(missed)}")
     return {
         "ari": adjusted_rand_index(found, known),
         "true_parts": len(moving),
-        "missed": [names[label] for label in moving if label not in matched],
+        "missed": missed,
     }
 
 
