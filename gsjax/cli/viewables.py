@@ -37,7 +37,7 @@ def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
-            "keeps no scene; let `gsjax fit` or `gsjax track` finish (--resume goes on)"
+            "keeps no scene; let it finish (--resume goes on)"
         )
     if (path / "parts.npz").is_file():
         return _of_parts(path, notes), path
