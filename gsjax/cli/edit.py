@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.cli.films import SCRIPT, Shot, edited, write_film
+from gsjax.cli.films import SCRIPT, Shot, edited, new_folder, write_film
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.methods.motion_parts.operations import OPERATIONS
@@ -19,6 +19,7 @@ HELP = (
     f" Operations: {', '.join(OPERATIONS)}. A script is a YAML file, `edits: [{{op: speed, parts: [door], "
     "factor: 2}]`, which may also have fps and length (seconds)."
 )
+_UNNAMED = "ops"
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Options:
     op: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OP:KEY=VALUE,...")] = ()
     """One edit, after those of the script: "speed:parts=drawer,factor=2". Can be given again and again."""
     out: Path | None = None
-    """Folder for the film. RUN/edit/NAME unless given, NAME being the script's, or "ops" without one."""
+    """Folder for the film. RUN/edit/NAME unless given, NAME being the script's, or without one "ops", "ops_2"
+    and so on."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the camera to film from. The first held out one, else the first, unless given."""
     ply: bool = False
@@ -55,9 +57,9 @@ def run(options: Options) -> int:
         script = read_script(options)
         saved = open_parts_run(options.run)
         camera = saved.camera(options.camera)
-        folder = _folder(options)
         with console.status("editing"):
             film, doubts = edited(script, saved)
+        folder = _folder(options)
         for doubt in doubts:
             notes.warn(doubt)
 
@@ -106,7 +108,9 @@ def _folder(options: Options) -> Path:
         FileExistsError: something is there that is no film, or one that may not be replaced.
         NotADirectoryError: it is a file.
     """
-    name = "ops" if options.script is None else options.script.stem
+    if options.out is None and options.script is None and not options.overwrite:
+        return new_folder(options.run / "edit", _UNNAMED)
+    name = _UNNAMED if options.script is None else options.script.stem
     folder = options.run / "edit" / name if options.out is None else options.out
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder}: expected a folder, found a file; name another --out")

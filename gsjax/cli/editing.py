@@ -1,6 +1,5 @@
 """A run of `gsjax parts` in the viewer: as a film, and how to edit it there, as `gsjax edit` does."""
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 from rich.console import Console
 
-from gsjax.cli.films import Shot, edited, frames_of, write_film
+from gsjax.cli.films import Shot, edited, frames_of, new_folder, write_film
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import PartsRun
 from gsjax.cli.recording import Recording
@@ -24,8 +23,6 @@ from gsjax.methods.motion_parts.trajectory import BACKGROUND
 from gsjax.scene.gaussians import concatenate, take
 from gsjax.scene.handles import Blend
 from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable
-
-_NAME = re.compile(r"\w[\w .-]*")  # of a folder that lies where it should
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,27 +108,6 @@ def script_of(lines: Sequence[str]) -> Script:
         ValueError: one is not as it should be; the message names the edit by its number.
     """
     return Script(edits=tuple(parse_op(line, number) for number, line in enumerate(lines, 1)))
-
-
-def new_folder(parent: Path, name: str) -> Path:
-    """A new folder of that name, with a number behind it if there is one.
-
-    Raises:
-        ValueError: that is no name for a folder.
-    """
-    if not _NAME.fullmatch(name):
-        raise ValueError(
-            f"film name: expected letters, digits, spaces and any of . _ - behind the first, found {name!r}"
-        )
-    number, folder = 1, parent / name
-    while True:
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            number += 1
-            folder = parent / f"{name}_{number}"
-        else:
-            return folder
 
 
 def camera_names(recording: Recording) -> dict[str, int]:

@@ -1,5 +1,6 @@
 """The film that edits make of a run of `gsjax parts`, and its folder, whoever asks for it."""
 
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
@@ -31,6 +32,7 @@ from gsjax.scene.render import render_with_room
 SCRIPT = "edit.yaml"
 """What tells the folder of a film from others."""
 _VIDEO, _METRICS, _PLY = "video.mp4", "metrics.json", "ply"
+_NAME = re.compile(r"\w[\w .-]*")  # of a folder that lies where it should
 
 
 class Shot(NamedTuple):
@@ -67,6 +69,27 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
         doubts.append(". ".join(beyond))
     return film, doubts
+
+
+def new_folder(parent: Path, name: str) -> Path:
+    """A new folder of that name, with a number behind it if there is one.
+
+    Raises:
+        ValueError: that is no name for a folder.
+    """
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"film name: expected letters, digits, spaces and any of . _ - behind the first, found {name!r}"
+        )
+    number, folder = 1, parent / name
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = parent / f"{name}_{number}"
+        else:
+            return folder
 
 
 def write_film(

@@ -180,6 +180,16 @@ def test_edits_without_a_script_from_another_camera(gsjax, run):
     np.testing.assert_allclose(there, np.asarray(scene.gaussians.means)[drawer] + shift, atol=1e-5)
 
 
+def test_films_of_ops_alone_are_numbered_on(gsjax, run):
+    once = ("edit", run, "--op", "freeze:parts=all")
+    for name in ("ops", "ops_2"):
+        assert gsjax(*once)[0] == 0
+        assert (run / "edit" / name / "video.mp4").is_file()
+    assert gsjax(*once, "--overwrite")[0] == 0
+    assert gsjax("edit", run, "--op", "freeze:parts=nobody")[0] == 2
+    assert sorted(folder.name for folder in (run / "edit").iterdir()) == ["ops", "ops_2"]
+
+
 def test_an_earlier_film_is_replaced_when_asked(gsjax, run, tmp_path):
     out = tmp_path / "film"
     once = ("edit", run, "--op", "freeze:parts=all", "--out", out)

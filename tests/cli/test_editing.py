@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from gsjax.cli.editing import new_folder, script_of
+from gsjax.cli.editing import script_of
+from gsjax.cli.films import new_folder
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.cli.viewables import open_viewable
