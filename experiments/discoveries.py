@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -22,6 +24,7 @@ from gsjax.metrics.temporal import temporal_scores
 from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.optical_flow import DisFlow
 from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.handles import HandlePose
 
 FOUND_IOU = 0.5
 
@@ -107,6 +110,14 @@ def with_parts(options: Options, **sections: dict[str, Any]) -> Options:
     for name, values in sections.items():
         parts = replace(parts, **{name: replace(getattr(parts, name), **values)})
     return replace(options, parts=parts)
+
+
+def pose_from(motions: Float[np.ndarray, "P 4 4"], centers: Float[np.ndarray, "P 3"]) -> HandlePose:
+    """The pose of handles at these places that moves the canonical scene by these rigid motions."""
+    centers = np.asarray(centers, np.float64)
+    shifts = np.einsum("pij,pj->pi", motions[:, :3, :3], centers) + motions[:, :3, 3] - centers
+    quats = jaxlie.SO3.from_matrix(jnp.asarray(motions[:, :3, :3], jnp.float32)).wxyz
+    return HandlePose(quats, jnp.asarray(shifts, jnp.float32))
 
 
 def told_the_truth(

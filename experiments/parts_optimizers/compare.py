@@ -15,11 +15,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import lineax
 import numpy as np
 import optimistix
-from discoveries import Options, canonical_of, told_the_truth
+from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Array, Float
 from recordings import recorded
 
@@ -122,18 +121,13 @@ def updates(gap: int, frames: tuple[int, ...] = FRAMES) -> list[Update]:
         sequence, read_ply(fitted)[0], ANCHOR, replace(PartsConfig(), weights="table")
     )
     canonical, weights = start.canonical, skinning_weights(start.field, start.canonical)
-    centers = np.asarray(canonical.centers, np.float64)
-
-    def pose(t: int) -> HandlePose:
-        shifts = np.einsum("pij,pj->pi", motions[t, :, :3, :3], centers) + motions[t, :, :3, 3] - centers
-        quats = jaxlie.SO3.from_matrix(jnp.asarray(motions[t, :, :3, :3], jnp.float32)).wxyz
-        return HandlePose(quats, jnp.asarray(shifts, jnp.float32))
-
+    centers = np.asarray(canonical.centers)
     found = []
     for t in frames:
         frame = sequence.frame(t + gap)
         sizes = {size: part_of(frame, (), size) for size in (HALF, WHOLE)}
-        found.append(Update(canonical, weights, pose(t), pose(t + gap), sizes))
+        before, after = (pose_from(motions[u], centers) for u in (t, t + gap))
+        found.append(Update(canonical, weights, before, after, sizes))
     return found
 
 

@@ -12,9 +12,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from discoveries import Options, canonical_of, told_the_truth
+from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Bool, Float, Int
 from recordings import recorded
 from scipy.ndimage import map_coordinates
@@ -177,15 +176,13 @@ def _masks(
     canonical, sequence = given.start.canonical, given.sequence
     weights = skinning_weights(given.start.field, canonical) if weights is None else weights
     shares = jnp.concatenate([weights, jax.nn.one_hot(jnp.zeros(canonical.fixed.num, int), weights.shape[1])])
-    centers, plan, found = np.asarray(canonical.centers, np.float64), None, []
+    centers, plan, found = np.asarray(canonical.centers), None, []
     draw = jax.jit(
         lambda gaussians, cameras, plan: render(gaussians, cameras, plan, features=shares),
         compiler_options=host_options(),
     )
     for t, motion in enumerate(motions):
-        shifts = np.einsum("pij,pj->pi", motion[:, :3, :3], centers) + motion[:, :3, 3] - centers
-        quats = jaxlie.SO3.from_matrix(jnp.asarray(motion[:, :3, :3], jnp.float32)).wxyz
-        gaussians = posed(canonical, weights, HandlePose(quats, jnp.asarray(shifts, jnp.float32)))
+        gaussians = posed(canonical, weights, pose_from(motion, centers))
         cameras = sequence.frame(t).cameras
         plan = plan or plan_render(gaussians, cameras, headroom=2.0)
         drawn = draw(gaussians, cameras, plan)
