@@ -91,13 +91,26 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     assert code == 0, said
     run = tmp_path / "run"
     arrays = dict(np.load(run / "parts.npz"))
-    follow = gsjax.cli.parts_loop.follow
 
-    def stopped_after_one(*arguments):
-        yield next(follow(*arguments))
-        raise KeyboardInterrupt
+    def stop_in(name):
+        """After the first step of that loop."""
+        loop = getattr(gsjax.cli.parts_loop, name)
 
-    monkeypatch.setattr(gsjax.cli.parts_loop, "follow", stopped_after_one)
+        def stopped(*arguments):
+            yield next(loop(*arguments))
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(gsjax.cli.parts_loop, name, stopped)
+
+    def resumed(name):
+        monkeypatch.undo()
+        code, said = gsjax_parts(*QUICK, *given, "--resume", name=name)
+        assert code == 0, said
+        again = dict(np.load(tmp_path / name / "parts.npz"))
+        for key, array in arrays.items():
+            np.testing.assert_array_equal(again[key], array, err_msg=key)
+
+    stop_in("follow")
     given = ("--scene", str(run / "canonical"), "--anchor", str(int(arrays["anchor"])))
     code, said = gsjax_parts(*QUICK, *given, name="stopped")
     assert code == 130
@@ -106,30 +119,14 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     assert partial["frames"]["followed"] == 2
     assert "partial run" in said
     assert "not complete" in " ".join(partial["notes"])
-    monkeypatch.undo()
-    code, said = gsjax_parts(*QUICK, *given, "--resume", name="stopped")
-    assert code == 0, said
-    again = dict(np.load(tmp_path / "stopped" / "parts.npz"))
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(again[name], array, err_msg=name)
+    resumed("stopped")
 
-    refine = gsjax.cli.parts_loop.refine
-
-    def stopped_refining(*arguments):
-        yield next(refine(*arguments))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(gsjax.cli.parts_loop, "refine", stopped_refining)
+    stop_in("refine")
     code, said = gsjax_parts(*QUICK, *given, name="late")
     assert code == 130
     assert "refined by 1 of 5 steps, and then stopped by Ctrl-C" in said
     assert not json.loads((tmp_path / "late" / "metrics.json").read_text())["complete"]
-    monkeypatch.undo()
-    code, said = gsjax_parts(*QUICK, *given, "--resume", name="late")
-    assert code == 0, said
-    again = dict(np.load(tmp_path / "late" / "parts.npz"))
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(again[name], array, err_msg=name)
+    resumed("late")
 
 
 def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
