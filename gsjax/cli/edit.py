@@ -9,8 +9,8 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.cli.films import SCRIPT, Shot, edited, new_folder, write_film
-from gsjax.cli.messages import Notes
+from gsjax.cli.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
+from gsjax.cli.messages import Notes, stage
 from gsjax.cli.parts_run import open_parts_run
 from gsjax.methods.motion_parts.operations import OPERATIONS
 from gsjax.methods.motion_parts.timeline import Script, parse_op, parse_script
@@ -36,7 +36,7 @@ class Options:
     """Folder for the film. RUN/edit/NAME unless given, NAME being the script's, or without one "ops", "ops_2"
     and so on."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to film from. The first held out one, else the first, unless given."""
+    """Id of the camera to film from. The one to which the edits change most, unless given."""
     ply: bool = False
     """Write the Gaussians of each frame of the film too, as ply/000000.ply and so on."""
     overwrite: bool = False
@@ -56,9 +56,10 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         script = read_script(options)
         saved = open_parts_run(options.run)
-        camera = saved.camera(options.camera)
-        with console.status("editing"):
+        given = None if options.camera is None else saved.camera(options.camera)
+        with stage(console, "editing"):
             film, doubts = edited(script, saved)
+            camera = telling_camera(film, saved, script) if given is None else given
         folder = _folder(options)
         for doubt in doubts:
             notes.warn(doubt)
@@ -71,7 +72,7 @@ def run(options: Options) -> int:
     part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
     pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
     print(f"{found['seconds']:.2f} s, {found['frames']} frames{part}, seen by camera {camera}{pace}")
-    print(f"film    {folder}")
+    print(f"film    {folder / VIDEO}")
     return 130 if stopped else 0
 
 
@@ -90,6 +91,8 @@ def read_script(options: Options) -> Script:
     if options.script is not None:
         try:
             script = parse_script(options.script.read_text(encoding="utf-8"))
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{options.script}: expected a YAML file of edits, found no text") from error
         except ValueError as error:
             raise ValueError(f"{options.script}: {error}") from error
     edits = []

@@ -3,11 +3,14 @@
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +19,13 @@ from jaxtyping import Array, Float, Int
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import PartsRun, read_parts
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
 from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
 from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.motion_parts.operations import label
 from gsjax.methods.motion_parts.timeline import ROUND, Script, apply, to_yaml
 from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
@@ -31,7 +35,11 @@ from gsjax.scene.render import render_with_room
 
 SCRIPT = "edit.yaml"
 """What tells the folder of a film from others."""
-_VIDEO, _METRICS, _PLY = "video.mp4", "metrics.json", "ply"
+VIDEO = "video.mp4"
+"""The film itself, in its folder."""
+_METRICS, _PLY = "metrics.json", "ply"
+_THUMBNAIL, _LOOKS = 160, 5  # pixels and moments by which cameras are compared ...
+_CHANGED = 0.05  # ... of colours from 0 to 1: what differs less has not changed
 _NAME = re.compile(r"\w[\w .-]*")  # of a folder that lies where it should
 
 
@@ -68,7 +76,31 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
     if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
         doubts.append(". ".join(beyond))
+    if idle := _idle(script, saved):
+        doubts.append(f"nothing is to be seen of {', '.join(idle)}")
     return film, doubts
+
+
+def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
+    """The id of the camera, of those that a run had, to which most looks different from the recording."""
+    times = np.asarray(film[0].trajectory.times)
+    length = float(times[-1]) + 1e-3
+    plain = apply(Script(fps=script.fps, length=length), saved.layer, saved.names)
+    sequence = saved.recording.judged
+    scale = _THUMBNAIL / max(sequence.width, sequence.height)
+    size = [max(1, round(scale * side)) for side in (sequence.width, sequence.height)]
+    cameras = [resized(sequence.camera(0, c), scale, *size) for c in range(sequence.num_cameras)]
+    moments = np.unique(np.linspace(0, len(times) - 1, _LOOKS + 2).round().astype(int)[1:-1]).tolist()
+
+    def seen(film: Film) -> Float[np.ndarray, "T C h w 3"]:
+        at, plan, images = frames_of(film, saved.blend), None, []
+        for t in moments:
+            drawn, plan = render_with_room(at(t), jax.tree.map(lambda *c: jnp.stack(c), *cameras), plan)
+            images.append(np.asarray(drawn.colors))
+        return np.stack(images)
+
+    changed = (np.abs(seen(film) - seen(plain)).max(axis=-1) > _CHANGED).mean(axis=(0, 2, 3))
+    return int(sequence.camera_ids[int(changed.argmax())]) if changed.any() else saved.camera(None)
 
 
 def new_folder(parent: Path, name: str) -> Path:
@@ -121,7 +153,7 @@ def write_film(
     view = sequence.camera(0, sequence.camera_ids.index(camera))
     fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
     seconds, stopped = [], False
-    with VideoWriter(folder / _VIDEO, fps) as video:
+    with VideoWriter(folder / VIDEO, fps) as video:
         try:
             for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
                 if ply:
@@ -197,9 +229,19 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
     return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
 
 
+def _idle(script: Script, saved: PartsRun) -> list[str]:
+    """The edits of a script that make no difference where they stand, as messages call them."""
+    known = cache(read_parts)  # a composite reads another run, and is done once an edit
+    begun = [replace(script, edits=script.edits[:count]) for count in range(len(script.edits) + 1)]
+    films = [jax.tree.map(np.asarray, apply(one, saved.layer, saved.names, known)) for one in begun]
+    same = [bool(eqx.tree_equal(before, after)) for before, after in pairwise(films)]
+    numbered = enumerate(zip(script.edits, same, strict=True), 1)
+    return [label(number, edit.operation()) for number, (edit, none) in numbered if none]
+
+
 def _clear(folder: Path) -> None:
     """Removes what an earlier film left there."""
-    for name in (SCRIPT, _VIDEO, _METRICS):
+    for name in (SCRIPT, VIDEO, _METRICS):
         (folder / name).unlink(missing_ok=True)
     if (folder / _PLY).is_dir():
         shutil.rmtree(folder / _PLY)

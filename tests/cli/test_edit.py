@@ -190,6 +190,35 @@ def test_films_of_ops_alone_are_numbered_on(gsjax, run):
     assert sorted(folder.name for folder in (run / "edit").iterdir()) == ["ops", "ops_2"]
 
 
+def test_the_camera_films_to_which_the_edits_change_most(gsjax, run):
+    """Each of the cameras sees each of two parts by another size; what is moved away counts."""
+    saved, films_of = open_parts_run(run), {}
+    for part in ("drawer", "shut_door"):
+        script = parse_script(f"edits: [{{op: fade, parts: {part}, opacity: 0}}]")
+        film, _ = films.edited(script, saved)
+        plain, _ = films.edited(parse_script("edits: []"), saved)
+        apart = []
+        for camera in (0, 1, 2):
+            view = saved.recording.judged.camera(0, camera)
+            pairs = zip(shots(film, view, saved), shots(plain, view, saved), strict=True)
+            apart.append(np.mean([np.abs(a.image - b.image).max(-1) > 0.05 for a, b in pairs]))
+        code, said = gsjax("edit", run, "--op", f"fade:parts={part},opacity=0", "--out", run / part)
+        assert code == 0, said
+        films_of[part] = json.loads((run / part / "metrics.json").read_text())["camera"]
+        assert films_of[part] == int(np.argmax(apart)), apart
+
+
+def test_edits_that_change_nothing_are_said_to(gsjax, run):
+    """And the first held-out camera films them, as all see the same."""
+    edits = ["freeze:parts=drawer,from=9", "move:parts=drawer,by=[0,0,0.1]", "scale:parts=1,factor=1"]
+    code, said = gsjax("edit", run, *(word for op in edits for word in ("--op", op)))
+    assert code == 0, said
+    assert "warning: nothing is to be seen of edit 1 (freeze), edit 3 (scale)" in said
+    code, said = gsjax("edit", run, "--op", edits[0])
+    assert "nothing is to be seen of edit 1 (freeze)" in said
+    assert "seen by camera 2" in said
+
+
 def test_an_earlier_film_is_replaced_when_asked(gsjax, run, tmp_path):
     out = tmp_path / "film"
     once = ("edit", run, "--op", "freeze:parts=all", "--out", out)
@@ -259,7 +288,7 @@ def test_what_cannot_be_done(gsjax, run, options, says):
         (b"edits: [", "bad.yaml: expected YAML, found a fault in line"),
         (b"speed: 2", "bad.yaml: speed: expected the keys fps, length, edits"),
         (b"edits: [{op: speed, parts: 1}]", "bad.yaml: edits: edit 1 (speed): factor: expected a factor"),
-        (b"\xff\xfe\x00", "bad.yaml: "),
+        (b"\xff\xfe\x00", "bad.yaml: expected a YAML file of edits, found no text"),
     ],
 )
 def test_a_script_that_is_none(gsjax, run, tmp_path, text, says):

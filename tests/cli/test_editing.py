@@ -151,7 +151,8 @@ def test_a_film_is_kept_as_gsjax_edit_does(gsjax, run, tmp_path):
     assert folder == run / "edit" / "copies"
     assert told == [(done, 7) for done in range(1, 8)]  # the last copy ends 0.14 s after the drawer
     out = tmp_path / "by_hand"
-    code, said = gsjax("edit", run, "--op", lines[0], "--op", lines[1], "--out", out)
+    edits = ("--op", lines[0], "--op", lines[1])
+    code, said = gsjax("edit", run, *edits, "--out", out, "--camera", 2)
     assert code == 0, said
     assert {path.name for path in folder.iterdir()} == {path.name for path in out.iterdir()}
     assert (folder / "edit.yaml").read_bytes() == (out / "edit.yaml").read_bytes()

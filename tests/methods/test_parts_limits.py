@@ -63,6 +63,16 @@ def test_one_captured_moment_is_all_there_is():
     np.testing.assert_allclose(beyond_captured(captured, moved).metres, [[0, 0, 0.5, 0]], atol=1e-6)
 
 
+def test_what_is_only_moved_is_not_said_to_be_turned():
+    """A little nearer to where it was than to where it now would be is the door when it is turned."""
+    captured = kitchen()
+    moved = edits.move(captured.trajectory, [2], jnp.array([0.3, 0.1, 0.0]))
+    beyond = beyond_captured(captured, moved)
+    np.testing.assert_allclose(beyond.metres[:, 2], np.hypot(0.3, 0.1), rtol=0.02)
+    (said,) = describe_beyond(beyond, captured.trajectory.times, {"door": 2}, least_rad=0.1)
+    assert "degrees" not in said
+
+
 @pytest.mark.parametrize("named", [True, False])
 def test_it_is_said_of_each_part_how_far_and_when(named):
     metres = np.zeros((10, 3))

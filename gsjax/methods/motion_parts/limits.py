@@ -55,11 +55,14 @@ def beyond_captured(captured: Layer, edited: Trajectory) -> Beyond:
     def nearest(pose: Float[Array, "P 7"]) -> Beyond:
         away = (start.inverse() @ jaxlie.SE3(pose)).log()
         share = jnp.sum(metric * away * along, axis=-1) / jnp.where(length > 0, length, 1.0)
-        seen = start @ jaxlie.SE3.exp(jnp.clip(share, 0.0, 1.0)[..., None] * along)
+        # The ends too: what is far off in place is little nearer by a turn that it does not have.
+        share = jnp.stack([jnp.zeros_like(share), jnp.clip(share, 0.0, 1.0), jnp.ones_like(share)])
+        seen = start @ jaxlie.SE3.exp(share[..., None] * along)
         metres = jnp.linalg.norm(pose[:, 4:] - seen.translation(), axis=-1)
         turn = (seen.rotation().inverse() @ jaxlie.SO3(pose[:, :4])).log()
         radians = jnp.linalg.norm(turn, axis=-1)
-        least = jnp.argmin(metres**2 + (radii[:, 0] * radians) ** 2, axis=0)[None]
+        metres, radians = (values.reshape(-1, len(radii)) for values in (metres, radians))
+        least = jnp.argmin(metres + radii[:, 0] * radians, axis=0)[None]
         return Beyond(*(jnp.take_along_axis(values, least, axis=0)[0] for values in (metres, radians)))
 
     return jax.lax.map(nearest, motions_of(edited.poses).wxyz_xyz)
@@ -85,9 +88,11 @@ def describe_beyond(
     sentences = []
     for p in np.flatnonzero(outside.any(axis=0)):
         when = np.asarray(times)[outside[:, p]]
-        far = f"{1000 * metres[:, p].max():.0f} mm and {np.rad2deg(radians[:, p].max()):.1f} degrees"
+        shift, turn = metres[:, p].max(), radians[:, p].max()
+        far = [f"{1000 * shift:.0f} mm"] if shift > least_m else []
+        far += [f"{np.rad2deg(turn):.1f} degrees"] if turn > least_rad else []
         sentences.append(
-            f"{called.get(int(p), f'part {p}')} goes up to {far} beyond what was captured, "
+            f"{called.get(int(p), f'part {p}')} goes up to {' and '.join(far)} beyond what was captured, "
             f"at {len(when)} of {len(times)} moments from {when[0]:.2f} s to {when[-1]:.2f} s: expect flaws"
         )
     return sentences

@@ -57,6 +57,11 @@ class Edit(Entry):
         if self.begin is not None and self.end is not None and not self.begin < self.end:
             raise ValueError(f"to: expected a time after from, {self.begin:g}, found {self.end:g}")
 
+    @classmethod
+    def operation(cls) -> str:
+        """Its name in scripts."""
+        return cls.__name__.lower()
+
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         """Which parts change, if these are named and the motion of each part of the scene ends at `lasts`."""
         return parts
@@ -335,7 +340,7 @@ class Composite(LookEdit):
 
 
 OPERATIONS: dict[str, type[Edit]] = {
-    kind.__name__.lower(): kind
+    kind.operation(): kind
     for kind in (
         *(Isolate, Freeze, Speed, Loop),
         *(Ghost, Fade, Echo, Composite),

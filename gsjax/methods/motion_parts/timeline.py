@@ -242,7 +242,7 @@ def _plain(entry: Entry) -> dict[str, Any]:
         return [plain(one) for one in value] if isinstance(value, tuple) else value
 
     values = {f: getattr(entry, f.name) for f in fields(entry)}
-    op = {"op": type(entry).__name__.lower()} if isinstance(entry, Edit) else {}
+    op = {"op": entry.operation()} if isinstance(entry, Edit) else {}
     return op | {key_of(f): plain(value) for f, value in values.items() if value != f.default}
 
 
@@ -272,4 +272,4 @@ def _said_of(place: int, edit: Edit) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{label(place + 1, type(edit).__name__.lower())}: {error}") from error
+        raise ValueError(f"{label(place + 1, edit.operation())}: {error}") from error
