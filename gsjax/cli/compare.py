@@ -12,6 +12,7 @@ from rich.text import Text
 
 from gsjax.cli.comparison import Aspect, Comparison, Group, compare
 from gsjax.cli.comparison_pictures import shows_the_same, write_strip
+from gsjax.cli.messages import counted
 from gsjax.cli.query import fresh_folder
 from gsjax.cli.report import Media, Table, format_number, write_report
 from gsjax.cli.run_folder import is_run
@@ -106,7 +107,7 @@ def _write(out: Path, found: Comparison) -> None:
 
 def _of_what(group: Group) -> str:
     """The group in words."""
-    views = f", {len(group.views)} held-out views" if group.views else ""
+    views = f", {counted(len(group.views), 'held-out view')}" if group.views else ""
     return f"{group.dataset}: {', '.join(group.labels)}{views}"
 
 

@@ -13,6 +13,7 @@ from rich.table import Table as Grid
 
 from gsjax.cli.fit_orbit import NAME as ORBIT
 from gsjax.cli.machine import in_words
+from gsjax.cli.messages import counted
 from gsjax.cli.outputs import write_png
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
@@ -269,7 +270,7 @@ def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> Non
     keys, heads, units, decimals = zip(*columns, strict=True)
     rows = [[row[key] for key in keys] for row in found["views"]]
     times = [[_TIMES[name], value] for name, value in found["seconds"].items()]
-    looked = f"of {photographs['looked_at']} held-out views"
+    looked = f"of {counted(photographs['looked_at'], 'held-out view')}"
     shown = found["views"][:: max(1, len(found["views"]) // _SHOWN)][:_SHOWN]
     write_report(
         folder.report,

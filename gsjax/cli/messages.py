@@ -103,6 +103,11 @@ def say_error(text: str, word: str = "error") -> None:
     console.print(line, soft_wrap=not console.is_terminal)
 
 
+def counted(count: int, noun: str) -> str:
+    """So many of something: "1 part", "2 parts"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def reason(stopped: BaseException) -> str:
     """What stopped a run, in words."""
     return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)

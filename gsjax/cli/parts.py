@@ -179,6 +179,11 @@ def _check(options: Options, recording: Recording) -> None:
         raise ValueError(
             f"--frames: expected 2 or more, between which something moves, found {options.frames}"
         )
+    if options.anchor is not None and not 0 <= options.anchor < sequence.num_frames:
+        raise ValueError(
+            f"--anchor: expected one of {sequence.num_frames} frames, 0 to {sequence.num_frames - 1}, found "
+            f"{options.anchor}"
+        )
     if options.sam is not None and options.masks == "files":
         raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
     inside = options.scene is not None and options.out.resolve() in options.scene.resolve().parents

@@ -7,9 +7,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsjax.cli.messages import Notes, reason
+from gsjax.cli.messages import Notes, counted, reason
 from gsjax.data import Sequence
 from gsjax.methods.motion_parts import Parts, PartsConfig, Start, follow, refine
+
+_LINES = 10  # of a log, about the frames of a run
 
 
 @dataclass
@@ -45,7 +47,9 @@ def follow_parts(
     columns = (TextColumn("following parts"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     words = TextColumn("{task.description}")
     if not console.is_terminal:
-        console.print("following parts, frame by frame", soft_wrap=True)
+        console.print(
+            "following parts; compiling, which takes a minute or two the first time", soft_wrap=True
+        )
     with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=len(following.parts.done))
         bar.update(task, completed=int(following.parts.done.sum()), description="compiling")
@@ -60,8 +64,11 @@ def follow_parts(
                 following.skipped += found.skipped
                 following.joined += found.joined
                 following.divided += found.divided
-                told = f"{_count(found.parts)} parts, loss {following.losses[-1][1]:.4f}"
-                bar.update(task, completed=int(found.parts.done.sum()), description=told)
+                told = f"{counted(_count(found.parts), 'part')}, loss {following.losses[-1][1]:.4f}"
+                done, asked = int(found.parts.done.sum()), len(found.parts.done)
+                bar.update(task, completed=done, description=told)
+                if not console.is_terminal and _LINES * done // asked > _LINES * (done - 1) // asked:
+                    console.print(f"{done} of {asked} frames: {told}", soft_wrap=True)
                 save(following, last=False)
         except (KeyboardInterrupt, Exception) as stopped:
             following.stopped = stopped

@@ -1,5 +1,6 @@
 """What `gsjax parts` comes to: parts.npz, videos, scores, joints, the report."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
-from gsjax.cli.messages import Notes, reason
+from gsjax.cli.messages import Notes, counted, reason
 from gsjax.cli.outputs import Film
 from gsjax.cli.parts_loop import Following
 from gsjax.cli.parts_scoring import joints_of, part_rows, score_parts
@@ -22,6 +23,7 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
 from gsjax.methods.motion_parts import Parts, PartScene, PartsConfig, Start, Trajectory, outcome
+from gsjax.viz.colors import label_color
 
 PART_COLUMNS = (
     Column("part", "name"),
@@ -38,12 +40,15 @@ PART_COLUMNS = (
     Column("median", "median_point_error_mm", "mm", 1),
     Column("IoU", "iou", "", 2),
 )
-_WIDE = ("gaussians", "confidence", "line_mm", "point_error_mm", "iou")  # what 80 columns have no room for
+_WIDE = ("gaussians", "line_mm", "point_error_mm", "iou")  # what 80 columns have no room for
+_WIDE_ENOUGH = 130
+_JOINTS = {"revolute": "hinge", "prismatic": "slide", "fixed": "none", "free": "free"}
 _PART_NOTE = (
-    "Joints are fitted to the motion since the canonical frame, in the world. 'Off' is against the true part "
-    "that most of the Gaussians are of; points off is over the Gaussians that are truly of it, whatever part "
-    "they were given to. 'Sure' is how much better the joint explains the motion than the next best kind; of "
-    "a free part, by how much it is off any joint."
+    "Colours are those of the videos. Joints are fitted to the motion since the canonical frame, in the "
+    "world. 'Off' is against the true part that most of the Gaussians are of; points off is over the "
+    "Gaussians that are truly of it, whatever part they were given to. 'Sure' is how far the motion is from "
+    "where the joint would be called another, or the part free; of a free part, from where it would be on a "
+    "joint."
 )
 
 
@@ -152,6 +157,8 @@ def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: in
 
 def write_results(folder: RunFolder, found: dict[str, Any], following: Following) -> None:
     """Writes report.html."""
+    rows = _in_words(found["parts"])
+    colors = [label_color(row["part"]) for row in rows]
     write_report(
         folder.report,
         title=found["dataset"] + ("" if found["complete"] else " (partial run)"),
@@ -169,11 +176,11 @@ def write_results(folder: RunFolder, found: dict[str, Any], following: Following
             for camera, scored in found["cameras"].items()
         ],
         tables=[
-            *table("Parts", PART_COLUMNS, found["parts"], _PART_NOTE),
-            *table("Cameras", CAMERA_COLUMNS, camera_rows(found), ""),
+            *(replace(parts, colors=colors) for parts in table("Parts", PART_COLUMNS, rows, _PART_NOTE)),
+            *table("Cameras", CAMERA_COLUMNS, camera_rows(found, "looked through"), ""),
             time_table(_TIMES, found["seconds"]),
         ],
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=[*_next_steps(folder, found), *found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
 
 
@@ -182,11 +189,13 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     console = Console(highlight=False)
     console.print()
     if found["parts"]:
-        narrow = tuple(column for column in PART_COLUMNS if column.key not in _WIDE)
-        console.print(grid(narrow, found["parts"]))
-    words = [f"[bold]{found['num_parts']}[/] parts of {found['pieces']} pieces"]
+        wide = console.width >= _WIDE_ENOUGH
+        columns = tuple(column for column in PART_COLUMNS if wide or column.key not in _WIDE)
+        console.print(grid(columns, _in_words(found["parts"])))
+    words = [f"[bold]{counted(found['num_parts'], 'part')}[/] of {counted(found['pieces'], 'piece')}"]
     if found["ari"] is not None:
-        words.append(f"adjusted Rand index [bold]{found['ari']:.3f}[/], {found['true_parts']} true parts")
+        true = counted(found["true_parts"], "true part")
+        words.append(f"adjusted Rand index [bold]{found['ari']:.3f}[/], {true}")
     console.print("; ".join(words))
     for kind, name in (("held_out", "held out"), ("tracked", "looked through")):
         if found[kind]["psnr"] is not None:
@@ -196,6 +205,22 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     part = "" if found["complete"] else " [bold yellow](partial run)[/]"
     console.print(f"{found['frames']['followed']} frames in {seconds['total'] / 60:.1f} min{pace}{part}")
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
+
+
+def _in_words(parts: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of parts, with joints called as people call them."""
+    return [{**row, "kind": _JOINTS[row["kind"]]} for row in parts]
+
+
+def _next_steps(folder: RunFolder, found: dict[str, Any]) -> list[str]:
+    """What can be done with the parts that were found."""
+    if not found["parts"]:
+        return []
+    run, part = folder.path, found["parts"][0]["part"]
+    return [
+        f"In space, and with a preview of edits: gsjax view {run}",
+        f'A film of an edit: gsjax edit {run} --op "speed:parts={part},factor=2"',
+    ]
 
 
 def _headline(found: dict[str, Any]) -> dict[str, Any]:

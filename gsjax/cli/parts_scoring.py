@@ -19,6 +19,7 @@ from gsjax.scene.handles import Blend
 
 _POINTS = 500  # of a part, by which its joint is fitted ...
 _FAR = 3.0  # ... none so many times as far from its middle as half of them: there, noise of a turn is large
+_OFF_JOINT = 0.15  # share of its way that a part may be off its joint: small ones are followed no better
 _NAMED_IOU = 0.25  # overlap with a true part below which a found one does not bear its name
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres about an object of which nothing is drawn
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
@@ -51,7 +52,8 @@ def joints_of(
         mine = means[labels == part]
         far = np.linalg.norm(mine - np.median(mine, axis=0), axis=1)
         mine = mine[far <= _FAR * np.median(far)]
-        found[part] = fit_joint(motions[:, part], mine[:: max(1, len(mine) // _POINTS)], noise_m=noise_m)
+        some = mine[:: max(1, len(mine) // _POINTS)]
+        found[part] = fit_joint(motions[:, part], some, noise_m=noise_m, tolerance=_OFF_JOINT)
     return found
 
 

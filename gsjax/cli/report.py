@@ -35,6 +35,7 @@ class Table:
         decimals: one a column: digits behind the point of its fractions, None for three digits in all.
         note: a line below the table.
         best: (row, column) of cells that stand out.
+        colors: one a row, RGB 0 to 255: that in which videos show what the row is about; none if empty.
     """
 
     title: str
@@ -44,6 +45,7 @@ class Table:
     note: str = ""
     decimals: Sequence[int | None] = ()
     best: Collection[tuple[int, int]] = ()
+    colors: Sequence[tuple[int, int, int]] = ()
 
     def __post_init__(self):
         width = len(self.columns)
@@ -51,6 +53,8 @@ class Table:
             raise ValueError(f"Table {self.title!r}: {len(self.units)} units for {width} columns")
         if self.decimals and len(self.decimals) != width:
             raise ValueError(f"Table {self.title!r}: {len(self.decimals)} decimals for {width} columns")
+        if self.colors and len(self.colors) != len(self.rows):
+            raise ValueError(f"Table {self.title!r}: {len(self.colors)} colors for {len(self.rows)} rows")
         for i, row in enumerate(self.rows):
             if len(row) != width:
                 raise ValueError(f"Table {self.title!r}: {len(row)} cells in row {i} for {width} columns")
@@ -174,6 +178,8 @@ def _table(table: Table) -> str:
     ]
     decimals = table.decimals or [None] * len(table.columns)
     texts = [[_text(format_number(v, d)) for v, d in zip(row, decimals, strict=True)] for row in table.rows]
+    for row, color in zip(texts, table.colors, strict=False):
+        row[0] = f'<i class="swatch" style="background: rgb{color}"></i>{row[0]}'
     body = "".join(f"<tr>{cells(row, 'td', i)}</tr>" for i, row in enumerate(texts))
     note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
     return (

@@ -72,13 +72,13 @@ def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def camera_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row a camera, by the keys of `CAMERA_COLUMNS`."""
+def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, Any]]:
+    """One row a camera, by the keys of `CAMERA_COLUMNS`; one that is not held out is called `seen`."""
     return [
         {
             **scored,
             "name": camera,
-            "kind": "tracked" if scored["tracked"] else "held out",
+            "kind": seen if scored["tracked"] else "held out",
             "coverage": None if scored["coverage"] is None else 100 * scored["coverage"],
         }
         for camera, scored in found["cameras"].items()

@@ -60,8 +60,8 @@ class FittedJoint(NamedTuple):
         joint: of that kind; None for the others.
         errors_m: how far points of the part are from where a part that is fixed, prismatic or revolute would
             have them, by name, root mean square.
-        confidence: 0 to 1; how much of the error of the next best kind this one explains. Of a free part, how
-            far beyond the tolerance the best joint is.
+        confidence: 0 to 1; how far the errors are from where the answer would be another, as a share: 0 is as
+            well free as on a joint, or as well on the other joint as on this one.
     """
 
     kind: str
@@ -104,14 +104,14 @@ def fit_joint(
         predicted = np.einsum("tij,nj->tni", told[:, :3, :3], points) + told[:, None, :3, 3]
         errors[kind] = _rms(moved - predicted)
     if errors["fixed"] <= noise_m:
-        return FittedJoint("fixed", None, errors, 1 - errors["fixed"] / (2 * noise_m))
+        return FittedJoint("fixed", None, errors, 1 - errors["fixed"] / noise_m)
     turns = np.ptp(found["revolute"].values) >= least_turn_rad
     kind = min(KINDS if turns else KINDS[:1], key=errors.__getitem__)
     other = KINDS[1 - KINDS.index(kind)] if turns else "fixed"
     allowed = max(noise_m, tolerance * errors["fixed"])
     if errors[kind] > allowed:
         return FittedJoint("free", None, errors, 1 - allowed / errors[kind])
-    return FittedJoint(kind, found[kind], errors, 1 - errors[kind] / max(errors[other], 1e-12))
+    return FittedJoint(kind, found[kind], errors, 1 - errors[kind] / max(min(errors[other], allowed), 1e-12))
 
 
 def _slide(shifts: Float[np.ndarray, "frames points 3"], middle: Float[np.ndarray, "3"]) -> Joint:

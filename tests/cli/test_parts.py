@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from gsjax.cli import main
 from gsjax.cli.recording import open_recording
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
+from gsjax.viz.colors import label_color
 
 SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
 QUICK = (
@@ -79,6 +81,11 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     page = (run / "report.html").read_text()
     assert "Parts found from motion" in page
     assert "Camera 3, held out" in page
+    assert f'gsjax edit {run} --op "speed:parts={found["parts"][0]["part"]},factor=2"' in unescape(page)
+    first = f'background: rgb{label_color(found["parts"][0]["part"])}"></i>part '
+    assert first in page
+    assert "following parts; compiling" in said
+    assert "4 of 4 frames: " in said
 
     code, said = gsjax_parts(*QUICK)
     assert code == 2
@@ -147,7 +154,7 @@ def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
     assert "--scale 0.05: pictures of 96x72 would be 5x4; expected 8 pixels or more a side" in said
     code, said = gsjax_parts("--frames", "0:3", "--anchor", "7")
     assert code == 2
-    assert "anchor: expected a frame from 0 to 2, found 7" in said
+    assert "--anchor: expected one of 3 frames, 0 to 2, found 7" in said
     code, said = gsjax_parts("--frames", "0:3", "--masks", "files", "--sam", str(tmp_path))
     assert code == 2
     assert "--sam: expected --masks segment" in said

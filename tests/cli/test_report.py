@@ -113,6 +113,8 @@ def test_ragged_tables_are_refused():
         Table("t", ("a", "b"), [(1, 2), (3,)])
     with pytest.raises(ValueError, match="1 units for 2 columns"):
         Table("t", ("a", "b"), [], units=("mm",))
+    with pytest.raises(ValueError, match="2 colors for 1 rows"):
+        Table("t", ("a",), [(1,)], colors=[(0, 0, 0)] * 2)
 
 
 @pytest.mark.parametrize(

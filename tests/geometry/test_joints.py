@@ -119,6 +119,29 @@ def test_what_slides_and_turns_is_free(seed):
     assert 0 < found.confidence < 1
 
 
+def test_how_sure_it_is_falls_to_nothing_where_the_answer_becomes_another():
+    """A hinge that is followed worse and worse is at last free; the more is allowed, the later."""
+    joint, points = made_up("revolute", 4)
+    found = {
+        allowed: [
+            fit_joint(shaken(joint.motions(), points, mm / 1000, 4), points, tolerance=allowed)
+            for mm in (1, 4, 8, 12, 16, 20, 24, 28, 32)
+        ]
+        for allowed in (0.03, 0.06)
+    }
+    for each in found.values():
+        kinds = [one.kind for one in each]
+        hinges = kinds.count("revolute")
+        assert 0 < hinges < len(kinds)
+        assert kinds == ["revolute"] * hinges + ["free"] * (len(kinds) - hinges)
+        sure = [one.confidence for one in each]
+        assert sure[:hinges] == sorted(sure[:hinges], reverse=True)
+        assert sure[hinges:] == sorted(sure[hinges:])
+        assert min(sure) < 0.3
+    counts = [sum(one.kind == "revolute" for one in each) for each in found.values()]
+    assert counts[0] < counts[1]
+
+
 def test_a_turn_too_small_to_tell_is_a_slide():
     far = Joint("revolute", np.array([0.0, 0.0, 1.0]), np.array([0.0, 8.0, 0.0]), np.linspace(0, 0.03, 9))
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
