@@ -88,6 +88,16 @@ def test_what_was_together_before_a_split_does_not_count(points):
     assert joined(found, *points, since=np.array([0, 0, T - 1])) == [0, 1, 2]
 
 
+def test_one_born_where_all_stands_again_is_none_of_them(points):
+    """It has moved as what it was split from. Since then it and another stand where they stood at first, as
+    frames before the anchor may have it: they move alike, and nothing follows from that."""
+    there, elsewhere = np.zeros((T, 3)), np.zeros((T, 3))
+    there[1:4], elsewhere[1:4] = [0.2, 0, 0], [0, 0.3, 0]
+    found = motions((np.zeros((T, 3)), there), (np.zeros((T, 3)), elsewhere))
+    assert joined(found, *points, since=np.array([0, 0, 4])) == [0, 1, 2]
+    assert joined(found, *points, since=np.array([0, 0, T])) == [0, 1, 2]
+
+
 def test_slots_without_a_part_join_nothing(points):
     turning = ramp(0, 0, 0.8), ramp(0, 0, 0)
     assert joined(motions(turning, turning), *points, alive=np.array([True, True, False])) == [0, 1, 2]

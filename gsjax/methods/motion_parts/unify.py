@@ -1,8 +1,8 @@
 """Unify and split: parts that move alike become one, and one that moves as two is divided (papers/001, 3.2).
 
-Two parts are compared by where they would take the points of both, over all frames seen so far: a translation
-alone depends on the pivot. They are compared only once both have moved beyond what tracking errs by: parts
-that still stand move alike, and are not one for that.
+Two parts are compared by where they would take the points of both, over all frames in which both were there:
+a translation alone depends on the pivot. They are compared only if both have moved in these beyond what
+tracking errs by: parts that stand move alike, and are not one for that.
 """
 
 from typing import NamedTuple
@@ -49,10 +49,11 @@ def gap(motions: Motions, a: int, b: int, points: Float[np.ndarray, "n 3"]) -> f
 
 
 def extent(motions: Motions, part: int, points: Float[np.ndarray, "n 3"]) -> float:
-    """How far a part has moved from where it was in the canonical scene, at most over frames, metres."""
+    """How far a part has moved from where it was in the canonical scene, at most over frames, metres; 0
+    without frames."""
     turn = motions.rotations[:, part] - np.eye(3)
     moved = np.einsum("tij,nj->tni", turn, points) + motions.offsets[:, part][:, None]
-    return float(np.sqrt(np.sum(moved**2, axis=-1).mean(-1).max()))
+    return float(np.sqrt(np.sum(moved**2, axis=-1).mean(-1).max(initial=0.0)))
 
 
 def unified(
@@ -82,14 +83,16 @@ def unified(
     into = np.arange(len(alive))
     sizes = np.bincount(labels, minlength=len(alive))
     mine = {int(p): points[labels == p] for p in np.flatnonzero(alive & (sizes > 0)) if p != BACKGROUND}
-    moved = {p: extent(motions, p, found) for p, found in mine.items()}
-    moving = [p for p in mine if moved[p] > noise_m]
+    moving = [p for p in mine if extent(motions, p, mine[p]) > noise_m]
     while True:
         best, pair = 1.0, None
         for i, p in enumerate(moving):
             for q in moving[i + 1 :]:
-                allowed = max(noise_m, tolerance * min(moved[p], moved[q]))
                 own = motions.since(int(max(since[p], since[q])))
+                moved = min(extent(own, part, mine[part]) for part in (p, q))
+                if moved <= noise_m:
+                    continue
+                allowed = max(noise_m, tolerance * moved)
                 apart = gap(own, p, q, np.concatenate([mine[p], mine[q]])) / allowed
                 if apart < best:
                     best, pair = apart, (p, q)
