@@ -14,6 +14,7 @@ import methods
 import numpy as np
 from one_update import Update, scene_at, update_of
 from recordings import MASK_CAMERA, recorded
+from timing import median_ms
 
 from gsjax.cli.recording import open_recording
 
@@ -56,11 +57,11 @@ def scene(dataset: str, t: int):
 def traces(recording: str, gap: int) -> dict[str, dict[str, Any]]:
     """All methods on one kind of update, for each is compared with the best; means over the updates."""
     given = updates(recording, gap)
-    draws, found = [methods.median_ms(methods.draw, update.batch) for update in given], {}
+    draws, found = [median_ms(methods.draw, update.batch) for update in given], {}
     for name, method in METHODS.items():
         runs = [method(update) for update in given]
         errors = [[update.errors(m) for m in run.motions] for update, run in zip(given, runs, strict=True)]
-        draws += [methods.median_ms(methods.draw, update.batch) for update in given]
+        draws += [median_ms(methods.draw, update.batch) for update in given]
         centroid, point = np.mean(errors, axis=0).T
         found[name] = {
             "counts": runs[0].counts,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from one_update import Update
 from scipy.spatial import cKDTree
+from timing import jitted, median_ms, timed
 from trimesh.registration import procrustes
 
 from gsjax.geometry.cameras import pixel_grid, unproject
@@ -25,7 +26,6 @@ from gsjax.methods.object_tracker.motion import Motion, place
 from gsjax.methods.object_tracker.points import sight_of
 from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
 from gsjax.methods.object_tracker.search import first_watch, search
-from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.optim.step import Step
 from gsjax.scene.render import render
@@ -34,11 +34,7 @@ ALIGN, REFINE = AlignConfig(), RefineConfig(delta_rate=3e-5)
 # Tuned on other updates than those of the table: see docs/results-optimizers.md.
 TRANSLATION_RATE, ROTATION_RATE = 6e-3, 3e-2  # Adam's at first, metres and radians
 BLOCKS, SOFTNESS = (8,) * 6 + (4,) * 4, 0.3  # Levenberg-Marquardt's, iteration by iteration
-ICP_REACH, ICP_MARGIN = (
-    0.03,
-    0.05,
-)  # pairs further apart than this, and points further off, do not count, metres
-CALLS = 7
+ICP_REACH, ICP_MARGIN = 0.03, 0.05  # metres; pairs further apart, and points further off, do not count
 
 
 class Trace(NamedTuple):
@@ -58,24 +54,6 @@ class Trace(NamedTuple):
 def standing(update: Update) -> Motion:
     """No motion."""
     return Motion(jnp.zeros((len(update.batch.centers), 6)), jnp.zeros_like(update.batch.pose.means))
-
-
-def jitted(function: Callable, **options: Any) -> Callable:
-    """Compiled as the tracker's host loop is."""
-    return jax.jit(function, compiler_options=host_options() or None, **options)
-
-
-def timed(function: Callable, *arguments: Any, **options: Any) -> tuple[Any, float]:
-    """What the function gives, and milliseconds."""
-    begun = perf_counter()
-    result = jax.block_until_ready(function(*arguments, **options))
-    return result, 1e3 * (perf_counter() - begun)
-
-
-def median_ms(function: Callable, *arguments: Any, **options: Any) -> float:
-    """Of several calls after one that compiles."""
-    timed(function, *arguments, **options)
-    return float(np.median([timed(function, *arguments, **options)[1] for _ in range(CALLS)]))
 
 
 draw = jitted(lambda batch: render(place(batch.scene, batch.pose), batch.frame.cameras, batch.plan).colors)

@@ -8,7 +8,6 @@ import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
@@ -21,6 +20,7 @@ import optimistix
 from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Array, Float
 from recordings import recorded
+from timing import jitted, median_ms, timed
 
 from gsjax.cli.recording import open_recording
 from gsjax.io.ply import read_ply
@@ -36,7 +36,6 @@ from gsjax.methods.motion_parts.follow import seen_at
 from gsjax.methods.motion_parts.residual import pose_residual
 from gsjax.methods.motion_parts.screws import motions_of, pose_of
 from gsjax.methods.motion_parts.stream import posed, skinning_weights
-from gsjax.optim.compiler import host_options
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.handles import HandlePose, rigid_motions
@@ -49,10 +48,8 @@ HALF, WHOLE = 2, 1
 MOVED_M = 0.002  # parts that move less between two frames are not judged
 NEAR = 1.5  # times the best error of all: what counts as arrived
 ADAM_COUNTS, COUNTS = (5, 10, 20, 40, 60, 120), (1, 2, 4, 6)
-CALLS = 5
 # The background has columns of zeros, so of all best moves the least is taken.
 GAUSS_NEWTON = optimistix.GaussNewton(1e-4, 1e-5, linear_solver=lineax.AutoLinearSolver(well_posed=False))
-jitted = partial(jax.jit, compiler_options=host_options())
 
 
 class Update(NamedTuple):
@@ -132,19 +129,6 @@ def updates(gap: int, frames: tuple[int, ...] = FRAMES) -> list[Update]:
 
 
 FOLDER = Path("runs/experiments/parts_optimizers/canonical")
-
-
-def timed(function, *arguments) -> tuple[Any, float]:
-    """What the function gives, and milliseconds."""
-    begun = perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return result, 1e3 * (perf_counter() - begun)
-
-
-def median_ms(function, *arguments) -> float:
-    """Of several calls after one that compiles."""
-    timed(function, *arguments)
-    return float(np.median([timed(function, *arguments)[1] for _ in range(CALLS)]))
 
 
 def adam(update: Update, coarse: float | None = None) -> Trace:
