@@ -55,16 +55,16 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
     whats = list(dict.fromkeys(row["what"] for row in rows))
     drawing = Figure(figsize=(15, 2.4 * len(whats)), dpi=100, layout="constrained")
     grid = drawing.subplots(len(whats), len(PANELS), sharey="col", squeeze=False)
+    for axes, (_, title) in zip(grid[0], PANELS, strict=True):
+        axes.set_title(title)
     for line, what in zip(grid, whats, strict=True):
         mine = [row for row in rows if row["what"] == what]
         names = [str(row["value"]) for row in mine]
-        for axes, (key, title) in zip(line, PANELS, strict=True):
+        for axes, (key, _) in zip(line, PANELS, strict=True):
             heights = [row[key] or 0.0 for row in mine]
             bars = axes.bar(names, heights, color="#4c8cc4")
             labels = ["–" if row[key] is None else f"{row[key]:.3g}" for row in mine]
             axes.bar_label(bars, labels, padding=2, fontsize=8)
             axes.margins(y=0.2)
             axes.set_xlabel(what)
-            if line is grid[0]:
-                axes.set_title(title)
     drawing.savefig(path)
