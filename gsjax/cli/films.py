@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -25,8 +24,8 @@ from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
 from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
-from gsjax.methods.motion_parts.operations import label
-from gsjax.methods.motion_parts.timeline import ROUND, Script, apply, to_yaml
+from gsjax.methods.motion_parts.operations import Edit, label
+from gsjax.methods.motion_parts.timeline import LENGTHS, ROUND, Script, apply, to_yaml
 from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians, take
@@ -76,26 +75,28 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
     if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
         doubts.append(". ".join(beyond))
-    if idle := _idle(script, saved):
+    if idle := _idle(script, film, saved):
         doubts.append(f"nothing is to be seen of {', '.join(idle)}")
     return film, doubts
 
 
 def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
     """The id of the camera, of those that a run had, to which most looks different from the recording."""
-    times = np.asarray(film[0].trajectory.times)
-    length = float(times[-1]) + 1e-3
-    plain = apply(Script(fps=script.fps, length=length), saved.layer, saved.names)
+    plain = apply(replace(script, edits=(), length=_lasting(script, film, saved)), saved.layer, saved.names)
+    moments = _edited_moments(film, plain)
+    if not len(moments):
+        return saved.camera(None)
+    some = np.linspace(0, len(moments) - 1, min(_LOOKS, len(moments)) + 2).round().astype(int)[1:-1]
     sequence = saved.recording.judged
     scale = _THUMBNAIL / max(sequence.width, sequence.height)
     size = [max(1, round(scale * side)) for side in (sequence.width, sequence.height)]
-    cameras = [resized(sequence.camera(0, c), scale, *size) for c in range(sequence.num_cameras)]
-    moments = np.unique(np.linspace(0, len(times) - 1, _LOOKS + 2).round().astype(int)[1:-1]).tolist()
+    each = [resized(sequence.camera(0, c), scale, *size) for c in range(sequence.num_cameras)]
+    cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
     def seen(film: Film) -> Float[np.ndarray, "T C h w 3"]:
         at, plan, images = frames_of(film, saved.blend), None, []
-        for t in moments:
-            drawn, plan = render_with_room(at(t), jax.tree.map(lambda *c: jnp.stack(c), *cameras), plan)
+        for t in np.unique(moments[some]).tolist():
+            drawn, plan = render_with_room(at(t), cameras, plan)
             images.append(np.asarray(drawn.colors))
         return np.stack(images)
 
@@ -229,14 +230,45 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
     return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
 
 
-def _idle(script: Script, saved: PartsRun) -> list[str]:
-    """The edits of a script that make no difference where they stand, as messages call them."""
+def _idle(script: Script, film: Film, saved: PartsRun) -> list[str]:
+    """The edits, as messages call them, without which the film would be the same, and so would be what those
+    before them make: of two that do the same, the second."""
     known = cache(read_parts)  # a composite reads another run, and is done once an edit
-    begun = [replace(script, edits=script.edits[:count]) for count in range(len(script.edits) + 1)]
-    films = [jax.tree.map(np.asarray, apply(one, saved.layer, saved.names, known)) for one in begun]
-    same = [bool(eqx.tree_equal(before, after)) for before, after in pairwise(films)]
-    numbered = enumerate(zip(script.edits, same, strict=True), 1)
-    return [label(number, edit.operation()) for number, (edit, none) in numbered if none]
+    length = _lasting(script, film, saved)
+
+    def same(some: tuple[Edit, ...], others: tuple[Edit, ...]) -> bool:
+        try:
+            films = [
+                apply(replace(script, edits=edits, length=length), saved.layer, saved.names, known)
+                for edits in (some, others)
+            ]
+        except ValueError:  # one needs the other
+            return False
+        return bool(eqx.tree_equal(*(jax.tree.map(np.asarray, each) for each in films)))
+
+    edits = script.edits
+    return [
+        label(k + 1, edit.operation())
+        for k, edit in enumerate(edits)
+        if same(edits, edits[:k] + edits[k + 1 :]) and same(edits[:k], edits[: k + 1])
+    ]
+
+
+def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
+    """The length, seconds, that fewer edits need to be told to make a film as long as this one."""
+    recorded = saved.layer.trajectory.times
+    step = 1 / script.fps if script.fps else float(np.median(np.diff(recorded)))
+    return float(np.clip(float(film[0].trajectory.times[-1]) + step / 2, *LENGTHS))
+
+
+def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
+    """At which moments a film differs from that without edits; all where something was added."""
+    count = min(len(film[0].trajectory.times), len(plain[0].trajectory.times))
+    if len(film) > 1:
+        return np.arange(count)
+    pairs = zip(*(jax.tree.leaves(each[0].trajectory) for each in (film, plain)), strict=True)
+    differ = [(np.asarray(a)[:count] != np.asarray(b)[:count]).reshape(count, -1) for a, b in pairs]
+    return np.flatnonzero(np.concatenate(differ, axis=1).any(axis=1))
 
 
 def _clear(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """What `gsjax parts` comes to: parts.npz, videos, scores, joints, the report."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -214,9 +215,10 @@ def _in_words(parts: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _next_steps(folder: RunFolder, found: dict[str, Any]) -> list[str]:
     """What can be done with the parts that were found."""
-    if not found["parts"]:
+    if not found["parts"] or found["frames"]["followed"] < 2:
         return []
-    run, part = folder.path, found["parts"][0]["part"]
+    run = shlex.quote(str(folder.path))
+    part = max(found["parts"], key=lambda row: row["moved_mm"])["part"]
     return [
         f"In space, and with a preview of edits: gsjax view {run}",
         f'A film of an edit: gsjax edit {run} --op "speed:parts={part},factor=2"',

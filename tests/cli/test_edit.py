@@ -1,6 +1,7 @@
 """`gsjax edit` on a run of `gsjax parts` made by hand: two parts that move in front of three cameras."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -206,6 +207,40 @@ def test_the_camera_films_to_which_the_edits_change_most(gsjax, run):
         assert code == 0, said
         films_of[part] = json.loads((run / part / "metrics.json").read_text())["camera"]
         assert films_of[part] == int(np.argmax(apart)), apart
+
+
+def test_an_edit_that_is_seen_by_what_follows_it_is_not_idle(run):
+    """Alone it lies past the end of the film; what comes later lengthens that, or brings it in."""
+    saved = open_parts_run(run)
+    for text in (
+        "edits: [{op: move, parts: 1, by: [0, 0, 0.1], from: 0.3}, {op: loop, parts: 2, times: 4}]",
+        "{length: 0.2, edits: [{op: move, parts: 1, by: [0, 0, 0.1], from: 0.19}, "
+        "{op: speed, parts: 1, factor: 2}]}",
+    ):
+        _, doubts = films.edited(parse_script(text), saved)
+        assert not any("nothing is to be seen" in doubt for doubt in doubts), doubts
+    _, doubts = films.edited(parse_script("edits: [{op: freeze, parts: 1}, {op: freeze, parts: 1}]"), saved)
+    assert doubts == ["nothing is to be seen of edit 2 (freeze)"]
+
+
+@pytest.mark.parametrize("script", ["length: 0.01", "{fps: 15, length: 0.05}", "{fps: 1000, length: 0.01}"])
+def test_a_film_of_one_moment_has_a_camera(run, script):
+    saved = open_parts_run(run)
+    edits = replace(parse_script(script), edits=(parse_op("fade:parts=drawer,opacity=0"),))
+    film, _ = films.edited(edits, saved)
+    assert films.telling_camera(film, saved, edits) in (0, 1, 2)
+
+
+def test_an_edit_near_the_end_is_looked_at(run):
+    """At a third of the way and at two thirds all is as it was."""
+    saved = open_parts_run(run)
+    for text in ("length: 3", "length: 3, fps: 30"):
+        early, late = (
+            parse_script(f"{{{text}, edits: [{{op: fade, parts: shut_door, opacity: 0, from: {begin}}}]}}")
+            for begin in (0.0, 2.9)
+        )
+        cameras = [films.telling_camera(films.edited(one, saved)[0], saved, one) for one in (early, late)]
+        assert cameras[0] == cameras[1] != saved.camera(None)
 
 
 def test_edits_that_change_nothing_are_said_to(gsjax, run):

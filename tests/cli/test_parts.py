@@ -81,7 +81,8 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     page = (run / "report.html").read_text()
     assert "Parts found from motion" in page
     assert "Camera 3, held out" in page
-    assert f'gsjax edit {run} --op "speed:parts={found["parts"][0]["part"]},factor=2"' in unescape(page)
+    most = max(found["parts"], key=lambda row: row["moved_mm"])["part"]
+    assert f'gsjax edit {run} --op "speed:parts={most},factor=2"' in unescape(page)
     first = f'background: rgb{label_color(found["parts"][0]["part"])}"></i>part '
     assert first in page
     assert "following parts; compiling" in said

@@ -34,6 +34,8 @@ LoadScene = Callable[[str], tuple[Layer, Names]]
 """From the path of another run to its scene as it was found, and the names of its parts."""
 MOST_MOMENTS = 100_000
 """A film that is longer, if only while it is edited, is a slip."""
+LENGTHS = 0.01, 86400.0
+"""Seconds, of a film."""
 ROUND = 256
 """Moments: films are edited in multiples of these, so that a new length seldom compiles anything."""
 _INSTANT = 1e-6  # seconds; rounding must not add a moment
@@ -50,7 +52,7 @@ class Script(Entry):
     """
 
     fps: float | None = field(default=None, metadata=number("frames a second, 0.1 to 1000", 0.1, 1000.0))
-    length: float | None = field(default=None, metadata=number("seconds, 0.01 to 86400", 0.01, 86400.0))
+    length: float | None = field(default=None, metadata=number("seconds, 0.01 to 86400", *LENGTHS))
     edits: tuple[Edit, ...] = field(default=(), metadata={"check": read_edits})
 
 
