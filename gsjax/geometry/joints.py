@@ -90,7 +90,8 @@ def fit_joint(
         points: of the part, canonical, metres.
         noise_m: what moves less is fixed; an error that counts as none.
         tolerance: error of a joint, as a share of the motion's own size, up to which it explains the motion.
-            A box that slides and turns at once is 4 to 8 % from a hinge.
+            A box that slides and turns steadily at once is 4 to 8 % from a hinge: more allows for noise, and
+            calls that box a hinge, of which it is then not very sure.
         least_turn_rad: a turn by less is none: about an axis far away it is as good as a slide.
     """
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]

@@ -119,6 +119,20 @@ def test_what_slides_and_turns_is_free(seed):
     assert 0 < found.confidence < 1
 
 
+@given(seeds, st.floats(0.5, 1.2))
+def test_a_steady_slide_and_turn_is_no_sure_hinge(seed, turn):
+    """It is nearly one, about an axis far away: what allows for so much noise cannot tell."""
+    rng = np.random.default_rng(seed)
+    share, way = np.linspace(0, 1, 16), rng.normal(size=2)
+    motions = np.tile(np.eye(4), (16, 1, 1))
+    motions[:, :3, :3] = Rotation.from_rotvec(np.outer(turn * share, [0, 0, 1])).as_matrix()
+    motions[:, :2, 3] = np.outer(0.25 * share, way / np.linalg.norm(way))
+    points = rng.uniform(-0.06, 0.06, (40, 3))
+    found = fit_joint(motions, points, tolerance=0.15)
+    assert found.kind == "free" or found.confidence < 0.6
+    assert fit_joint(motions, points).kind == "free"
+
+
 def test_how_sure_it_is_falls_to_nothing_where_the_answer_becomes_another():
     """A hinge that is followed worse and worse is at last free; the more is allowed, the later."""
     joint, points = made_up("revolute", 4)

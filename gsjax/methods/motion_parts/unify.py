@@ -2,7 +2,7 @@
 
 Two parts are compared by where they would take the points of both, over all frames in which both were there:
 a translation alone depends on the pivot. They are compared only if both have moved in these beyond what
-tracking errs by: parts that stand move alike, and are not one for that.
+tracking errs by: parts that stand where they stood at first move alike, and are not one for that.
 """
 
 from typing import NamedTuple
