@@ -5,6 +5,7 @@ a translation alone depends on the pivot. They are compared only if both have mo
 tracking errs by: parts that stand where they stood at first move alike, and are not one for that.
 """
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -83,25 +84,26 @@ def unified(
     into = np.arange(len(alive))
     sizes = np.bincount(labels, minlength=len(alive))
     mine = {int(p): points[labels == p] for p in np.flatnonzero(alive & (sizes > 0)) if p != BACKGROUND}
+
+    def apart(p: int, q: int) -> float:
+        """The gap between two parts, in what counts as none."""
+        own = motions.since(int(max(since[p], since[q])))
+        moved = min(extent(own, part, mine[part]) for part in (p, q))
+        if moved <= noise_m:
+            return np.inf
+        allowed = max(noise_m, tolerance * moved)
+        return gap(own, p, q, np.concatenate([mine[p], mine[q]])) / allowed
+
     moving = [p for p in mine if extent(motions, p, mine[p]) > noise_m]
-    while True:
-        best, pair = 1.0, None
-        for i, p in enumerate(moving):
-            for q in moving[i + 1 :]:
-                own = motions.since(int(max(since[p], since[q])))
-                moved = min(extent(own, part, mine[part]) for part in (p, q))
-                if moved <= noise_m:
-                    continue
-                allowed = max(noise_m, tolerance * moved)
-                apart = gap(own, p, q, np.concatenate([mine[p], mine[q]])) / allowed
-                if apart < best:
-                    best, pair = apart, (p, q)
-        if pair is None:
-            return into
-        keep, lose = sorted(pair, key=lambda p: -len(mine[p]))
+    gaps = {pair: apart(*pair) for pair in combinations(moving, 2)}
+    while gaps and min(gaps.values()) < 1:
+        keep, lose = sorted(min(gaps, key=gaps.__getitem__), key=lambda p: -len(mine[p]))
         into[into == lose] = keep
         mine[keep] = np.concatenate([mine[keep], mine.pop(lose)])
         moving.remove(lose)
+        gaps = {pair: far for pair, far in gaps.items() if keep not in pair and lose not in pair}
+        gaps |= {(keep, p): apart(keep, p) for p in moving if p != keep}
+    return into
 
 
 class Cut(NamedTuple):
