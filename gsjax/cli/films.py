@@ -263,10 +263,11 @@ def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
 
 def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
     """At which moments a film differs from that without edits; all where something was added."""
-    count = min(len(film[0].trajectory.times), len(plain[0].trajectory.times))
+    both = film[0].trajectory, plain[0].trajectory
+    count = min(len(one.times) for one in both)
     if len(film) > 1:
         return np.arange(count)
-    pairs = zip(*(jax.tree.leaves(each[0].trajectory) for each in (film, plain)), strict=True)
+    pairs = zip(*map(jax.tree.leaves, both), strict=True)
     differ = [(np.asarray(a)[:count] != np.asarray(b)[:count]).reshape(count, -1) for a, b in pairs]
     return np.flatnonzero(np.concatenate(differ, axis=1).any(axis=1))
 
