@@ -25,7 +25,7 @@ from gsjax.io.video import VideoWriter
 from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
 from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
 from gsjax.methods.motion_parts.operations import Edit, label
-from gsjax.methods.motion_parts.timeline import LENGTHS, ROUND, Script, apply, to_yaml
+from gsjax.methods.motion_parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
 from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians, take
@@ -66,7 +66,8 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     Raises:
         ValueError, OSError: there is no such part or other run, or the edits cannot be done.
     """
-    film = apply(script, saved.layer, saved.names, read_parts)
+    known = cache(read_parts)  # other runs are read once
+    film = apply(script, saved.layer, saved.names, known)
     recorded, now = saved.layer, film[0].trajectory
     doubts = []
     if not saved.complete:
@@ -75,7 +76,7 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
     if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
         doubts.append(". ".join(beyond))
-    if idle := _idle(script, film, saved):
+    if idle := _idle(script, film, saved, known):
         doubts.append(f"nothing is to be seen of {', '.join(idle)}")
     return film, doubts
 
@@ -230,21 +231,21 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
     return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
 
 
-def _idle(script: Script, film: Film, saved: PartsRun) -> list[str]:
+def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
     """The edits, as messages call them, without which the film would be the same, and so would be what those
     before them make: of two that do the same, the second."""
-    known = cache(read_parts)  # a composite reads another run, and is done once an edit
     length = _lasting(script, film, saved)
 
-    def same(some: tuple[Edit, ...], others: tuple[Edit, ...]) -> bool:
+    @cache
+    def made(edits: tuple[Edit, ...]) -> Film | None:
         try:
-            films = [
-                apply(replace(script, edits=edits, length=length), saved.layer, saved.names, known)
-                for edits in (some, others)
-            ]
-        except ValueError:  # one needs the other
-            return False
-        return bool(eqx.tree_equal(*(jax.tree.map(np.asarray, each) for each in films)))
+            return apply(replace(script, edits=edits, length=length), saved.layer, saved.names, known)
+        except ValueError:  # one needs another
+            return None
+
+    def same(*edits: tuple[Edit, ...]) -> bool:
+        films = [jax.tree.map(np.asarray, made(each)) for each in edits]
+        return all(film is not None for film in films) and bool(eqx.tree_equal(*films))
 
     edits = script.edits
     return [
