@@ -3,10 +3,12 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Bool, Integer
 
 IGNORED_LABEL = -1
+BOUNDARY_SHARE = 0.02  # of the diagonal: how far from its outline a mask's boundary reaches
 
 
 @dataclass
@@ -72,6 +74,57 @@ def iou_of_masks(predicted: np.ndarray, true: np.ndarray) -> float:
     overlap = LabelOverlap()
     overlap.add(np.asarray(predicted, bool).astype(np.int8), np.asarray(true, bool).astype(np.int8))
     return overlap.iou(1)
+
+
+@dataclass
+class MaskOverlap:
+    """Pixels of one thing's masks, and of their boundaries, added up picture by picture.
+
+    Boundary IoU (Cheng et al., CVPR 2021) is the IoU of what lies within a mask and no further than 2 % of
+    the picture's diagonal from its outline: of large things too it sees whether the outline is right.
+
+    Attributes:
+        both, either: pixels in the predicted and the true mask, in one of them.
+        boundary_both, boundary_either: the same of the boundaries.
+    """
+
+    both: int = 0
+    either: int = 0
+    boundary_both: int = 0
+    boundary_either: int = 0
+
+    def add(self, predicted: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> None:
+        """Count one picture.
+
+        Raises:
+            ValueError: the two differ in shape.
+        """
+        if predicted.shape != true.shape:
+            raise ValueError(f"predicted: got shape {predicted.shape}, want {true.shape} to match true")
+        self.both += int((predicted & true).sum())
+        self.either += int((predicted | true).sum())
+        ours, theirs = boundary(predicted), boundary(true)
+        self.boundary_both += int((ours & theirs).sum())
+        self.boundary_either += int((ours | theirs).sum())
+
+    @property
+    def iou(self) -> float:
+        """NaN where nothing was predicted or true."""
+        return _ratio(self.both, self.either)
+
+    @property
+    def boundary_iou(self) -> float:
+        """NaN where nothing was predicted or true."""
+        return _ratio(self.boundary_both, self.boundary_either)
+
+
+def boundary(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """What of a mask is no further from its outline than 2 % of the picture's diagonal; the picture's edge is
+    an outline too."""
+    reach = max(1, round(BOUNDARY_SHARE * float(np.hypot(*mask.shape))))
+    bordered = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    inner = cv2.erode(bordered, np.ones((3, 3), np.uint8), iterations=reach)[1:-1, 1:-1] > 0
+    return mask & ~inner
 
 
 def _count(counts: dict[int, int], labels: np.ndarray) -> None:

@@ -7,7 +7,8 @@ same alphas. With q_i = sum_c v_ic dL/dI_c, and what is behind Gaussian i, S_i =
 
 where S begins as the whole, which the finished image knows: sum_c I_c dL/dI_c + T dL/dT. The pixels'
 gradients are summed to Gaussians by two matmuls: dL/dpower against the monomials 1, x, y, x^2, xy, y^2 of the
-tile's pixels, and w against dL/dI.
+tile's pixels, and w against dL/dI. Where nobody asks for the geometry's gradients, as when features are
+learned on a scene that stands, the last matmul is all there is.
 """
 
 from functools import partial
@@ -15,6 +16,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from gsjax.rasterize.compositing import (
@@ -58,13 +60,27 @@ def _composite(splats: Splats, lists: Lists, reads, plan: Plan):
 
 
 def _composite_fwd(splats, lists, reads, plan):
-    outputs = composite_forward(splats, lists, reads, plan)
-    return outputs, (splats, lists, outputs)
+    shapes_move = any(leaf.perturbed for leaf in (splats.means2d, splats.conics, splats.opacities))
+    splats, lists, reads = jax.tree.map(lambda leaf: leaf.value, (splats, lists, reads))
+    values, transmittance, reads = composite_forward(splats, lists, reads, plan)
+    image = (values, transmittance) if shapes_move else None
+    return (values, transmittance, reads), (splats, lists, reads, image)
 
 
 def _composite_bwd(plan: Plan, residuals, cotangents):
-    splats, lists, (values, transmittance, reads) = residuals
-    d_values, d_transmittance, _ = cotangents
+    splats, lists, reads, image = residuals
+    d_values, d_transmittance = (
+        jnp.zeros(d.shape, d.dtype) if isinstance(d, SymbolicZero) else d for d in cotangents[:2]
+    )
+    if image is None:
+        d_values = _values_gradients(splats, lists, reads, d_values, plan)
+        return Splats(None, None, None, d_values), None, None  # type: ignore[arg-type]
+    return _gradients(splats, lists, reads, image, (d_values, d_transmittance), plan), None, None
+
+
+def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Plan) -> Splats:
+    """By all that a splat has."""
+    (values, transmittance), (d_values, d_transmittance) = image, cotangents
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     behind = (values * d_values).sum(axis=1) + d_transmittance * transmittance
@@ -95,8 +111,39 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
     rows, _ = jax.lax.scan(one_batch, rows, batch_tiles(lists, reads, channels, plan))
     visible = splats.opacities > 0
     d_opacities = jnp.where(visible, rows[:, 5] / jnp.where(visible, splats.opacities, 1.0), 0.0)
-    d_splats = Splats(rows[:, :2], rows[:, 2:5], d_opacities, rows[:, 6:].astype(splats.values.dtype))
-    return d_splats, None, None
+    return Splats(rows[:, :2], rows[:, 2:5], d_opacities, rows[:, 6:].astype(splats.values.dtype))
+
+
+def _values_gradients(
+    splats: Splats, lists: Lists, reads, d_values: Float[Array, "tiles channels pixels"], plan: Plan
+) -> Float[Array, "n channels"]:
+    """By the values alone: w^T dL/dI."""
+    dtype, channels = splats.opacities.dtype, splats.values.shape[1]
+    chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
+    columns = in_columns(splats._replace(values=splats.values[:, :0]), plan.limits)
+
+    def of_chunk(piece: Columns, d_image, light):
+        alphas = splat_alphas(piece, pixels, plan.limits)
+        weights, light = weights_of_many(alphas, light, plan.limits)
+        return light, jnp.matmul(weights, d_image.T, precision="highest")
+
+    def one_batch(total, batch: Batches):
+        d_image = d_values[jnp.maximum(batch.tiles, 0)]
+
+        def step(carry):
+            first, light, total = carry
+            ids, piece = read_chunk(columns, lists, batch, first, chunk)
+            light, rows = jax.vmap(of_chunk)(piece, d_image, light)
+            return first + chunk, light, total.at[ids.ravel()].add(rows.reshape(-1, channels))
+
+        start = (jnp.int32(0), jnp.ones((len(batch.tiles), plan.tile_pixels), dtype), total)
+        return jax.lax.while_loop(lambda carry: jnp.any(still_read(batch, carry[0], carry[1])), step, start)[
+            2
+        ], None
+
+    total = jnp.zeros((splats.opacities.shape[0], channels), dtype)
+    total, _ = jax.lax.scan(one_batch, total, batch_tiles(lists, reads, channels, plan))
+    return total.astype(splats.values.dtype)
 
 
 def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
@@ -153,4 +200,4 @@ def _gradient_rows(piece: Columns, moments: Float[Array, "list 8"]) -> Float[Arr
     return jnp.stack([a * sx + b * sy, b * sx + c * sy, -0.5 * sxx, -sxy, -0.5 * syy, m], axis=-1)
 
 
-_composite.defvjp(_composite_fwd, _composite_bwd)
+_composite.defvjp(_composite_fwd, _composite_bwd, symbolic_zeros=True)

@@ -131,12 +131,16 @@ class FeatureGrid(eqx.Module):
 
     def at(self, located: Located) -> Float[Array, "N outputs"]:
         """Outputs at positions that `locate` has found, for those that stay while the grid is trained."""
+        values = jax.vmap(self.layers[-1])(self.hidden_at(located))
+        # Not before: the network's gradient would meet the NaN even where nobody asks for that row.
+        return jnp.where(located.valid[:, None], values, jnp.nan)
+
+    def hidden_at(self, located: Located) -> Float[Array, "N hidden"]:
+        """What the last layer is given, which is linear: whoever adds up outputs may add up these instead."""
         values = self.encode(located)
         for layer in self.layers[:-1]:
             values = jax.nn.relu(jax.vmap(layer)(values))
-        values = jax.vmap(self.layers[-1])(values)
-        # Not before: the network's gradient would meet the NaN even where nobody asks for that row.
-        return jnp.where(located.valid[:, None], values, jnp.nan)
+        return values
 
     def encode(self, located: Located) -> Float[Array, "N features"]:
         """What the network is given: the interpolated features of all levels; 0 where a position is NaN."""

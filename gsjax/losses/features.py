@@ -1,0 +1,131 @@
+"""Losses between a rendered feature map and what a teacher says of its pixels (papers/002, section 3.4).
+
+A field of C channels meets a teacher of D through a linear map W, [D, C], without bias. With g a pixel's C
+rendered numbers and e the teacher's D, all that L_rec (eq. 4) and L_cos (eq. 5) need of W g is
+
+    |W g|^2 = g^T (W^T W) g    and    e . W g = (W^T e) . g,
+
+so neither forms D numbers a pixel; and a teacher that says one of K vectors of each pixel, as masks with an
+embedding each do, needs W^T e of those K alone. Both are exact.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gsjax.losses.photometric import weighted_mean
+
+_LEAST_NORM = 1e-12  # squared
+
+
+class Likeness(NamedTuple):
+    """How W g relates to e, pixel by pixel: |W g|^2, (W g) . e and |e|^2."""
+
+    squared: Float[Array, "*pixels"]
+    product: Float[Array, "*pixels"]
+    target: Float[Array, "*pixels"]
+
+
+def likeness(
+    rendered: Float[Array, "*pixels c"],
+    weights: Float[Array, "d c"],
+    codebook: Float[Array, "k d"],
+    ids: Int[Array, "*pixels"],
+) -> Likeness:
+    """Of pixels to the rows of a codebook that the teacher names; -1 counts as 0.
+
+    Args:
+        rendered: g.
+        weights: W.
+        codebook: what the teacher may say.
+        ids: which of it.
+    """
+    gram = jnp.matmul(weights.T, weights, precision="highest")
+    toward = jnp.matmul(codebook, weights, precision="highest")  # [k, c]
+    squared = jnp.sum(jnp.matmul(rendered, gram, precision="highest") * rendered, axis=-1)
+    row = jnp.maximum(ids, 0)
+    product = jnp.take_along_axis(
+        jnp.matmul(rendered, toward.T, precision="highest"), row[..., None], axis=-1
+    )[..., 0]
+    return Likeness(jnp.maximum(squared, 0.0), product, jnp.sum(codebook**2, axis=-1)[row])
+
+
+def likeness_to_map(
+    rendered: Float[Array, "*pixels c"], weights: Float[Array, "d c"], target: Float[Array, "*pixels d"]
+) -> Likeness:
+    """Of pixels to a feature of their own each."""
+    lifted = jnp.matmul(rendered, weights.T, precision="highest")
+    return Likeness(
+        jnp.sum(lifted**2, axis=-1), jnp.sum(lifted * target, axis=-1), jnp.sum(target**2, axis=-1)
+    )
+
+
+def feature_error(
+    likeness: Likeness, alphas: Float[Array, "*pixels"], dimension: int
+) -> Float[Array, "*pixels"]:
+    """L_rec of each pixel: the mean over D channels of (W g - alpha e)^2.
+
+    What is half transparent is to show half a feature, else Gaussians at the rim of the scene would have to
+    have larger ones than their neighbours.
+    """
+    squared, product, target = likeness
+    return (squared - 2 * alphas * product + alphas**2 * target) / dimension
+
+
+def cosine_error(likeness: Likeness) -> Float[Array, "*pixels"]:
+    """L_cos of each pixel: 1 - cos(W g, e); its slope is 0 where one of the two has no length."""
+    squared, product, target = likeness
+    there = (squared > _LEAST_NORM) & (target > _LEAST_NORM)
+    lengths = jnp.sqrt(jnp.where(there, squared * target, 1.0))
+    return 1 - jnp.where(there, product / lengths, 0.0)
+
+
+def max_pooled(features: Float[Array, "h w c"], edge: int) -> Float[Array, "h_ w_ c"]:
+    """The largest of each channel in windows of `edge` x `edge` pixels; what is left over at the far sides is
+    left out."""
+    high, wide = features.shape[0] // edge, features.shape[1] // edge
+    windows = features[: high * edge, : wide * edge].reshape(high, edge, wide, edge, -1)
+    return windows.max(axis=(1, 3))
+
+
+def pooled_ids(ids: Int[Array, "h w"], edge: int) -> Int[Array, "h_ w_"]:
+    """The one thing that each window of `max_pooled` shows, and -1 where it shows two or none."""
+    high, wide = ids.shape[0] // edge, ids.shape[1] // edge
+    windows = ids[: high * edge, : wide * edge].reshape(high, edge, wide, edge)
+    most, least = windows.max(axis=(1, 3)), windows.min(axis=(1, 3))
+    return jnp.where(most == least, most, -1)
+
+
+def contrastive_loss(
+    features: Float[Array, "n c"], ids: Int[Array, "n"], gamma: float = 1.0
+) -> Float[Array, ""]:
+    """Features of one thing together, of different things apart (eq. 6 as the text describes it):
+
+        - mean over A of log( sum over B of A's kind of K(A, B) / sum over all B of K(A, B) ),
+
+    K(A, B) = exp(-gamma |A - B|^2), no A with itself. In logarithms, for K underflows where features are 10
+    apart. An A without another of its kind is no anchor; 0 where nothing is.
+
+    Args:
+        features: of pixels.
+        ids: what each shows; those with -1 take no part.
+    """
+    # About their mean, which changes no distance: what all have in common would take the digits.
+    features = features - jax.lax.stop_gradient(features.mean(axis=0))
+    lengths = jnp.sum(features**2, axis=-1)
+    products = jnp.matmul(features, features.T, precision="highest")
+    apart = jnp.maximum(lengths[:, None] + lengths - 2 * products, 0.0)
+    others = (ids >= 0) & ~jnp.eye(len(ids), dtype=bool)
+    same = others & (ids[:, None] == ids)
+    anchors = (ids >= 0) & same.any(axis=1)
+    share = _log_sum(-gamma * apart, same) - _log_sum(-gamma * apart, others)
+    return -weighted_mean(jnp.where(anchors, share, 0.0), anchors.astype(features.dtype))
+
+
+def _log_sum(logs: Float[Array, "n n"], of: Bool[Array, "n n"]) -> Float[Array, "n"]:
+    """log sum exp of each row's chosen entries; 0 for a row without any."""
+    some = of.any(axis=1)
+    chosen = jnp.where(of, logs, -jnp.inf)
+    return jax.nn.logsumexp(jnp.where(some[:, None], chosen, 0.0), axis=1) * some

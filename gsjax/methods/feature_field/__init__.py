@@ -1,0 +1,79 @@
+"""A semantic field for a scene that somebody else has fitted, asked in 3D (FD-3DGS, papers/002).
+
+    teacher = teacher_of_objects(masks, embeddings)
+    problem, state = begin_field(gaussians, cameras, teacher, config)
+    for distilled in distill(problem, state): ...
+    scores = relevancy(gaussian_cosines(field, located, queries))
+
+config.py    what can be set              distill.py   the losses, and one step
+teacher.py   what pixels are to say       training.py  the loop on the host
+field.py     hash grid and convolution    query.py     what a query means
+inverse.py   from the teacher's channels back to the field's
+"""
+
+from gsjax.methods.feature_field.config import FieldConfig, FieldRatesConfig, FieldWeightsConfig
+from gsjax.methods.feature_field.distill import FieldBatch, distillation_step, field_loss
+from gsjax.methods.feature_field.field import (
+    FeatureField,
+    carried,
+    features_of,
+    init_field,
+    used_part,
+    whole,
+)
+from gsjax.methods.feature_field.inverse import learned_inverse, pseudo_inverse
+from gsjax.methods.feature_field.query import (
+    Threshold,
+    back_projected_cosines,
+    gaussian_cosines,
+    pixel_cosines,
+    pixel_mask,
+    relevancy,
+    selection_mask,
+    threshold_for,
+)
+from gsjax.methods.feature_field.teacher import Teacher, teacher_of_maps, teacher_of_objects
+from gsjax.methods.feature_field.training import (
+    Distilled,
+    FieldProblem,
+    FieldState,
+    begin_field,
+    distill,
+    finished,
+    frozen_views,
+)
+
+__all__ = [
+    "Distilled",
+    "FeatureField",
+    "FieldBatch",
+    "FieldConfig",
+    "FieldProblem",
+    "FieldRatesConfig",
+    "FieldState",
+    "FieldWeightsConfig",
+    "Teacher",
+    "Threshold",
+    "back_projected_cosines",
+    "begin_field",
+    "carried",
+    "distill",
+    "distillation_step",
+    "features_of",
+    "field_loss",
+    "finished",
+    "frozen_views",
+    "gaussian_cosines",
+    "init_field",
+    "learned_inverse",
+    "pixel_cosines",
+    "pixel_mask",
+    "pseudo_inverse",
+    "relevancy",
+    "selection_mask",
+    "teacher_of_maps",
+    "teacher_of_objects",
+    "threshold_for",
+    "used_part",
+    "whole",
+]

@@ -1,0 +1,227 @@
+"""Distillation: a view a step is drawn in features and held against its teacher (papers/002, section 3.4)."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from gsjax.losses.features import (
+    contrastive_loss,
+    cosine_error,
+    feature_error,
+    likeness,
+    likeness_to_map,
+    max_pooled,
+    pooled_ids,
+)
+from gsjax.losses.regularization import total_variation
+from gsjax.methods.feature_field.config import FieldConfig
+from gsjax.methods.feature_field.field import Carried, FeatureField, carried
+from gsjax.optim.step import Step, gradient_step
+from gsjax.rasterize.frozen import FrozenView, paint, strip_of
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.feature_grid import Located
+
+_FINAL_RATE = 0.1
+
+
+class FieldBatch(NamedTuple):
+    """A view and what its teacher says.
+
+    Attributes:
+        view: of the scene, which stands still.
+        located: where its Gaussians lie in the grid; None without one.
+        ids: rows of the codebook, or things; -1 unknown.
+        codebook: of the teacher; None where there are maps only.
+        map: of the teacher, of any size; None where there is none.
+        plan: of the view.
+    """
+
+    view: FrozenView
+    located: Located | None
+    ids: Int[Array, "height width"]
+    codebook: Float[Array, "k d"] | None
+    map: Float[Array, "h w d"] | None
+    plan: Plan
+
+
+class _Sums(NamedTuple):
+    """Of the pixels of a strip."""
+
+    rec: Float[Array, ""]
+    cos: Float[Array, ""]
+    pixels: Float[Array, ""]
+    tv: Float[Array, ""]
+
+
+def distillation_step(config: FieldConfig) -> Step:
+    """Adam on a `FeatureField`; `batch` is a `FieldBatch`, `step` the number of the step, `key` is needed.
+
+    `info` has each loss by name, unweighted.
+    """
+    rates = config.rates
+    fall = optax.exponential_decay(1.0, config.iterations, _FINAL_RATE)
+
+    def label(field: FeatureField):
+        def of(path, _):
+            names = [getattr(key, "name", None) for key in path]
+            return "lift" if "lift" in names else "layers" if "layers" in names else "table"
+
+        return jax.tree_util.tree_map_with_path(of, field)
+
+    def adam(rate: float):
+        return optax.adam(lambda i: rate * fall(i), eps=1e-15)
+
+    adams = {"table": adam(rates.table), "layers": adam(rates.layers), "lift": adam(rates.lift)}
+    return gradient_step(field_loss(config), optax.multi_transform(adams, label))
+
+
+def field_loss(config: FieldConfig) -> Callable:
+    """`loss(field, batch, *, step, key)`: eq. 8, of one view."""
+    weights, edge = config.weights, config.contrast_pool
+
+    def loss(field: FeatureField, batch: FieldBatch, *, step: Any, key: Any):
+        sums, pooled = _drawn(field, batch, config)
+        channels = field.channels
+        height, width = batch.ids.shape
+        known = jnp.maximum(sums.pixels, 1.0)
+        aux = {"rec": sums.rec / known, "cos": sums.cos / known}
+        value = weights.rec * aux["rec"] + weights.cos * aux["cos"]
+        if weights.tv:
+            aux["tv"] = sums.tv / (height * width * channels)
+            value += weights.tv * aux["tv"]
+        if weights.contrast:
+            assert pooled is not None
+            aux["contrast"] = jax.lax.cond(
+                jnp.asarray(step) >= config.contrast_after * config.iterations,
+                lambda: _contrast(pooled, pooled_ids(batch.ids, edge), key, config),
+                lambda: jnp.zeros((), pooled.dtype),
+            )
+            value += weights.contrast * aux["contrast"]
+        return value, aux
+
+    return loss
+
+
+def strip_rows(config: FieldConfig, hidden: int, plan: Plan) -> int:
+    """Rows of tiles in a strip whose pixels' features take no more memory than they may."""
+    a_row = 4 * (hidden + config.channels) * plan.tile_size * plan.width
+    return int(max(1, min(plan.tiles_y, config.strip_megabytes * 2**20 // a_row)))
+
+
+def _drawn(
+    field: FeatureField, batch: FieldBatch, config: FieldConfig
+) -> tuple[_Sums, Float[Array, "h_ w_ channels"] | None]:
+    """What losses there are in a view, and its pooled features where the contrast asks for them.
+
+    The image is worked through strip by strip, each of which forgets its pixels and is drawn once more on the
+    way back. So the memory is that of a strip.
+    """
+    parts, plan = carried(field, batch.located), batch.plan
+    rows = strip_rows(config, parts.values.shape[1], plan)
+    strips = -(-plan.tiles_y // rows)
+    high = rows * plan.tile_size
+    ids = jnp.pad(batch.ids, ((0, strips * high - plan.height), (0, 0)), constant_values=-1)
+    padded = batch._replace(ids=ids)
+
+    def strip(above, number):
+        return _strip(field, parts, padded, above, number, rows, config)
+
+    above = jnp.zeros((plan.width, field.channels), parts.values.dtype)
+    if strips == 1:
+        _, (sums, pooled) = strip(above, 0)
+        return sums, pooled
+    _, (sums, pooled) = jax.lax.scan(jax.checkpoint(strip), above, jnp.arange(strips))
+    if pooled is not None:
+        pooled = pooled.reshape(-1, *pooled.shape[2:])[: plan.height // config.contrast_pool]
+    return jax.tree.map(jnp.sum, sums), pooled
+
+
+def _strip(
+    field: FeatureField,
+    parts: Carried,
+    batch: FieldBatch,
+    above: Float[Array, "width channels"],
+    number: Int[Array, ""] | int,
+    rows: int,
+    config: FieldConfig,
+):
+    """One strip: its last row, its sums, and its pooled features."""
+    plan, weights = batch.plan, config.weights
+    high = rows * plan.tile_size
+    view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
+    image, alphas = paint(view, parts.values, strip_plan)
+    # Pixels on one axis: a matmul over two of them, as in the slope by the weights, XLA:CPU does ten times as
+    # slowly.
+    alphas = alphas.ravel()
+    rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
+    inside = number * high + jnp.arange(high) < plan.height
+    sums = _teacher_sums(field, parts, batch, rendered, alphas, number * high, inside)
+    if not weights.tv and not weights.contrast:
+        return above, (sums, None)
+    channels = parts.channels_of(rendered).reshape(high, plan.width, -1)
+    if weights.tv:
+        before = jnp.where(number == 0, channels[0], above)
+        sums = sums._replace(tv=total_variation(channels, before, inside))
+    pooled = max_pooled(channels, config.contrast_pool) if weights.contrast else None
+    if pooled is not None and rows == plan.tiles_y:
+        pooled = pooled[: plan.height // config.contrast_pool]
+    return channels[-1], (sums, pooled)
+
+
+def _teacher_sums(
+    field: FeatureField, parts: Carried, batch: FieldBatch, rendered, alphas, first_row, inside
+) -> _Sums:
+    """By how much a strip's pixels, in one row, differ from what the teacher says of them."""
+    lifted = parts.lifted(field.lift)
+    zero = jnp.zeros((), rendered.dtype)
+    rec, cos, pixels = zero, zero, zero
+    if batch.codebook is not None:
+        ids = jax.lax.dynamic_slice_in_dim(batch.ids, first_row, len(inside)).ravel()
+        like, known = likeness(rendered, lifted, batch.codebook, ids), ids >= 0
+        rec += jnp.where(known, feature_error(like, alphas, field.dimension), 0.0).sum()
+        cos += jnp.where(known, cosine_error(like), 0.0).sum()
+        pixels += known.sum(dtype=zero.dtype)
+    if batch.map is not None:
+        said = _stretched(batch.map, first_row, len(inside), batch.plan)
+        like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
+        known = jnp.repeat(inside, batch.plan.width)
+        rec += jnp.where(known, feature_error(like, alphas, field.dimension), 0.0).sum()
+        cos += jnp.where(known, cosine_error(like), 0.0).sum()
+        pixels += known.sum(dtype=zero.dtype)
+    return _Sums(rec, cos, pixels, zero)
+
+
+def _stretched(
+    teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
+) -> Float[Array, "rows width d"]:
+    """Rows of a teacher's map as large as the view, linear between the centres of its pixels."""
+    high, wide = teacher.shape[:2]
+
+    def places(centres, have: int, want: int):
+        at = jnp.clip(centres * (have / want) - 0.5, 0, have - 1)
+        low = jnp.minimum(at.astype(jnp.int32), have - 1)
+        return low, jnp.minimum(low + 1, have - 1), at - low
+
+    top, bottom, down = places(first + jnp.arange(rows) + 0.5, high, plan.height)
+    left, right, across = places(jnp.arange(plan.width) + 0.5, wide, plan.width)
+    lines = teacher[top] * (1 - down)[:, None, None] + teacher[bottom] * down[:, None, None]
+    return lines[:, left] * (1 - across)[:, None] + lines[:, right] * across[:, None]
+
+
+def _contrast(
+    pooled: Float[Array, "h w channels"], ids: Int[Array, "h w"], key: Any, config: FieldConfig
+) -> Float[Array, ""]:
+    """The contrast within a patch of pooled features that a key chooses."""
+    high, wide = (min(config.contrast_patch, side) for side in ids.shape)
+    first, second = jax.random.split(key)
+    corner = (
+        jax.random.randint(first, (), 0, ids.shape[0] - high + 1),
+        jax.random.randint(second, (), 0, ids.shape[1] - wide + 1),
+    )
+    patch = jax.lax.dynamic_slice(pooled, (*corner, 0), (high, wide, pooled.shape[2]))
+    seen = jax.lax.dynamic_slice(ids, corner, (high, wide))
+    return contrastive_loss(patch.reshape(high * wide, -1), seen.ravel(), config.contrast_gamma)

@@ -1,0 +1,59 @@
+"""The way back from the teacher's channels to the field's (papers/002, eq. 9): the pseudo-inverse, or
+learned.
+
+    L_cyc = |W' F - F'_low|_1 + |W F'_low - F|_1
+
+with F'_low rendered features of C channels and F = W F'_low. With W fixed the second term is 0, and what is
+left is linear regression in L1 on features as they occur: the learned inverse need not be one elsewhere.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+_RATE = 3e-3
+
+
+def pseudo_inverse(lift: Float[Array, "d channels"]) -> Float[Array, "channels d"]:
+    """Moore and Penrose's, by singular values."""
+    return jnp.linalg.pinv(lift)
+
+
+@partial(jax.jit, static_argnames=("iterations", "batch"))
+def learned_inverse(
+    lift: Float[Array, "d channels"],
+    features: Float[Array, "n channels"],
+    key: Array,
+    iterations: int = 500,
+    batch: int = 2048,
+) -> tuple[Float[Array, "channels d"], Float[Array, "iterations"]]:
+    """An inverse of a fixed convolution, by Adam on the cycle loss; and the loss over the iterations.
+
+    Args:
+        lift: W.
+        features: F'_low as they occur, of pixels or of Gaussians.
+        key: of first values, and of what each step looks at.
+        iterations: steps.
+        batch: features that a step looks at.
+    """
+    optimizer = optax.adam(optax.exponential_decay(_RATE, iterations, 0.03))
+
+    def loss(inverse, some):
+        return jnp.abs(some @ lift.T @ inverse.T - some).sum(axis=-1).mean()
+
+    def step(carry, key):
+        inverse, state = carry
+        some = features[jax.random.randint(key, (batch,), 0, len(features))]
+        value, slope = jax.value_and_grad(loss)(inverse, some)
+        updates, state = optimizer.update(slope, state)
+        return (optax.apply_updates(inverse, updates), state), value
+
+    first, keys = jax.random.split(key)
+    start = jax.random.normal(first, lift.T.shape, lift.dtype) / jnp.sqrt(lift.shape[0])
+    (inverse, _), losses = jax.lax.scan(
+        step, (start, optimizer.init(start)), jax.random.split(keys, iterations)
+    )
+    return inverse, losses

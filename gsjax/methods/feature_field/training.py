@@ -1,0 +1,163 @@
+"""The host loop of a distillation: which view is next, what goes to the device, what comes back."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.feature_field.config import FieldConfig
+from gsjax.methods.feature_field.distill import FieldBatch, distillation_step
+from gsjax.methods.feature_field.field import FeatureField, init_field, used_part, whole
+from gsjax.methods.feature_field.teacher import Teacher
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.frozen import FrozenView, freeze_views
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.gaussians import Gaussians
+
+_PATCHES = 1  # what keys are for, beside first values
+
+
+class FieldProblem(NamedTuple):
+    """What does not change during a distillation.
+
+    Attributes:
+        config: how.
+        views: batches, one a view that teaches something.
+        rows: of the grid's table that train; None without a grid.
+    """
+
+    config: FieldConfig
+    views: list[FieldBatch]
+    rows: Int[np.ndarray, "used"] | None
+
+
+class FieldState(eqx.Module):
+    """What a distillation goes on from, to the same bits.
+
+    Attributes:
+        field: what is learned; of a grid, the entries that train.
+        optimizer: what the step carries along.
+        step: how many steps were made.
+    """
+
+    field: FeatureField
+    optimizer: Any
+    step: int
+
+
+class Distilled(NamedTuple):
+    """A distillation after one more step.
+
+    Attributes:
+        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
+        info: losses of this step, on the device.
+        seconds: that it took, without what compiled.
+        compile_seconds: that compiling took in it.
+    """
+
+    state: FieldState
+    info: dict[str, Array]
+    seconds: float
+    compile_seconds: float
+
+
+def begin_field(
+    gaussians: Gaussians, cameras: Sequence[Camera], teacher: Teacher, config: FieldConfig
+) -> tuple[FieldProblem, FieldState]:
+    """A distillation before its first step.
+
+    Args:
+        gaussians: the scene, which stays as it is.
+        cameras: one a view, viewmat [4,4] and K [3,3], of any sizes.
+        teacher: of the same views.
+        config: how.
+
+    Raises:
+        ValueError: the teacher has other views, or of other sizes, or the scene no Gaussian with a place.
+    """
+    _check(cameras, teacher)
+    field, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
+    field, located, rows = used_part(field, located)
+    codebook = None if teacher.codebook is None else jnp.asarray(teacher.codebook)
+    frozen, views = frozen_views(gaussians, cameras), []
+    for v, (view, plan) in enumerate(frozen):
+        if teacher.maps is None and not (teacher.ids[v] >= 0).any():
+            continue  # it teaches nothing
+        of_pixels = None if teacher.maps is None else jnp.asarray(teacher.maps[v])
+        views.append(FieldBatch(view, located, jnp.asarray(teacher.ids[v]), codebook, of_pixels, plan))
+    state = FieldState(field, distillation_step(config).init(field), 0)
+    return FieldProblem(config, views, rows), state
+
+
+def distill(problem: FieldProblem, state: FieldState) -> Iterator[Distilled]:
+    """Step by step, until all is done. The same state and problem give the same bits, wherever the
+    distillation was begun or resumed."""
+    config = problem.config
+    advance = _compiled(config)
+    key = jax.random.fold_in(jax.random.key(config.seed), _PATCHES)
+    field, optimizer, compiled = state.field, state.optimizer, set()
+    for i in range(state.step, config.iterations):
+        begun = perf_counter()
+        batch = problem.views[_turn(config.seed, i, len(problem.views))]
+        shapes = (batch.plan, *(leaf.shape for leaf in jax.tree.leaves(batch)))
+        field, optimizer, info = advance(field, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i))
+        jax.block_until_ready(info)
+        seconds, new = perf_counter() - begun, shapes not in compiled
+        compiled.add(shapes)
+        now = FieldState(field, optimizer, i + 1)
+        yield Distilled(now, info, 0.0 if new else seconds, seconds if new else 0.0)
+
+
+def finished(problem: FieldProblem, state: FieldState) -> FeatureField:
+    """The field for any place, not only where the scene's Gaussians are."""
+    return whole(state.field, problem.rows)
+
+
+def frozen_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[tuple[FrozenView, Plan]]:
+    """The scene in each camera. Those of one size share their plan and the lengths of their lists."""
+    sizes = sorted({(camera.width, camera.height, camera.near) for camera in cameras})
+    found: dict[int, tuple[FrozenView, Plan]] = {}
+    for width, height, near in sizes:
+        which = [v for v, c in enumerate(cameras) if (c.width, c.height, c.near) == (width, height, near)]
+        scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+        viewmats, Ks = (jnp.stack([getattr(cameras[v], n) for v in which]) for n in ("viewmat", "K"))
+        views, plan = freeze_views(*scene, viewmats, Ks, width, height, near_plane=near)
+        for place, v in enumerate(which):
+            found[v] = (jax.tree.map(lambda a, place=place: a[place], views), plan)
+    return [found[v] for v in range(len(cameras))]
+
+
+@lru_cache(maxsize=2)
+def _compiled(config: FieldConfig) -> Callable:
+    """The jitted step; buffers that it replaces are given away."""
+    step = distillation_step(config)
+
+    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
+    def advance(field, optimizer, batch, i, key):
+        return step.update(field, optimizer, batch, step=i, key=key)
+
+    return advance
+
+
+def _turn(seed: int, step: int, count: int) -> int:
+    """Which view a step looks at: all of them in a random order, and then in another."""
+    epoch, place = divmod(step, count)
+    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
+
+
+def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:
+    if len(cameras) != len(teacher.ids):
+        raise ValueError(f"teacher: expected that of {len(cameras)} views, found {len(teacher.ids)}")
+    for v, (camera, ids) in enumerate(zip(cameras, teacher.ids, strict=True)):
+        if ids.shape != (camera.height, camera.width):
+            raise ValueError(
+                f"teacher: expected {camera.width}x{camera.height} pixels of view {v} like its camera, found "
+                f"{ids.shape[1]}x{ids.shape[0]}"
+            )

@@ -1,0 +1,114 @@
+"""Views of Gaussians that stand still: projected and listed once, painted as often as their values change.
+
+Where values alone train, as features do on a scene that somebody else has fitted, a render would project,
+sort and list the same Gaussians in every step. What it finds is kept here instead, 24 bytes a Gaussian and 4
+a pair. An image of many channels need not be there as a whole either: a strip of its tile rows can be
+painted, and used up, after the other.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.rasterize.binning import bin_gaussians
+from gsjax.rasterize.compositing import Lists, Splats
+from gsjax.rasterize.gradients import composite
+from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.projection import project_gaussians
+from gsjax.rasterize.rasterization import plan as _plan
+
+
+class FrozenView(NamedTuple):
+    """What a camera sees of N Gaussians, whatever they are painted with; or a strip of it.
+
+    Attributes:
+        means2d, conics, opacities: as projected, in pixels of the image or of the strip.
+        ids: Gaussians of all tiles' lists, front to back, no further than they are read.
+        starts, counts: of each tile's list in `ids`.
+    """
+
+    means2d: Float[Array, "*views n 2"]
+    conics: Float[Array, "*views n 3"]
+    opacities: Float[Array, "*views n"]
+    ids: Int[Array, "*views pairs"]
+    starts: Int[Array, "*views tiles"]
+    counts: Int[Array, "*views tiles"]
+
+
+def freeze_views(
+    means: Float[Array, "n 3"],
+    quats: Float[Array, "n 4"],
+    scales: Float[Array, "n 3"],
+    opacities: Float[Array, "n"],
+    viewmats: Float[Array, "c 4 4"],
+    Ks: Float[Array, "c 3 3"],
+    width: int,
+    height: int,
+    **options: Any,
+) -> tuple[FrozenView, Plan]:
+    """The views [C, ...] of C cameras, and the plan that they are painted with. On the host.
+
+    Arguments and options as for `gsjax.rasterization`; gradients stop here. Gaussians that cannot be drawn
+    are in no list.
+
+    Raises:
+        ValueError: as `gsjax.plan`.
+    """
+    scene = (means, quats, scales, opacities)
+    plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
+    views = [_freeze(*scene, viewmat, K, plan) for viewmat, K in zip(viewmats, Ks, strict=True)]
+    ends = [int((view.starts + view.counts).max(initial=0)) for view in views]
+    pairs = max([1, *ends])
+    kept = [jax.device_get(view._replace(ids=view.ids[:pairs])) for view in views]
+    return jax.tree.map(lambda *a: jnp.asarray(np.stack(a)), *kept), plan
+
+
+def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
+    """`rows` rows of tiles of one view, from row `first` on, and their plan; below the image they are empty."""
+    wide = plan.tiles_x
+
+    def cut(a):
+        padded = jnp.pad(a, (0, rows * wide))  # a slice that would reach beyond begins earlier instead
+        return jax.lax.dynamic_slice_in_dim(padded, first * wide, rows * wide)
+
+    down = jnp.stack([jnp.zeros(()), first * plan.tile_size]).astype(view.means2d.dtype)
+    part = view._replace(means2d=view.means2d - down, starts=cut(view.starts), counts=cut(view.counts))
+    return part, dataclasses.replace(plan, height=rows * plan.tile_size)
+
+
+def paint(
+    view: FrozenView, values: Float[Array, "n d"], plan: Plan
+) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
+    """The image of one view, sum_i w_i v_i without background, and its alphas. Differentiable by the values.
+
+    The weights are those of `gsjax.rasterization`, so the image is too.
+    """
+    view = jax.lax.stop_gradient(view)
+    splats = Splats(view.means2d, view.conics, view.opacities, values)
+    lists = Lists(view.ids, view.starts, view.counts)
+    tiles, transmittance, _ = composite(splats, lists, None, plan)
+    return _untiled(tiles, plan), 1 - _untiled(transmittance[:, None], plan)[..., 0]
+
+
+def _untiled(
+    tiles: Float[Array, "tiles channels pixels"], plan: Plan
+) -> Float[Array, "height width channels"]:
+    edge = plan.tile_size
+    image = tiles.reshape(plan.tiles_y, plan.tiles_x, -1, edge, edge).transpose(0, 3, 1, 4, 2)
+    return image.reshape(plan.tiles_y * edge, plan.tiles_x * edge, -1)[: plan.height, : plan.width]
+
+
+@partial(jax.jit, static_argnames="plan")
+def _freeze(means, quats, scales, opacities, viewmat, K, plan: Plan) -> FrozenView:
+    usable = jnp.ones(len(means), bool)
+    projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan)
+    binned = bin_gaussians(projected, None, plan)
+    splats = Splats(projected.means2d, projected.conics, projected.opacities, jnp.ones((len(means), 1)))
+    *_, reads = composite(splats, Lists(binned.ids, binned.starts, binned.counts), None, plan)
+    shapes = (projected.means2d, projected.conics, projected.opacities)
+    return FrozenView(*shapes, binned.ids, binned.starts, reads)

@@ -1,0 +1,113 @@
+"""Views that are listed once and painted: the rasterizer's own images, whole and in strips."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.rasterize.frozen import freeze_views, paint, strip_of
+from gsjax.rasterize.rasterization import rasterization
+
+
+def drawn(scene, values, **options):
+    """Image and alphas of the rasterizer."""
+    shapes = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
+    colors, alphas, _ = rasterization(**shapes, colors=values, width=33, height=17, **options)
+    return np.asarray(colors), np.asarray(alphas)[..., 0]
+
+
+@pytest.fixture(scope="module")
+def frozen(small, geometry):
+    _, scene = small(3)
+    return scene, *freeze_views(*geometry(scene), 33, 17)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 20])
+def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
+    scene, views, plan = frozen
+    values = jnp.asarray(np.random.default_rng(0).normal(size=(len(scene["means"]), channels)), jnp.float32)
+    colors, alphas = drawn(scene, values)
+    for c in range(len(colors)):
+        image, opacity = paint(jax.tree.map(lambda a, c=c: a[c], views), values, plan)
+        np.testing.assert_allclose(image, colors[c], atol=2e-5)
+        np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 5])
+def test_strips_below_each_other_are_the_image(frozen, rows):
+    scene, views, plan = frozen
+    view = jax.tree.map(lambda a: a[0], views)
+    values = jnp.asarray(np.random.default_rng(1).normal(size=(len(scene["means"]), 12)), jnp.float32)
+    whole, _ = paint(view, values, plan)
+    cut = jax.jit(lambda i: paint(*_with(strip_of(view, plan, i, rows), values))[0])
+    strips = [cut(jnp.int32(i)) for i in range(0, plan.tiles_y, rows)]
+    assert strips[0].shape == (rows * plan.tile_size, 33, 12)
+    together = np.concatenate(strips)
+    np.testing.assert_allclose(together[:17], whole, atol=1e-5)
+    np.testing.assert_array_equal(together[24:], 0)  # rows of tiles below the image
+
+
+def _with(strip, values):
+    view, plan = strip
+    return view, values, plan
+
+
+def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else_has_any(frozen):
+    scene, views, plan = frozen
+    view = jax.tree.map(lambda a: a[0], views)
+    for channels in (3, 20):
+        random = np.random.default_rng(2)
+        values, weights = (
+            jnp.asarray(random.normal(size=shape), jnp.float32)
+            for shape in ((len(scene["means"]), channels), (17, 33, channels))
+        )
+        slope = jax.grad(lambda v, w=weights: (paint(view, v, plan)[0] * w).sum())(values)
+
+        def whole(scene, values, w=weights):
+            shapes = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
+            of_plan = dataclasses.replace(plan, capacity=4096)
+            return (rasterization(**shapes, colors=values, width=33, height=17, plan=of_plan)[0][0] * w).sum()
+
+        # By everything, which takes another way back; and by the values alone.
+        both = jax.grad(whole, argnums=(0, 1), allow_int=True)(scene, values)[1]
+        np.testing.assert_allclose(slope, both, atol=2e-4)
+        np.testing.assert_allclose(jax.grad(whole, argnums=1)(scene, values), both, atol=2e-4)
+        still = jax.grad(lambda view, v=values: paint(view, v, plan)[0].sum(), allow_int=True)(view)
+        np.testing.assert_array_equal(still.means2d, 0)
+
+
+def test_a_batch_of_values_is_a_loop_and_its_slopes_too(frozen):
+    scene, views, plan = frozen
+    view = jax.tree.map(lambda a: a[0], views)
+    values = jnp.asarray(np.random.default_rng(3).normal(size=(3, len(scene["means"]), 2)), jnp.float32)
+
+    def value(v):
+        return (paint(view, v, plan)[0] ** 2).sum()
+
+    np.testing.assert_allclose(jax.vmap(value)(values), [value(v) for v in values], rtol=1e-5)
+    slopes = jax.vmap(jax.grad(value))(values)
+    np.testing.assert_allclose(slopes, np.stack([jax.grad(value)(v) for v in values]), rtol=1e-4, atol=1e-4)
+
+
+def test_what_cannot_be_drawn_is_in_no_list(small, geometry):
+    _, scene = small(4)
+    sick = dict(scene, means=scene["means"].at[::3].set(jnp.nan))
+    views, plan = freeze_views(*geometry(sick), 33, 17)
+    view = jax.tree.map(lambda a: a[0], views)
+    values = jnp.where(jnp.arange(len(sick["means"]))[:, None] % 3 == 0, jnp.nan, 1.0)
+    assert np.isfinite(paint(view, values, plan)[0]).all()
+    listed = np.concatenate(
+        [np.asarray(view.ids)[a : a + n] for a, n in zip(view.starts, view.counts, strict=True)]
+    )
+    assert not (listed % 3 == 0).any()
+
+
+def test_a_view_that_sees_nothing_is_empty(small, geometry):
+    _, scene = small(5)
+    away = dict(scene, means=scene["means"] + np.float32(1e6))
+    views, plan = freeze_views(*geometry(away), 33, 17)
+    image, alphas = paint(jax.tree.map(lambda a: a[0], views), jnp.ones((len(away["means"]), 2)), plan)
+    np.testing.assert_array_equal(image, 0)
+    np.testing.assert_array_equal(alphas, 0)
