@@ -69,7 +69,7 @@ def freeze_views(
 
 
 def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
-    """`rows` rows of tiles of one view, from row `first` on, and their plan; below the image they are empty."""
+    """`rows` rows of tiles of one view, from `first` on, and their plan; below the image they are empty."""
     wide = plan.tiles_x
 
     def cut(a):

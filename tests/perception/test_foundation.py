@@ -10,6 +10,7 @@ from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
 from gsjax.perception.clip import load_clip
 from gsjax.perception.dinov2 import load_dinov2
 from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
+from gsjax.perception.maskclip import load_maskclip
 from gsjax.perception.sam import load_sam
 from gsjax.perception.sam2 import load_sam2
 
@@ -88,6 +89,41 @@ def test_clip_sees_a_square_around_each_object(clip_folder):
     np.testing.assert_allclose(vectors[2], encoder.embed_images([crop])[0], atol=1e-6)
     with pytest.raises(ValueError, match="got nothing"):
         encoder.embed_text("  ")
+
+
+@needs_foundation
+def test_maskclip_is_the_values_of_clips_last_layer(clip_folder):
+    import torch
+    from transformers import CLIPImageProcessorPil, CLIPModel
+
+    encoder = load_maskclip(clip_folder, resolution=32)
+    assert isinstance(encoder, DenseEncoder)
+    found = encoder(np.stack([IMAGE, IMAGE[:, ::-1]]))
+    assert found.shape == (2, 4, 6, 12)  # 37 pixels become 32, and 52 become 48, in patches of 8
+
+    model = CLIPModel.from_pretrained(clip_folder).eval()
+    size = {"height": 32, "width": 48}
+    processor = CLIPImageProcessorPil.from_pretrained(clip_folder)
+    pixels = processor([IMAGE], size=size, do_center_crop=False, return_tensors="pt")["pixel_values"]
+    with torch.no_grad():
+        hidden = model.vision_model(pixels, output_hidden_states=True, interpolate_pos_encoding=True)
+    weights = {name: value.numpy() for name, value in model.state_dict().items()}
+
+    def norm(x, name):
+        scaled = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5)
+        return scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+
+    def linear(x, name):
+        return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+    last = "vision_model.encoder.layers.1"
+    values = linear(norm(hidden.hidden_states[1].numpy(), f"{last}.layer_norm1"), f"{last}.self_attn.v_proj")
+    patches = norm(linear(values, f"{last}.self_attn.out_proj"), "vision_model.post_layernorm")[0, 1:]
+    vectors = patches @ weights["visual_projection.weight"].T
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found[0], vectors.reshape(4, 6, 12), atol=1e-5)
+    np.testing.assert_array_equal(encoder.embed_text("red can"), encoder.clip.embed_text("red can"))
+    assert encoder.min_score == 0.2
 
 
 @needs_foundation

@@ -1,0 +1,78 @@
+"""MaskCLIP (Zhou et al., "Extract Free Dense Labels from CLIP", ECCV 2022): CLIP's vector of each patch, in
+the space of its texts, without training.
+
+CLIP's last layer attends from all patches to one; what it would mix, the values, say what each patch is. So
+they take the place of the layer's output, as in the code of F3RM and FeatUp: values, through the layer's own
+projection, the last norm and the projection to the texts' space, with no residual and no MLP.
+
+Needs the extra `foundation`; weights are those of CLIP, local files.
+"""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Num
+
+from gsjax.perception.clip import ClipEncoder, load_clip
+from gsjax.perception.pictures import to_bytes
+
+
+@dataclass(frozen=True)
+class MaskClipEncoder:
+    """Unit vectors of patches and of texts; from `load_maskclip`.
+
+    Attributes:
+        clip: the model, for texts too.
+        resolution: pixels of the shorter side that the model sees, rounded to whole patches. More see more,
+            as far as position embeddings can be stretched.
+    """
+
+    clip: ClipEncoder
+    resolution: int = 448
+
+    @property
+    def min_score(self) -> float:
+        return self.clip.min_score
+
+    def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:
+        """A vector a patch of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen."""
+        height, width = images.shape[1:3]
+        vision, torch = self.clip.model.vision_model, self.clip.torch
+        patch = self.clip.model.config.vision_config.patch_size
+        scale = self.resolution / min(height, width)
+        rows, columns = (max(1, round(size * scale / patch)) for size in (height, width))
+        size = {"height": rows * patch, "width": columns * patch}
+        pixels = self.clip.processor(
+            [to_bytes(image) for image in images], size=size, do_center_crop=False, return_tensors="pt"
+        )["pixel_values"]
+        with torch.inference_mode():
+            seen = vision(
+                pixel_values=pixels.to(self.clip.device),
+                output_hidden_states=True,
+                interpolate_pos_encoding=True,
+            )
+            last = vision.encoder.layers[-1]
+            values = last.self_attn.v_proj(last.layer_norm1(seen.hidden_states[-2]))
+            patches = vision.post_layernorm(last.self_attn.out_proj(values)[:, 1:])
+            vectors = self.clip.model.visual_projection(patches).float().cpu().numpy()
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+        return vectors.reshape(len(images), rows, columns, -1)
+
+    def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
+        """The unit vector of a text.
+
+        Raises:
+            ValueError: the text is empty.
+        """
+        return self.clip.embed_text(text)
+
+
+def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int = 448) -> MaskClipEncoder:
+    """CLIP from a folder of weights in the layout of Hugging Face, for patches.
+
+    Raises:
+        FileNotFoundError: the folder or a file of it is missing.
+        ImportError: torch or transformers is not installed.
+    """
+    return MaskClipEncoder(load_clip(path, device), resolution)

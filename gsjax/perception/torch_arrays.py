@@ -1,0 +1,136 @@
+"""The one array of a torch file (.pt, .pth) as `torch.save(tensor, path)` writes it, without torch and
+without unpickling.
+
+Such a file is a zip of the numbers, plain, and of a pickle that says their type and shape. A pickle can run
+anything when it is loaded. So it is not: its opcodes are listed (`pickletools.genops`, which runs nothing),
+and must be the few that rebuild one tensor.
+"""
+
+import pickletools
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_TYPES = {
+    "FloatStorage": np.float32,
+    "DoubleStorage": np.float64,
+    "HalfStorage": np.float16,
+    "LongStorage": np.int64,
+    "IntStorage": np.int32,
+    "ShortStorage": np.int16,
+    "CharStorage": np.int8,
+    "ByteStorage": np.uint8,
+    "BoolStorage": np.bool_,
+}
+_CALLS = {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
+_ADVICE = "Save it again as .npy: numpy.save('features.npy', tensor.cpu().numpy())."
+
+
+def read_torch_array(path: Path) -> np.ndarray:
+    """The array of a file that holds one tensor.
+
+    Raises:
+        ValueError: it is no such file, or holds anything besides one tensor of plain numbers.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            described = [name for name in names if name.endswith("/data.pkl") or name == "data.pkl"]
+            if len(described) != 1:
+                raise ValueError(f"{path}: expected a file of torch.save, found none of its parts. {_ADVICE}")
+            kind, key, offset, shape, strides = _tensor(path, archive.read(described[0]))
+            root = described[0].removesuffix("data.pkl")
+            if f"{root}data/{key}" not in names:
+                raise ValueError(f"{path}: expected its numbers in data/{key}, found none. {_ADVICE}")
+            if f"{root}byteorder" in names and archive.read(f"{root}byteorder") != b"little":
+                raise ValueError(f"{path}: expected little-endian numbers, found others. {_ADVICE}")
+            stored = archive.read(f"{root}data/{key}")
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+        raise ValueError(f"{path}: expected a file of torch.save, found {error}. {_ADVICE}") from error
+    numbers = np.frombuffer(stored, _TYPES[kind])
+    last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
+    if min([0, offset, *shape, *strides]) < 0 or (0 not in shape and last >= len(numbers)):
+        raise ValueError(
+            f"{path}: expected numbers for the shape {list(shape)}, found {len(numbers)}. {_ADVICE}"
+        )
+    if 0 in shape:
+        return np.zeros(shape, numbers.dtype)
+    bytes_apart = [stride * numbers.itemsize for stride in strides]
+    return np.lib.stride_tricks.as_strided(numbers[offset:], shape, bytes_apart).copy()
+
+
+def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], tuple[int, ...]]:
+    """Type, file, first place, shape and strides, by following what the opcodes would put on a stack."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    mark = object()
+
+    def refuse(found: str) -> ValueError:
+        return ValueError(
+            f"{path}: expected one tensor and nothing else, found {found}; gsjax loads no pickles, which can "
+            f"run any program. {_ADVICE}"
+        )
+
+    def since_mark() -> list[Any]:
+        place = len(stack) - 1 - stack[::-1].index(mark)
+        items = stack[place + 1 :]
+        del stack[place:]
+        return items
+
+    try:
+        for opcode, argument, _ in pickletools.genops(pickle):
+            name = opcode.name
+            if name in ("PROTO", "FRAME"):
+                continue
+            if name == "STOP":
+                break
+            if name == "GLOBAL":
+                if argument not in _CALLS and not _is_storage(argument):
+                    raise refuse(repr(argument.replace(" ", ".")))
+                stack.append(argument)
+            elif name in ("BINUNICODE", "SHORT_BINUNICODE", "BININT", "BININT1", "BININT2", "LONG1"):
+                stack.append(argument)
+            elif name in ("NEWTRUE", "NEWFALSE"):
+                stack.append(name == "NEWTRUE")
+            elif name in ("BINPUT", "LONG_BINPUT"):
+                memo[argument] = stack[-1]
+            elif name in ("BINGET", "LONG_BINGET"):
+                stack.append(memo[argument])
+            elif name == "MARK":
+                stack.append(mark)
+            elif name == "EMPTY_TUPLE":
+                stack.append(())
+            elif name in ("TUPLE1", "TUPLE2", "TUPLE3"):
+                count = int(name[-1])
+                stack[-count:] = [tuple(stack[-count:])]
+            elif name == "TUPLE":
+                stack.append(tuple(since_mark()))
+            elif name == "BINPERSID":
+                stack.append(("storage", stack.pop()))
+            elif name == "REDUCE":
+                arguments, function = stack.pop(), stack.pop()
+                if function not in _CALLS:
+                    raise refuse(f"a call of {function!r}")
+                stack.append((function, arguments))
+            else:
+                raise refuse(f"the opcode {name}")
+        ((function, (storage, offset, shape, strides, *_)),) = stack
+        (tag, (kind_of, storage_type, key, _, _)) = storage
+        if (function, tag, kind_of) != ("torch._utils _rebuild_tensor_v2", "storage", "storage"):
+            raise refuse("something else")
+        numbers = (offset, *shape, *strides)
+        if not all(type(n) is int for n in numbers) or len(shape) != len(strides) or not isinstance(key, str):
+            raise refuse("a tensor without a shape")
+        return storage_type.split()[1], key, offset, tuple(shape), tuple(strides)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        if str(path) in str(error):
+            raise
+        raise refuse("something else") from error
+
+
+def _is_storage(name: str) -> bool:
+    module, _, kind = name.partition(" ")
+    return module == "torch" and kind in _TYPES

@@ -1,0 +1,37 @@
+"""Names have vectors of their own, and nobody else's."""
+
+import numpy as np
+import pytest
+
+from gsjax.methods.protocols import LanguageEncoder
+from gsjax.perception.codebook import DIMENSION, ClassCodebook
+
+NAMES = {1: "drawer", 2: "laptop_lid", 4: "Faucet Handle"}
+LABELS = np.array([[0, 1, 1], [2, 4, 3]])
+
+
+def test_objects_have_the_vectors_of_their_names():
+    encoder = ClassCodebook(NAMES)
+    assert isinstance(encoder, LanguageEncoder)
+    rows = encoder.embed_objects(np.zeros((2, 3, 3)), LABELS, 5)
+    assert rows.shape == (5, DIMENSION)
+    np.testing.assert_array_equal(rows[1], encoder.embed_text("Laptop Lid"))
+    np.testing.assert_array_equal(rows[3], encoder.embed_text("faucet_handle"))
+    np.testing.assert_array_equal(rows[[2, 4]], 0)  # one without a name, one without a pixel
+    cosines = rows[[0, 1, 3]] @ rows[[0, 1, 3]].T
+    np.testing.assert_allclose(np.diag(cosines), 1, atol=1e-6)
+    assert np.abs(cosines - np.eye(3)).max() < 0.2
+
+
+def test_a_name_has_the_same_vector_wherever_it_occurs():
+    one, other = ClassCodebook({1: "can", 2: "milk"}), ClassCodebook({7: "milk"})
+    np.testing.assert_array_equal(one.embed_text("milk"), other.embed_text("Milk"))
+
+
+def test_what_has_no_name_is_told():
+    with pytest.raises(ValueError, match="no class 'fridge'; there are: drawer, laptop lid, faucet handle"):
+        ClassCodebook(NAMES).embed_text("fridge")
+    with pytest.raises(ValueError, match="want each of them once"):
+        ClassCodebook({1: "Box", 2: "box"})
+    with pytest.raises(ValueError, match="names: expected those of labels, found none"):
+        ClassCodebook({})
