@@ -1,12 +1,12 @@
 """Posed photographs of one scene: what static readers give, and what a reconstruction is fitted to."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
 
 from gsjax.data.errors import DataError
 from gsjax.data.resizing import blended, expect_scale, picked
@@ -53,12 +53,14 @@ class Photographs:
         load_image: i -> RGB, [H,W,3] uint8, as a pinhole camera sees it.
         load_mask: i -> which pixels count, [H,W] bool; or None where all do.
         load_depth: i -> depth along the optical axis, [H,W], 0 = invalid; or None where it has none.
+        load_labels: i -> what each pixel shows, [H,W] integers; or None where nobody said.
+        label_names: of labels, where they have one.
         times: seconds, [N], where the data has them, or None.
         splits: "train", "val" or "test" for each, as the data has it; None where it does not say.
         cloud: points of the scene.
         background: RGB, 0 to 1, of what was behind transparent photographs; None where none was transparent.
         near: what is nearer to a camera is not to be drawn, metres.
-        locate: (kind, i) -> path of a file, for messages; kind is "image", "mask" or "depth".
+        locate: (kind, i) -> path of a file, for messages; kind is "image", "mask", "labels" or "depth".
 
     Raises:
         ValueError: shapes disagree, a pose is no rigid motion, or there is no photograph.
@@ -72,6 +74,8 @@ class Photographs:
     load_image: Callable[[int], np.ndarray] = field(repr=False)
     load_mask: Callable[[int], np.ndarray | None] | None = field(default=None, repr=False)
     load_depth: Callable[[int], np.ndarray | None] | None = field(default=None, repr=False)
+    load_labels: Callable[[int], np.ndarray | None] | None = field(default=None, repr=False)
+    label_names: Mapping[int, str] = field(default_factory=dict)
     times: Float[np.ndarray, "..."] | None = None
     splits: tuple[str, ...] | None = None
     cloud: Cloud | None = field(default=None, repr=False)
@@ -133,6 +137,14 @@ class Photographs:
             return None
         return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
+    def labels(self, i: int) -> Integer[np.ndarray, "height width"] | None:
+        """What each pixel shows, 0 the background; None where nobody said.
+
+        Raises:
+            DataError: as `image`.
+        """
+        return self._optional(self.load_labels, "labels", i, np.integer)
+
     def select(self, indices: Indices[int]) -> "Photographs":
         """Some of them, in this order."""
         chosen = [int(i) for i in indices]
@@ -146,6 +158,7 @@ class Photographs:
             load_image=lambda i: self.load_image(chosen[i]),
             load_mask=self.load_mask and (lambda i: self.mask(chosen[i])),
             load_depth=self.load_depth and (lambda i: self.depth(chosen[i])),
+            load_labels=self.load_labels and (lambda i: self.labels(chosen[i])),
             times=None if self.times is None else self.times[chosen],
             splits=None if self.splits is None else tuple(self.splits[i] for i in chosen),
             locate=locate and (lambda kind, i: locate(kind, chosen[i])),
@@ -174,6 +187,7 @@ class Photographs:
             load_image=blended(self.image, size),
             load_mask=picked(self.load_mask and self.mask, size),
             load_depth=picked(self.load_depth and self.depth, size),
+            load_labels=picked(self.load_labels and self.labels, size),
         )
 
     def where(self, kind: str, i: int) -> str:
@@ -189,10 +203,20 @@ class Photographs:
     def _check(self, kind: str, i: int, array: np.ndarray, channels: tuple[int, ...], dtype: type) -> None:
         width, height = (int(size) for size in self.sizes[i])
         if array.shape != (height, width, *channels) or not np.issubdtype(array.dtype, dtype):
-            words = "floats" if dtype == np.floating else np.dtype(dtype).name
+            words = {np.floating: "floats", np.integer: "integers"}.get(dtype) or np.dtype(dtype).name
             expected = f"shape {(height, width, *channels)} of {words}"
             found = f"shape {array.shape} of {array.dtype}"
             raise DataError(self.where(kind, i), expected, found, "Correct the file or its loader.")
+
+
+def _names_of_labels(sequence: Sequence) -> dict[int, str]:
+    """The name of each mask value of a recording that has one."""
+    names = {model.label: model.name for model in sequence.models if model.label}
+    truth = sequence.truth
+    if truth is not None:
+        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
+        names |= {} if truth.robot is None else {truth.robot: "robot"}
+    return names
 
 
 def photographs_of(sequence: Sequence) -> Photographs:
@@ -208,7 +232,9 @@ def photographs_of(sequence: Sequence) -> Photographs:
         viewmats=sequence.viewmats.reshape(-1, 4, 4),
         load_image=lambda i: sequence.image(*places[i]),
         load_depth=(lambda i: sequence.depth(*places[i])) if sequence.has_depth else None,
+        load_labels=(lambda i: sequence.mask(*places[i])) if sequence.has_masks else None,
+        label_names=_names_of_labels(sequence),
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
         near=sequence.near,
-        locate=lambda kind, i: sequence.where(kind, *places[i]),
+        locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *places[i]),
     )

@@ -52,10 +52,12 @@ class ClosedVocabulary:
         min_score: three quarters of one aspect may be missing, but not all of it.
     """
 
-    def __init__(self, names: Mapping[int, str] | None = None):
+    def __init__(self, names: Mapping[int, str] | None = None, sizes: bool = True):
         """
         Args:
             names: the name of each label, as far as it has one: "can", "milk carton".
+            sizes: whether objects are told apart by size. Who compares those of several pictures leaves it
+                out: how large something is among the others depends on who else is in the picture.
 
         Raises:
             ValueError: two labels have the same name.
@@ -63,7 +65,7 @@ class ClosedVocabulary:
         self._names = {label: " ".join(_words(name)) for label, name in sorted((names or {}).items())}
         if len(set(self._names.values())) < len(self._names):
             raise ValueError(f"names: got {list(self._names.values())}, want each of them once")
-        self._aspects = dict(ASPECTS)
+        self._aspects = {name: words for name, words in ASPECTS.items() if sizes or name != "size"}
         if self._names:
             self._aspects["name"] = tuple(self._names.values())
         self.min_score = (1 - 0.75 / len(self._aspects)) / np.sqrt(2)
@@ -128,7 +130,7 @@ class ClosedVocabulary:
         unknown = []
         for word in rest.split():
             known = _SYNONYMS.get(word, word)
-            meant = {(aspect, known) for aspect, words in ASPECTS.items() if known in words}
+            meant = {(aspect, known) for aspect, words in self._aspects.items() if known in words}
             if not meant and word not in _SILENT:  # "milk" may stand for "milk carton"
                 meant = {("name", name) for name in self._names.values() if word in name.split()}
                 unknown += [] if meant else [word]

@@ -23,6 +23,7 @@ FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
 _BATCH_PIXELS = {"cpu": 2048, "gpu": 16384}
 """Pixels composited together. A batch ends with its longest list: small ones wait less. A GPU is to be kept
 busy."""
+_LEAST_PIXELS = 512  # of a batch, however many channels there are: tiny matmuls take a third longer on a CPU
 
 
 class Limits(NamedTuple):
@@ -141,9 +142,8 @@ class Plan:
     def batch_size(self, channels: int) -> int:
         """Tiles composited together: `tiles_per_batch`, or fewer the more channels there are."""
         pixels = _BATCH_PIXELS["cpu" if jax.default_backend() == "cpu" else "gpu"]
-        return self.tiles_per_batch or max(
-            1, FEW_CHANNELS * pixels // (max(channels, FEW_CHANNELS) * self.tile_pixels)
-        )
+        pixels = max(_LEAST_PIXELS, FEW_CHANNELS * pixels // max(channels, FEW_CHANNELS))
+        return self.tiles_per_batch or max(1, pixels // self.tile_pixels)
 
     def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.

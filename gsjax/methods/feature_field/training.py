@@ -69,7 +69,11 @@ class Distilled(NamedTuple):
 
 
 def begin_field(
-    gaussians: Gaussians, cameras: Sequence[Camera], teacher: Teacher, config: FieldConfig
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    teacher: Teacher,
+    config: FieldConfig,
+    rasterize_mode: str = "classic",
 ) -> tuple[FieldProblem, FieldState]:
     """A distillation before its first step.
 
@@ -78,6 +82,7 @@ def begin_field(
         cameras: one a view, viewmat [4,4] and K [3,3], of any sizes.
         teacher: of the same views.
         config: how.
+        rasterize_mode: "antialiased" for a scene that was fitted so.
 
     Raises:
         ValueError: the teacher has other views, or of other sizes, or the scene no Gaussian with a place.
@@ -86,7 +91,7 @@ def begin_field(
     field, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
     field, located, rows = used_part(field, located)
     codebook = None if teacher.codebook is None else jnp.asarray(teacher.codebook)
-    frozen, views = frozen_views(gaussians, cameras), []
+    frozen, views = frozen_views(gaussians, cameras, rasterize_mode), []
     for v, (view, plan) in enumerate(frozen):
         if teacher.maps is None and not (teacher.ids[v] >= 0).any():
             continue  # it teaches nothing
@@ -120,7 +125,9 @@ def finished(problem: FieldProblem, state: FieldState) -> FeatureField:
     return whole(state.field, problem.rows)
 
 
-def frozen_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[tuple[FrozenView, Plan]]:
+def frozen_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], rasterize_mode: str = "classic"
+) -> list[tuple[FrozenView, Plan]]:
     """The scene in each camera. Those of one size share their plan and the lengths of their lists."""
     sizes = sorted({(camera.width, camera.height, camera.near) for camera in cameras})
     found: dict[int, tuple[FrozenView, Plan]] = {}
@@ -128,7 +135,9 @@ def frozen_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[tuple[
         which = [v for v, c in enumerate(cameras) if (c.width, c.height, c.near) == (width, height, near)]
         scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
         viewmats, Ks = (jnp.stack([getattr(cameras[v], n) for v in which]) for n in ("viewmat", "K"))
-        views, plan = freeze_views(*scene, viewmats, Ks, width, height, near_plane=near)
+        views, plan = freeze_views(
+            *scene, viewmats, Ks, width, height, near_plane=near, rasterize_mode=rasterize_mode
+        )
         for place, v in enumerate(which):
             found[v] = (jax.tree.map(lambda a, place=place: a[place], views), plan)
     return [found[v] for v in range(len(cameras))]
