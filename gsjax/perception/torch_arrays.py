@@ -10,7 +10,7 @@ import pickletools
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -81,8 +81,8 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
         return items
 
     try:
-        for opcode, argument, _ in pickletools.genops(pickle):
-            name = opcode.name
+        for opcode, operand, _ in pickletools.genops(pickle):
+            name, argument = opcode.name, cast(Any, operand)
             if name in ("PROTO", "FRAME"):
                 continue
             if name == "STOP":
