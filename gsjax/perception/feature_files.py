@@ -48,7 +48,9 @@ class PictureFeatures:
 
     @property
     def dimension(self) -> int:
-        return (self.codebook if self.map is None else self.map).shape[-1]
+        numbers = self.codebook if self.map is None else self.map
+        assert numbers is not None
+        return numbers.shape[-1]
 
 
 def read_feature_folder(
