@@ -17,6 +17,7 @@ COMMANDS = {
     "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs, and report on it"),
     "parts": ("gsjax.cli.parts", "find the parts of a moving scene from several cameras, and their joints"),
     "edit": ("gsjax.cli.edit", "change when, where and how parts of a run move, and film it"),
+    "distill": ("gsjax.cli.distill", "give the Gaussians of a scene a meaning, to be asked by query"),
     "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),
     "compare": ("gsjax.cli.compare", "set runs side by side: scores, curves, pictures, settings"),
     "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for gsjax fit"),

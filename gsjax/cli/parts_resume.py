@@ -1,18 +1,11 @@
 """What an unfinished `gsjax parts` leaves from time to time, so that another can go on from it."""
 
-import warnings
 from pathlib import Path
-from time import perf_counter
 
-import jax
-
-from gsjax.cli.messages import describe
+from gsjax.cli import saving
 from gsjax.cli.parts_loop import Following
-from gsjax.data.errors import DataWarning
-from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
+from gsjax.io.checkpoints import load_checkpoint, load_metadata
 
-EVERY_S = 30.0
-"""Seconds of following that a run may lose when it is killed."""
 _STATE = "parts.npz"
 
 
@@ -20,25 +13,21 @@ class Saver:
     """Writes the state of a run into its folder `resume/`."""
 
     def __init__(self, folder: Path):
-        self._path, self._at = folder / _STATE, perf_counter()
+        self._save = saving.Saver(folder / _STATE, "following")
 
     def __call__(self, following: Following, *, last: bool) -> None:
         """Save if the last time is long enough ago, or this is the last; where the disk is full, say so."""
-        if not last and perf_counter() - self._at < EVERY_S:
-            return
-        metadata = {
-            "update_s": following.update_s,
-            "losses": following.losses,
-            "skipped": following.skipped,
-            "joined": following.joined,
-            "divided": following.divided,
-        }
-        try:
-            save_checkpoint(self._path, jax.device_get(following.parts), metadata)
-        except OSError as error:
-            message = f"could not save what --resume needs ({describe(error)}); following goes on"
-            warnings.warn(message, DataWarning, stacklevel=2)
-        self._at = perf_counter()
+        self._save(
+            following.parts,
+            lambda: {
+                "update_s": following.update_s,
+                "losses": following.losses,
+                "skipped": following.skipped,
+                "joined": following.joined,
+                "divided": following.divided,
+            },
+            last=last,
+        )
 
 
 def load(folder: Path, first: Following) -> Following:

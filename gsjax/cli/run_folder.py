@@ -13,11 +13,22 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
-_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz")
-_FOLDERS = ("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "tensorboard", "resume")
+_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz", "field.npz")
+_FOLDERS = (
+    "canonical",
+    "renders",
+    "plots",
+    "query",
+    "grasp",
+    "eval",
+    "edit",
+    "field",
+    "tensorboard",
+    "resume",
+)
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
-_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply")
+_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
@@ -60,6 +71,7 @@ class RunFolder:
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
           parts.npz               of `gsjax parts`: anchor, means0 [N,3], weights [N,P], labels [N],
                                   centres [P,3], R [T,P,3,3], t [T,P,3], times [T]
+          field.npz               of `gsjax distill`: features of places, and what they mean
           scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
           canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
@@ -70,6 +82,7 @@ class RunFolder:
           screenshots/            what was saved from `gsjax view`; --overwrite keeps it
           resume/                 what an unfinished run goes on from; a finished one has none
           query/, grasp/, eval/   what `gsjax query`, `gsjax grasp` and `gsjax eval` found afterwards
+          field/                  of `gsjax distill`: a run of its own
           edit/NAME/              of `gsjax edit`: video.mp4, edit.yaml, metrics.json, perhaps ply/FRAME.ply
           tensorboard/            of a fit with --tensorboard: its event files
 

@@ -68,6 +68,10 @@ class ClassCodebook:
             raise ValueError(f"no class {text!r}; there are: {', '.join(self.names)}")
         return self._vector(name)
 
+    def others(self, text: str) -> tuple[str, ...]:
+        """All names but this one."""
+        return tuple(name for name in self.names if name != _plain(text))
+
     def _vector(self, name: str) -> Float[np.ndarray, "D"]:
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
         vector = np.random.default_rng(seed).normal(size=self._dimension)

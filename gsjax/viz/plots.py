@@ -92,6 +92,24 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out
     return figure
 
 
+def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
+    """Each loss over the steps, on a logarithmic axis; what was not yet counted is left out.
+
+    Args:
+        rows: `step`, and losses by name (None or 0 where there was none); `loss`, their sum, is not shown.
+    """
+    figure, axes = _new("Losses", "step", "")
+    steps = np.array([row["step"] for row in rows], float)
+    names = [name for name in rows[0] if name not in ("step", "seconds", "loss")]
+    for i, name in enumerate(names):
+        values = np.array([row[name] or np.nan for row in rows], float)
+        if np.isfinite(values).any():
+            axes.plot(steps, values, color=_rgb(i + 1), lw=1.4, label=name)
+    axes.set_yscale("log")
+    _legend(figure, axes)
+    return figure
+
+
 def fit_curves(
     runs: Mapping[str, Sequence[Mapping[str, float | None]]], title: str = "Held-out PSNR"
 ) -> Figure:

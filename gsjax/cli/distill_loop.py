@@ -1,0 +1,123 @@
+"""The steps of `gsjax distill`: shown and saved while they go on, until there are enough."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsjax.cli.interrupts import hear, undisturbed
+from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.saving import Saver
+from gsjax.io.atomic import atomic_write
+from gsjax.io.checkpoints import load_checkpoint, load_metadata
+from gsjax.methods.feature_field import FieldProblem, FieldState, distill
+
+LOSSES = ("rec", "cos", "contrast", "tv")
+_STATE = "field.npz"
+_LOGGED_EVERY = 10  # steps
+_SHOWN_EVERY_S = 0.2
+_LINES = 10  # of a log
+
+
+@dataclass
+class Learning:
+    """How a distillation goes on.
+
+    Attributes:
+        state: to go on from.
+        rows: step, seconds, and the means of each loss over the steps since the row before.
+        seconds: of all steps so far, without what compiled.
+        compile_seconds: that compiling took.
+        skipped: steps that met numbers that are not finite, and changed nothing.
+        stopped: what ended it early, or None.
+    """
+
+    state: FieldState
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+    skipped: int = 0
+    stopped: BaseException | None = None
+
+    def metadata(self) -> dict[str, Any]:
+        """What is saved beside the state."""
+        return {name: getattr(self, name) for name in ("rows", "seconds", "compile_seconds", "skipped")}
+
+
+def load(folder: Path, first: Learning) -> Learning:
+    """What a run had come to; `first` where it was stopped before it had saved anything.
+
+    Raises:
+        CheckpointError: it is damaged, or of another scene.
+    """
+    path = folder / _STATE
+    if not path.is_file():
+        return first
+    state, _ = load_checkpoint(path, first.state)
+    return Learning(state, **load_metadata(path))
+
+
+def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console: Console) -> Learning:
+    """Go on until all steps are made, Ctrl-C or an error."""
+    save, total, recent = Saver(folder.resume / _STATE, "distilling"), problem.config.iterations, []
+    columns = (TextColumn("distilling"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+    words = TextColumn("{task.description}")
+    if not console.is_terminal:
+        console.print("distilling; compiling, which takes half a minute the first time", soft_wrap=True)
+    shown = 0.0
+    with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("compiling", total=total, completed=learning.state.step)
+        steps = distill(problem, learning.state)
+        try:
+            while (found := undisturbed(next, steps, None)) is not None:
+                learning.state, step = found.state, found.state.step
+                learning.seconds += found.seconds
+                learning.compile_seconds += found.compile_seconds
+                recent.append(found.info)
+                if step % _LOGGED_EVERY == 0 or step == total:
+                    _add_row(learning, recent, folder)
+                    recent = []
+                if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
+                    bar.update(task, completed=step, description=_told(learning.rows[-1]))
+                    shown = perf_counter()
+                if not console.is_terminal and _LINES * step // total > _LINES * (step - 1) // total:
+                    told = f": {_told(learning.rows[-1])}" if learning.rows else ""
+                    console.print(f"{step:,} of {total:,} steps{told}", soft_wrap=True)
+                save(learning.state, learning.metadata, last=False)
+                hear()
+        except (KeyboardInterrupt, Exception) as stopped:
+            if any(
+                leaf.is_deleted() for leaf in jax.tree.leaves(learning.state) if isinstance(leaf, jax.Array)
+            ):
+                raise  # a step that failed took it along: what --resume needs was saved before
+            learning.stopped = stopped
+        save(learning.state, learning.metadata, last=True)
+    return learning
+
+
+def _add_row(learning: Learning, infos: list[dict[str, Any]], folder: RunFolder) -> None:
+    """A row of means, which stands in metrics.jsonl at once."""
+    infos = jax.device_get(infos)
+    sound = [info for info in infos if not info["skipped"]]
+    learning.skipped += len(infos) - len(sound)
+    row: dict[str, Any] = {
+        "step": learning.state.step,
+        "seconds": learning.seconds + learning.compile_seconds,
+    }
+    for name in ("loss", *LOSSES):
+        values = [float(info[name]) for info in sound if name in info]
+        row[name] = float(np.mean(values)) if values else None
+    learning.rows.append(row)
+    with atomic_write(folder.metrics_lines) as temporary:
+        temporary.write_text("".join(json.dumps(one) + "\n" for one in learning.rows), encoding="utf-8")
+
+
+def _told(row: dict[str, Any]) -> str:
+    """The means of a row in words."""
+    return "angles are off by " + ("–" if row["cos"] is None else f"{row['cos']:.3f} (1 - cosine)")

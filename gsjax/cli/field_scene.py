@@ -1,0 +1,113 @@
+"""The scene that a field is distilled for, and the photographs of it: those of a run, or of a PLY file that
+others made."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from gsjax.cli.photographs import choose_photographs, photographs_of_run, split
+from gsjax.cli.run_files import read_arrays, reopen
+from gsjax.cli.run_records import read_record
+from gsjax.data.errors import DataError
+from gsjax.data.open import ReadOptions
+from gsjax.data.photographs import Photographs, photographs_of
+from gsjax.io.ply import read_ply
+from gsjax.scene.gaussians import Gaussians
+
+_AGAIN = "run it again with this version of gsjax"
+
+
+@dataclass(frozen=True, eq=False)
+class FieldScene:
+    """What stands still while a field learns.
+
+    Attributes:
+        file: the PLY file.
+        gaussians: the scene.
+        photographs: of it, posed as the scene was fitted.
+        taught: which of them may teach.
+        held_out: which of them only judge.
+        rasterize_mode: as the scene was fitted.
+    """
+
+    file: Path
+    gaussians: Gaussians
+    photographs: Photographs
+    taught: Int[np.ndarray, "a"]
+    held_out: Int[np.ndarray, "b"]
+    rasterize_mode: str = "classic"
+
+
+def scene_of_run(path: Path, images: str | None = None) -> FieldScene:
+    """That of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame).
+
+    Args:
+        path: the run's folder.
+        images: where its photographs are now; where they were, unless given.
+
+    Raises:
+        FileNotFoundError, ValueError: there is no such run, or it has no scene, or no photographs that can be
+            read.
+    """
+    if (path / "canonical" / "scene.ply").is_file():
+        return scene_of_run(path / "canonical", images)
+    record = read_record(path)
+    file = path / "scene.ply"
+    if not file.is_file():
+        raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run goes on still, or failed")
+    gaussians = _read(file)
+    if record.kind == "track":
+        if images is not None:
+            raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
+        recording, _ = reopen(path / "config.yml", _AGAIN)
+        first = recording.judged.select(frames=slice(0, 1))
+        indices, count = np.arange(first.num_cameras), recording.tracked.num_cameras
+        return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
+    try:
+        photographs = photographs_of_run(record.config, images)
+    except DataError as error:
+        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
+    photographs = _as_learned(photographs, path / "cameras.npz")
+    mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
+    return FieldScene(file, gaussians, photographs, *split(photographs, record.config["test_every"]), mode)
+
+
+def scene_of_file(file: Path, images: str, read: ReadOptions, test_every: int, **chosen) -> FieldScene:
+    """A PLY file with photographs of the same world.
+
+    Args:
+        file: the scene.
+        images: a dataset.
+        read: what its layout leaves open.
+        test_every: hold out every so-manieth photograph where the data has no split.
+        **chosen: as `choose_photographs` has them.
+
+    Raises:
+        PlyError, DataError, ValueError: one of them cannot be read.
+    """
+    photographs = choose_photographs(images, read, **chosen)
+    return FieldScene(file, _read(file), photographs, *split(photographs, test_every))
+
+
+def scaled(scene: FieldScene, scale: float) -> FieldScene:
+    """With smaller photographs."""
+    return replace(scene, photographs=scene.photographs.scaled(scale))
+
+
+def _read(file: Path) -> Gaussians:
+    return jax.tree.map(jnp.asarray, read_ply(file)[0])
+
+
+def _as_learned(photographs: Photographs, file: Path) -> Photographs:
+    """With the poses that a fit found for its photographs, where it looked for them."""
+    if not file.is_file():
+        return photographs
+    arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
+    found = dict(zip(arrays["names"].tolist(), arrays["viewmats"], strict=True))
+    posed = zip(photographs.names, photographs.viewmats, strict=True)
+    viewmats = [found.get(name, viewmat) for name, viewmat in posed]
+    return replace(photographs, viewmats=np.stack(viewmats).astype(np.float64))
