@@ -23,7 +23,7 @@ COMMANDS = {
     "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for gsjax fit"),
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
     "view": ("gsjax.cli.view", "look at a run or a PLY file in a browser"),
-    "query": ("gsjax.cli.query", "find the object of a run that a text means, and show it over time"),
+    "query": ("gsjax.cli.query", "find what a text means: objects of a run, or Gaussians by a field"),
     "grasp": ("gsjax.cli.grasp", "find the best grasp of the object that a text means, in every frame"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),

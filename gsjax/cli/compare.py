@@ -13,9 +13,8 @@ from rich.text import Text
 from gsjax.cli.comparison import Aspect, Comparison, Group, compare
 from gsjax.cli.comparison_pictures import shows_the_same, write_strip
 from gsjax.cli.messages import counted
-from gsjax.cli.query import fresh_folder
 from gsjax.cli.report import Media, Table, format_number, write_report
-from gsjax.cli.run_folder import is_run
+from gsjax.cli.run_folder import fresh_folder, is_run
 from gsjax.cli.run_records import read_record
 from gsjax.io.atomic import write_json
 from gsjax.viz.plots import fit_curves, save

@@ -18,8 +18,8 @@ from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
 from gsjax.cli.photographs import photographs_of_run, read_views, split
-from gsjax.cli.query import fresh_folder
 from gsjax.cli.report import Media, Table, format_number, write_report
+from gsjax.cli.run_folder import fresh_folder
 from gsjax.cli.run_records import EVALUATION, Record, digest, read_record
 from gsjax.cli.summary import Column
 from gsjax.data.errors import DataError

@@ -25,7 +25,7 @@ from gsjax.viz.colors import (
     colorize_features,
     colorize_labels,
     fit_pca_colors,
-    side_by_side,
+    in_rows,
     to_uint8,
 )
 from gsjax.viz.plots import losses_over_steps, save
@@ -86,7 +86,7 @@ def judge(
                 scores.add(by_pixel, in_space, true)
         if len([r for r in rows if "picture" in r]) < _SHOWN:
             path = folder.render("held_out" if held_out else "taught", len(rows))
-            _write_panel(path, panels)
+            write_png(path, in_rows(panels, len(panels), _PANEL_HEIGHT))
             row["picture"] = str(path.relative_to(folder.path))
         rows.append(row)
     classes = scores.rows()
@@ -113,16 +113,8 @@ def _features(field, located, view: Frozen, pca: PcaColors) -> np.ndarray:
     image, alphas = paint(view[0], parts.values, view[1])
     channels = np.asarray(parts.channels_of(parts.joined(image, alphas)))
     alphas = np.asarray(alphas)
-    return colorize_features(
-        np.where(alphas[..., None] > 0.5, channels / np.maximum(alphas[..., None], 0.5), np.nan), pca
-    )
-
-
-def _write_panel(path, panels: dict[str, np.ndarray]) -> None:
-    """Writes pictures side by side; small ones enlarged."""
-    times = -(-_PANEL_HEIGHT // len(panels["photograph"]))
-    large = [picture.repeat(times, 0).repeat(times, 1) for picture in panels.values()]
-    write_png(path, side_by_side(*large, captions=tuple(panels)))
+    mean = channels / np.maximum(alphas[..., None], 0.5)
+    return colorize_features(np.where(alphas[..., None] > 0.5, mean, np.nan), pca)
 
 
 def write_results(folder: RunFolder, found: dict[str, Any]) -> None:

@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
+from gsjax.cli.object_query import Answer, Asked, ask, progress, show
 from gsjax.cli.outputs import frame_rate, write_png
-from gsjax.cli.query import Answer, Asked, ask, fresh_folder, progress, show
+from gsjax.cli.run_folder import fresh_folder
 from gsjax.cli.saved_run import SavedRun
 from gsjax.cli.views import views
 from gsjax.geometry.cameras import project

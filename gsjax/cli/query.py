@@ -1,78 +1,54 @@
-"""`gsjax query`: which object of a run a text means, and where it is in every frame."""
+"""`gsjax query`: what of a run a text means: an object of a tracked one, in every frame; or, where there is a
+field (`gsjax distill`), Gaussians."""
 
-import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
-import cv2
-import jax.numpy as jnp
-import numpy as np
 import tyro
-from jaxtyping import Bool, Int
 from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
+from gsjax.cli.field_query import Question, answer
+from gsjax.cli.field_run import field_of, open_field_run
 from gsjax.cli.messages import Notes
-from gsjax.cli.outputs import frame_rate, write_png
-from gsjax.cli.saved_run import SavedRun, open_run
-from gsjax.cli.views import View, views
-from gsjax.io.atomic import write_json, write_npz
-from gsjax.io.video import VideoWriter
-from gsjax.methods.object_tracker import find_object
-from gsjax.methods.protocols import LanguageEncoder
-from gsjax.perception.closed_vocabulary import ClosedVocabulary
-from gsjax.viz.colors import highlight, label_color, to_uint8
-
-_CLOSE = 0.02  # a smaller margin is called a close call
-_VIDEO_HEIGHT = 480  # smaller pictures are enlarged
+from gsjax.cli.object_query import Asked, ask_for_object
+from gsjax.io.atomic import write_json
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked of a run, and how it is understood."""
-
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder of a run of `gsjax track`."""
-    text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")]
-    """Which object: "red can"."""
-    camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to show it from. The first held out one, else the first tracked, unless given."""
-    encoder: Literal["closed", "clip"] = "closed"
-    """Who understands the text: a closed vocabulary without weights, or CLIP."""
-    weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
-    min_score: float | None = None
-    """Cosine below which the text means none of the objects. The encoder's own unless given."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
-
-
-@dataclass(frozen=True)
-class Options(Asked):
+class Options:
     """What `gsjax query` is told."""
 
-
-class Answer(NamedTuple):
-    """The object that a text means.
-
-    Attributes:
-        group: its label in the run's files, 1 to K.
-        name: what it is called.
-        scores: cosine of each object, by name.
-        margin: how far it lies above the next.
-        min_score: the score that was asked for.
-        rows: its Gaussians, as rows of scene.ply.
-    """
-
-    group: int
-    name: str
-    scores: dict[str, float]
-    margin: float
-    min_score: float
-    rows: Int[np.ndarray, "n"]
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of a run of `gsjax track`, or of any run with a field (`gsjax distill`), or of such a field."""
+    text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")] = None
+    """What is looked for: "red can". Or say it by --image or --point."""
+    camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
+    """Camera (or photograph) to show it from, and in which a --point is. Of a tracked run the first held out
+    one, else the first; of a field all, unless given."""
+    image: Path | None = None
+    """Of a field: a picture of what is looked for; of one with an alpha channel what is opaque."""
+    point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
+    """Of a field: a pixel of --camera that shows what is looked for."""
+    negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
+    """Of a field: what the text is held against. Of classes all others, of CLIP "object", "things",
+    "stuff", "texture", unless given."""
+    threshold: float | None = None
+    """Of a field: score from which on a Gaussian is meant. 1/2 against negatives, else where the scores part
+    best into two kinds (Otsu), unless given."""
+    color: tuple[float, float, float] = (1.0, 0.25, 0.6)
+    """Of a field: RGB, 0 to 1, of what was found in recolored.ply."""
+    move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Of a field: metres by which what was found is moved in moved.ply; not written unless given."""
+    encoder: Literal["closed", "clip"] = "closed"
+    """Of a tracked run: who understands the text, a closed vocabulary without weights, or CLIP."""
+    weights: Path | None = None
+    """Folder of CLIP's weights, in the layout of Hugging Face; of a field, where they are now."""
+    min_score: float | None = None
+    """Of a tracked run: cosine below which the text means none of the objects. The encoder's own unless
+    given."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:
@@ -81,134 +57,90 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
-    console = Console(stderr=True, highlight=False)
+    console, field = Console(stderr=True, highlight=False), field_of(options.run)
+    tracked = (options.run / "trajectory.npz").is_file()  # which answers over time, unless by sight
+    if field is not None and not (tracked and options.image is None and options.point is None):
+        return _ask_field(options, field, console)
+    ask_for_object(_asked(options), console)
+    return 0
+
+
+def _ask_field(options: Options, field: Path, console: Console) -> int:
+    """Answer by a field."""
+    question = _question(options)
     with Notes(console) as notes:
-        saved, answer = ask(options, console, notes)
-        recording = saved.seen_by(options.camera)
-        camera = recording.tracked.camera_ids[0]
-        folder = fresh_folder(saved.path / "query")
-        write_npz(
-            folder / "selection.npz",
-            {
-                "indices": answer.rows,
-                "scores": np.array(list(answer.scores.values()), np.float32),
-                "names": np.array(list(answer.scores)),
-                "means": saved.tracking.means()[:, answer.rows],
-                "times": recording.tracked.times[: saved.tracking.num_frames],
-            },
-        )
-        pixels = []
-        with VideoWriter(folder / "video.mp4", frame_rate(recording.tracked.times)) as video:
-            for view in progress(views(saved.tracking, recording), saved, console):
-                mask = view.groups == answer.group
-                pixels.append(int(mask.sum()))
-                frame_id = recording.tracked.frame_ids[view.t]
-                write_png(folder / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
-                video.write(show(view, mask, answer.group))
-        told = {"text": options.text, "encoder": options.encoder, "camera": camera}
-        told |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
-        told |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
-        told |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
-        write_json(folder / "query.json", told)
-    hidden = sum(count == 0 for count in pixels)
-    unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
-    score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"
-    print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
+        with console.status("reading the field"):
+            found = open_field_run(field, notes)
+        folder = options.run / "query"
+        told = answer(found, question, folder, options.color, options.move, notes, console)
+        write_json(folder / "query.json", told | {"features": found.stored.source.kind, "notes": notes.all})
+    unseen = [name for name, pixels in told["pixels"].items() if not pixels]
+    hidden = f"; not seen by {', '.join(unseen[:6])}{', ...' if len(unseen) > 6 else ''}" if unseen else ""
+    score = f"score above {told['threshold']:.2f}: {told['rule']}"
+    print(f"{told['gaussians']:,} of {told['of']:,} Gaussians ({score}){hidden}")
+    print(f"asked in {1e3 * told['query_seconds']:.1f} ms")
     print(f"query   {folder}")
     return 0
 
 
-def ask(options: Asked, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
-    """Open the run and find the object; prints the scores of all.
+def _question(options: Options) -> Question:
+    """What is asked of a field, checked.
 
     Raises:
-        ValueError, OSError: as `run`.
+        ValueError: not one of text, --image and --point, or options that a field has no use for.
     """
-    _check_encoder(options)
-    saved = open_run(options.run)
-    saved.seen_by(options.camera)  # one that is not there need not wait for the rest either
-    encoder = _encoder(options, saved)
-    wanted = encoder.embed_text(options.text)  # first: a word that nobody knows need not wait for the rest
-    with console.status("looking at the first frame"):
-        view = next(views(saved.tracking, saved.seen_by(saved.mask_camera)))[0]
-        objects = encoder.embed_objects(to_uint8(view.image), view.groups, len(saved.names))
-    min_score = encoder.min_score if options.min_score is None else options.min_score
-    match = find_object(jnp.asarray(wanted, float), jnp.asarray(objects, float), float(min_score))
-    scores = dict(zip(saved.names.values(), np.asarray(match.scores).tolist(), strict=True))
-    group, margin = int(match.best) + 1, float(match.margin)
-    if not match.found:
-        listed = ", ".join(f"{name} {score:.2f}" for name, score in _ranked(scores))
+    ways = [options.text is not None, options.image is not None, options.point is not None]
+    if sum(ways) != 1:
         raise ValueError(
-            f"{options.text!r} means none of the objects of {saved.path}: its best cosine is "
-            f"{max(scores.values()):.2f}, and {min_score:.2f} is asked for. There are: {listed}"
+            f"expected one of TEXT, --image and --point, found {sum(ways) or 'none'}; "
+            f'gsjax query {options.run} "red can"'
         )
-    if margin < _CLOSE:
-        second = _ranked(scores)[1][0]
-        notes.warn(f"{second} fits {options.text!r} about as well; say more to tell them apart")
-    _print_scores(scores, saved.names[group])
-    rows = np.flatnonzero(np.asarray(saved.tracking.scene.labels) == group)
-    return saved, Answer(group, saved.names[group], scores, margin, float(min_score), rows)
-
-
-def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
-    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged."""
-    size = enlarged(mask.shape[1], mask.shape[0])
-    image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
-    # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
-    soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-    return highlight(image, soft > 0.5, label_color(group))
-
-
-def enlarged(width: int, height: int) -> tuple[int, int]:
-    """The size of a video of pictures of this size."""
-    factor = max(1, -(-_VIDEO_HEIGHT // height))
-    return width * factor, height * factor
-
-
-def fresh_folder(path: Path) -> Path:
-    """An empty folder; what an earlier question left there is removed."""
-    if path.exists():
-        shutil.rmtree(path)
-    path.mkdir()
-    return path
-
-
-def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
-    """The one view of each frame, with a progress bar."""
-    count = saved.tracking.num_frames
-    for frame in track(frames, "rendering", total=count, console=console, transient=True):
-        yield frame[0]
-
-
-def _check_encoder(options: Asked) -> None:
-    if options.encoder == "clip" and options.weights is None:
+    if options.encoder != "closed" or options.min_score is not None:
         raise ValueError(
-            "--encoder clip: expected --weights PATH as well, a folder of CLIP's weights, found none"
+            "--encoder, --min-score: a field knows who made its features; leave them out (--threshold)"
         )
-    if options.encoder == "closed" and options.weights is not None:
-        raise ValueError("--weights: the closed vocabulary has none; they are for --encoder clip")
+    point = None
+    if options.point is not None:
+        try:
+            x, y = (float(part) for part in options.point.split(","))
+        except ValueError:
+            raise ValueError(f"--point: expected X,Y in pixels, found {options.point!r}") from None
+        point = (x, y)
+        if options.camera is None:
+            raise ValueError("--point: expected --camera too, the photograph that it is in, found none")
+    if any(not 0 <= value <= 1 for value in options.color):
+        raise ValueError(f"--color: expected three numbers of 0 to 1, found {options.color}")
+    return Question(
+        options.text,
+        options.image,
+        point,
+        options.camera,
+        options.negatives,
+        options.threshold,
+        options.weights,
+    )
 
 
-def _encoder(options: Asked, saved: SavedRun) -> LanguageEncoder:
-    if options.encoder == "closed":
-        return ClosedVocabulary(saved.names)
-    from gsjax.perception.clip import load_clip
+def _asked(options: Options) -> Asked:
+    """What is asked of a tracked run, checked.
 
-    assert options.weights is not None
-    try:
-        return load_clip(options.weights)
-    except ImportError as error:
-        raise ValueError(f"--encoder clip: {error}") from error
-
-
-def _ranked(scores: dict[str, float]) -> list[tuple[str, float]]:
-    return sorted(scores.items(), key=lambda item: -item[1])
-
-
-def _print_scores(scores: dict[str, float], best: str) -> None:
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    table.add_column("object")
-    table.add_column("cosine", justify="right")
-    for name, score in _ranked(scores):
-        table.add_row(name, f"{score:.3f}", style="bold green" if name == best else None)
-    Console(highlight=False).print(table)
+    Raises:
+        ValueError: it cannot be asked of one.
+    """
+    for name in ("image", "point", "negatives", "threshold", "move"):
+        if getattr(options, name) is not None:
+            raise ValueError(
+                f"--{name}: {options.run} has no field that could be asked so; gsjax distill {options.run} "
+                "makes one"
+            )
+    if options.text is None:
+        raise ValueError(
+            f'expected a TEXT that says which object, found none; gsjax query {options.run} "can"'
+        )
+    camera = None
+    if options.camera is not None:
+        if not options.camera.lstrip("-").isdigit():
+            raise ValueError(f"--camera: expected the id of a camera, a number, found {options.camera!r}")
+        camera = int(options.camera)
+    shared = (options.encoder, options.weights, options.min_score, options.debug)
+    return Asked(options.run, options.text, camera, *shared)

@@ -233,6 +233,14 @@ class RunFolder:
         write_npz(self.path / "trajectory.npz", arrays)
 
 
+def fresh_folder(path: Path) -> Path:
+    """An empty folder; what an earlier question left there is removed."""
+    if path.exists():
+        shutil.rmtree(path)
+    path.mkdir()
+    return path
+
+
 def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
     """Nested settings by the names that options have on the command line: fit.start.count."""
     flat: dict[str, Any] = {}

@@ -3,7 +3,7 @@
 All pictures are uint8 RGB `[H,W,3]`; colour inputs are floats in 0 to 1 or uint8.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -111,6 +111,11 @@ def highlight(
     return cv2.drawContours(np.ascontiguousarray(picture), contours, -1, color, thick, cv2.LINE_AA)
 
 
+def heat(values: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Values from 0, dark, to 1, bright."""
+    return _apply_colormap("inferno", np.clip(np.nan_to_num(values), 0, 1))
+
+
 def error_heatmap(
     a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"], limit: float = 0.3
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,7 +124,7 @@ def error_heatmap(
     Pixels that are not finite in either image are shown as no error: nothing was compared there.
     """
     error = np.abs(_to_float(a) - _to_float(b)).mean(axis=-1)
-    return _apply_colormap("inferno", np.clip(np.nan_to_num(error, nan=0.0) / limit, 0, 1))
+    return heat(error / limit)
 
 
 def to_uint8(image: Num[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -149,7 +154,24 @@ def side_by_side(
     if labels is not None:
         pictures.append(overlay_labels(image, labels))
     columns = 2 if len(pictures) == 4 and image.shape[1] > 1.2 * image.shape[0] else len(pictures)
-    framed = [captioned(picture, text) for picture, text in zip(pictures, captions, strict=False)]
+    return in_rows(dict(zip(captions, pictures, strict=False)), columns)
+
+
+def in_rows(
+    pictures: Mapping[str, Num[np.ndarray, "h w 3"]], columns: int, least_height: int = 0
+) -> UInt8[np.ndarray, "rows cols 3"]:
+    """Pictures of one size by their captions, row by row; even-sized, as video codecs want.
+
+    Args:
+        pictures: colours.
+        columns: how many are beside each other.
+        least_height: of a picture, in pixels; smaller ones are enlarged by a whole factor.
+    """
+    framed = []
+    for text, picture in pictures.items():
+        times = max(1, -(-least_height // len(picture)))
+        framed.append(captioned(to_uint8(picture).repeat(times, 0).repeat(times, 1), text))
+    framed += [np.zeros_like(framed[0])] * (-len(framed) % columns)
     rows = [np.concatenate(framed[i : i + columns], axis=1) for i in range(0, len(framed), columns)]
     panel = np.concatenate(rows, axis=0)
     return np.pad(panel, ((0, panel.shape[0] % 2), (0, panel.shape[1] % 2), (0, 0)))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from skimage.filters import threshold_otsu
 
 from gsjax.methods.feature_field.field import FeatureField, carried
@@ -59,6 +59,21 @@ def pixel_cosines(
     rendered = parts.joined(image.reshape(alphas.size, -1), alphas.ravel())
     cosines = _cosines(rendered, parts.lifted(field.lift), queries)
     return cosines.reshape(*alphas.shape, len(queries)), alphas
+
+
+def pixel_features(
+    field: FeatureField,
+    located: Located | None,
+    view: FrozenView,
+    plan: Plan,
+    pixels: Int[Array, "p 2"],
+) -> tuple[Float[Array, "p d"], Float[Array, "p"]]:
+    """W F' at some pixels (x, y) of a view, in the teacher's channels, and the alphas there."""
+    parts = carried(field, located)
+    image, alphas = paint(view, parts.values, plan)
+    x, y = pixels[:, 0], pixels[:, 1]
+    rendered = parts.joined(image[y, x], alphas[y, x])
+    return jnp.matmul(rendered, parts.lifted(field.lift).T, precision="highest"), alphas[y, x]
 
 
 def back_projected_cosines(
