@@ -57,7 +57,7 @@ def judge(
     try:
         truth = teach(photographs, which, asked, cache, console).teacher if held_out else None
         if truth is None:
-            places = [list(scene.taught).index(i) for i in which]
+            places = [scene.taught.index(i) for i in which]
             truth = said.teacher._replace(
                 ids=[said.teacher.ids[p] for p in places],
                 maps=None if said.teacher.maps is None else [said.teacher.maps[p] for p in places],

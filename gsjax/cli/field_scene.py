@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from gsjax.cli.photographs import choose_photographs, photographs_of_run, split
 from gsjax.cli.run_files import read_arrays, reopen
@@ -37,8 +36,8 @@ class FieldScene:
     file: Path
     gaussians: Gaussians
     photographs: Photographs
-    taught: Int[np.ndarray, "a"]
-    held_out: Int[np.ndarray, "b"]
+    taught: list[int]
+    held_out: list[int]
     rasterize_mode: str = "classic"
 
 
@@ -65,7 +64,7 @@ def scene_of_run(path: Path, images: str | None = None) -> FieldScene:
             raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
         recording, _ = reopen(path / "config.yml", _AGAIN)
         first = recording.judged.select(frames=slice(0, 1))
-        indices, count = np.arange(first.num_cameras), recording.tracked.num_cameras
+        indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
         return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
     try:
         photographs = photographs_of_run(record.config, images)
@@ -73,7 +72,7 @@ def scene_of_run(path: Path, images: str | None = None) -> FieldScene:
         raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
     photographs = _as_learned(photographs, path / "cameras.npz")
     mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
-    return FieldScene(file, gaussians, photographs, *split(photographs, record.config["test_every"]), mode)
+    return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)
 
 
 def scene_of_file(file: Path, images: str, read: ReadOptions, test_every: int, **chosen) -> FieldScene:
@@ -90,12 +89,17 @@ def scene_of_file(file: Path, images: str, read: ReadOptions, test_every: int, *
         PlyError, DataError, ValueError: one of them cannot be read.
     """
     photographs = choose_photographs(images, read, **chosen)
-    return FieldScene(file, _read(file), photographs, *split(photographs, test_every))
+    return FieldScene(file, _read(file), photographs, *_split(photographs, test_every))
 
 
 def scaled(scene: FieldScene, scale: float) -> FieldScene:
     """With smaller photographs."""
     return replace(scene, photographs=scene.photographs.scaled(scale))
+
+
+def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
+    chosen, held_out = split(photographs, every)
+    return chosen.tolist(), held_out.tolist()
 
 
 def _read(file: Path) -> Gaussians:

@@ -1,6 +1,6 @@
 """What photographs are to say of a scene: whose masks, whose features, and where they are kept."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -76,13 +76,13 @@ class Said:
 
 
 def teach(
-    photographs: Photographs, which: Iterable[int], asked: Asked, cache: FeatureCache, console: Console
+    photographs: Photographs, indices: Sequence[int], asked: Asked, cache: FeatureCache, console: Console
 ) -> Said:
     """Has photographs encoded.
 
     Args:
         photographs: of the scene.
-        which: of them are to teach.
+        indices: which of them are to teach.
         asked: whose masks and features.
         cache: what was said before.
         console: shows how far it is.
@@ -92,7 +92,6 @@ def teach(
         FileNotFoundError: files or weights are not there.
     """
     asked.check()
-    indices = list(which)
     named = [photographs.labels(i) is not None for i in indices] if photographs.load_labels else [False]
     masks = "segment" if asked.sam is not None else asked.masks
     if masks == "files" and not any(named):
@@ -138,7 +137,7 @@ def teach(
 
 def _of_files(
     photographs: Photographs,
-    indices: list[int],
+    indices: Sequence[int],
     labels: list[np.ndarray] | None,
     whose: str,
     asked: Asked,
@@ -240,6 +239,6 @@ def _as_large(one: PictureFeatures, photographs: Photographs, i: int) -> Int[np.
     return cv2.resize(one.ids, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def _sizes(photographs: Photographs, indices: list[int]) -> list[tuple[int, int]]:
+def _sizes(photographs: Photographs, indices: Sequence[int]) -> list[tuple[int, int]]:
     """(height, width) of each."""
     return [(int(photographs.sizes[i][1]), int(photographs.sizes[i][0])) for i in indices]

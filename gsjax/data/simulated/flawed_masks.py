@@ -19,6 +19,7 @@ class Flaws:
         merged: share of the pictures in which two things are one.
         split: share of the pictures in which one thing is two.
         missing: share of the pictures in which a thing that is there is overlooked.
+        smallest: a thing with fewer pixels is always overlooked, as segmenters drop specks.
         missing_label: what is then said of its pixels: -1 nothing, as of what lies in no mask; or 0, that
             they are background.
     """
@@ -27,6 +28,7 @@ class Flaws:
     merged: float = 0.2
     split: float = 0.2
     missing: float = 1 / 3
+    smallest: int = 40
     missing_label: int = -1
 
 
@@ -54,7 +56,7 @@ def flawed_masks(
 
     A mask has the embedding of its label. Two things in one mask have the mean of theirs, by their pixels, as
     an encoder of crops would say; of one that is two, the smaller piece has one halfway to another thing's,
-    for half of a thing looks like something else. Nothing is overlooked in all pictures that show it.
+    for half of a thing looks like something else. Nothing is overlooked in all pictures that show enough of it.
 
     Args:
         masks: labels of each picture, [H,W].
@@ -66,7 +68,9 @@ def flawed_masks(
     count, things = len(masks), range(1, len(codebook))
     missing = np.zeros((count, len(codebook)), bool)
     for k in things:
-        shown = np.flatnonzero([(mask == k).any() for mask in masks])
+        pixels = np.array([(mask == k).sum() for mask in masks])
+        missing[:, k] = pixels < flaws.smallest
+        shown = np.flatnonzero(~missing[:, k])
         number = min(int(flaws.missing * len(shown) + random.uniform()), max(len(shown) - 1, 0))
         missing[random.permutation(shown)[:number], k] = True
     merged = set(random.permutation(count)[: round(flaws.merged * count)].tolist())
@@ -74,8 +78,8 @@ def flawed_masks(
     labels, embeddings, said = [], [], []
     for v, mask in enumerate(masks):
         found, rows = _outlined(mask, missing[v], flaws, random), np.array(codebook)
-        if missing[v].any():
-            said.append(f"picture {v}: {np.flatnonzero(missing[v]).tolist()} overlooked")
+        if overlooked := [k for k in things if missing[v, k] and (mask == k).any()]:
+            said.append(f"picture {v}: {overlooked} overlooked")
         if v in merged and (pair := _neighbours(found, random)) is not None:
             one, other = pair
             sizes = np.array([(found == one).sum(), (found == other).sum()])

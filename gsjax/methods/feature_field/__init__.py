@@ -9,6 +9,7 @@ config.py    what can be set              distill.py   the losses, and one step
 teacher.py   what pixels are to say       training.py  the loop on the host
 field.py     hash grid and convolution    query.py     what a query means
 inverse.py   from the teacher's channels back to the field's
+votes.py     labels by majority, to be held against
 """
 
 from gsjax.methods.feature_field.config import FieldConfig, FieldRatesConfig, FieldWeightsConfig
@@ -43,6 +44,7 @@ from gsjax.methods.feature_field.training import (
     finished,
     frozen_views,
 )
+from gsjax.methods.feature_field.votes import label_votes, majority_labels
 
 __all__ = [
     "Distilled",
@@ -66,7 +68,9 @@ __all__ = [
     "frozen_views",
     "gaussian_cosines",
     "init_field",
+    "label_votes",
     "learned_inverse",
+    "majority_labels",
     "pixel_cosines",
     "pixel_features",
     "pixel_mask",

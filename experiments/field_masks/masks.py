@@ -1,0 +1,38 @@
+"""How well does a field say, of views and of Gaussians, what flawed masks say, against a plain vote?"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+from fields import by_majority, codebook_of, fitted, flawed_teacher, learned, of_field, scored
+
+from gsjax.data.simulated.flawed_masks import Flaws
+from gsjax.methods.feature_field import FieldConfig
+
+SCENES = {
+    "articulated_0": {"eval_cameras": (3, 8), "frames": "0:1"},
+    "tabletop_0": {"eval_cameras": (2,), "frames": "0:1"},
+}
+NONE = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """Masks of one seed, lifted by a vote and distilled into a field."""
+    scene = fitted(options["scene"], folder, **SCENES[options["scene"]])
+    names, codes = codebook_of(scene.photographs)
+    flaws = NONE if options["masks"] == "true" else Flaws()
+    teacher, ids = flawed_teacher(scene.photographs, scene.taught, codes, seed, flaws)
+    voted = scored(scene, by_majority(scene, scene.taught, ids, len(names)), names)
+    found = learned(scene, scene.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
+    by_field = (found.field, found.located, codes)
+    asked = scored(scene, of_field(found, codes), names, by_field)
+    return {
+        **asked,
+        "voted_miou": voted["miou_3d"],
+        "voted_mboundary_iou": voted["mboundary_iou_3d"],
+        "voted_gaussian_iou": voted["gaussian_iou"],
+        "gaussians": scene.gaussians.num,
+        "minutes": (found.seconds + found.compile_seconds) / 60,
+    }

@@ -1,0 +1,234 @@
+"""What experiments with feature fields share: fitted scenes, teachers with a segmenter's flaws, and scores
+against true labels, of pixels and of Gaussians."""
+
+import resource
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from recordings import recorded
+
+from gsjax.cli import fit as fit_command
+from gsjax.cli.field_scene import FieldScene, scene_of_run
+from gsjax.cli.field_scores import ClassScores, class_maps, classes_of
+from gsjax.data.photographs import Photographs
+from gsjax.data.simulated.flawed_masks import Flaws, flawed_masks
+from gsjax.geometry.cameras import project
+from gsjax.methods.feature_field import (
+    FeatureField,
+    FieldConfig,
+    Teacher,
+    begin_field,
+    distill,
+    finished,
+    frozen_views,
+    majority_labels,
+    teacher_of_objects,
+)
+from gsjax.methods.reconstruction import PRESETS
+from gsjax.perception.codebook import ClassCodebook
+from gsjax.rasterize.frozen import paint
+from gsjax.scene.feature_grid import Located, locate
+from gsjax.scene.gaussians import Gaussians
+
+TRUE_WITHIN = 0.015  # metres between a Gaussian's centre and the depth where its label is taken
+_OPAQUE = 0.5
+_LEAST_VOTES = 1
+
+
+def fitted(
+    name: str, folder: Path, eval_cameras: tuple[int, ...] = (), preset: str = "depth", **options: Any
+) -> FieldScene:
+    """The first frame of a recording as `gsjax fit` has it, made once for all experiments; beside `folder`."""
+    path = folder.parents[1] / "field_scenes" / name
+    if not (path / "report.html").is_file():
+        told = fit_command.Options(
+            str(recorded(name)),
+            path,
+            eval_cameras=eval_cameras,
+            overwrite=True,
+            fit=PRESETS[preset],
+            **options,
+        )
+        fit_command.run(told)
+    return scene_of_run(path)
+
+
+def codebook_of(photographs: Photographs) -> tuple[dict[int, str], Float[np.ndarray, "k d"]]:
+    """Names of the labels 0 to K, the background among them, and their codes."""
+    there = {int(v) for i in range(photographs.num) for v in np.unique(_labels(photographs, i))}
+    known = {label: photographs.label_names.get(label, f"object {label}") for label in range(max(there) + 1)}
+    names = known | {0: "background"}
+    encoder = ClassCodebook({label + 1: name for label, name in names.items()})
+    return names, np.stack([encoder.embed_text(name) for name in names.values()])
+
+
+def flawed_teacher(
+    photographs: Photographs, which: Any, codes: np.ndarray, seed: int, flaws: Flaws | None = None
+) -> tuple[Teacher, list[np.ndarray]]:
+    """What a segmenter and an encoder might have said of photographs; and, for a vote of labels, which code
+    each pixel's embedding is nearest to."""
+    said = flawed_masks([_labels(photographs, i) for i in which], codes, seed, flaws)
+    nearest = [(rows @ codes.T).argmax(axis=1) for rows in said.embeddings]
+    ids = [
+        np.where(one < 0, -1, near[np.maximum(one, 0)])
+        for one, near in zip(said.labels, nearest, strict=True)
+    ]
+    return teacher_of_objects(said.labels, said.embeddings), ids
+
+
+def _labels(photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
+    labels = photographs.labels(i)
+    assert labels is not None
+    return np.asarray(labels, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A field that was distilled.
+
+    Attributes:
+        field, located: as queries take them.
+        seconds: of the steps, without what compiled.
+        compile_seconds: that compiling took.
+        memory_mb: most that the process had, so far.
+        trained: how many numbers.
+        losses: of the last steps, means.
+    """
+
+    field: FeatureField
+    located: Located | None
+    seconds: float
+    compile_seconds: float
+    memory_mb: float
+    trained: int
+    losses: dict[str, float]
+
+
+def learned(scene: FieldScene, which: Any, teacher: Teacher, config: FieldConfig) -> Learned:
+    """Distil a field from some photographs."""
+    cameras = [scene.photographs.camera(i) for i in which]
+    problem, state = begin_field(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
+    seconds, compiling, infos = 0.0, 0.0, []
+    for found in distill(problem, state):
+        state = found.state
+        seconds, compiling = seconds + found.seconds, compiling + found.compile_seconds
+        infos = [*infos[-19:], jax.device_get(found.info)]
+    assert not any(info["skipped"] for info in infos)
+    field = finished(problem, state)
+    located = None if problem.rows is None else locate(field.encoding, jnp.asarray(scene.gaussians.means))
+    names = [name for name in infos[0] if name not in ("skipped",)]
+    return Learned(
+        field,
+        located,
+        seconds,
+        compiling,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        sum(leaf.size for leaf in jax.tree.leaves(state.field)),
+        {name: float(np.mean([info[name] for info in infos])) for name in names},
+    )
+
+
+def scored(
+    scene: FieldScene,
+    of_gaussians: Int[np.ndarray, "n"],
+    names: dict[int, str],
+    by_field: tuple[FeatureField, Located | None, np.ndarray] | None = None,
+) -> dict[str, Any]:
+    """Masks of the held-out views and selections of Gaussians against truth: means over all things, the
+    background left out.
+
+    Args:
+        scene: with held-out photographs.
+        of_gaussians: the label of each Gaussian; -1 none.
+        names: of labels.
+        by_field: a field and the codes of the labels, for the query by pixels.
+    """
+    photographs = scene.photographs
+    views = frozen_views(
+        scene.gaussians, [photographs.camera(i) for i in scene.held_out], scene.rasterize_mode
+    )
+    scores, covered = ClassScores(names), []
+    for view, i in zip(views, scene.held_out, strict=True):
+        if by_field is not None:
+            by_pixel, in_space = class_maps(by_field[0], by_field[1], view, by_field[2], of_gaussians)
+        else:
+            share = np.asarray(paint(view[0], jax.nn.one_hot(of_gaussians, len(names)), view[1])[0])
+            in_space = np.where(share.max(-1) > _OPAQUE, share.argmax(-1), -1)
+            by_pixel = np.full_like(in_space, -1)
+        scores.add(by_pixel, in_space, _labels(photographs, int(i)))
+        covered.append(np.asarray(paint(view[0], jnp.ones((scene.gaussians.num, 1)), view[1])[1]) > _OPAQUE)
+    rows = [row for row in scores.rows() if row["label"] != 0]
+    truth = true_labels(scene.gaussians, photographs)
+    found = {f"m{name}": _mean([row[name] for row in rows]) for name in _NAMES}
+    ious = {k: _iou(of_gaussians == k, truth == k, truth >= 0) for k in names if k and (truth == k).any()}
+    hidden = _hidden(scene, truth)
+    kept = [((of_gaussians == k) & one).sum() / one.sum() for k, one in hidden.items() if one.any()]
+    return found | {
+        "gaussian_iou": _mean(list(ious.values())),
+        "hidden_recall": _mean(kept),
+        "covered": float(np.mean(covered)),
+        "things": [
+            f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f} / {ious.get(row['label'], np.nan):.2f}"
+            for row in rows
+        ],
+    }
+
+
+_NAMES = ("iou_2d", "iou_3d", "boundary_iou_2d", "boundary_iou_3d")
+
+
+def of_field(found: Learned, codes: np.ndarray) -> Int[np.ndarray, "n"]:
+    """The label that each Gaussian is nearest to."""
+    return classes_of(found.field, found.located, codes)
+
+
+def by_majority(scene: FieldScene, which: Any, ids: list[np.ndarray], count: int) -> Int[np.ndarray, "n"]:
+    """Plain lifting of the labels of pixels."""
+    cameras = [scene.photographs.camera(i) for i in which]
+    return majority_labels(frozen_views(scene.gaussians, cameras, scene.rasterize_mode), ids, count)
+
+
+def true_labels(gaussians: Gaussians, photographs: Photographs) -> Int[np.ndarray, "n"]:
+    """The mask value where a Gaussian's centre falls, if the depth there is within 15 mm of it: what most
+    cameras say. -1 where none does."""
+    votes = np.zeros((gaussians.num, 256), np.int32)
+    for i in range(photographs.num):
+        label, seen = _seen(gaussians, photographs, i)
+        np.add.at(votes, (np.flatnonzero(seen), label[seen]), 1)
+    return np.where(votes.sum(1) >= _LEAST_VOTES, votes.argmax(1), -1)
+
+
+def _seen(
+    gaussians: Gaussians, photographs: Photographs, i: int
+) -> tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """The mask value under each centre, and whether the centre lies where the depth is."""
+    camera, depth = photographs.camera(i), photographs.depth(i)
+    assert depth is not None
+    pixels, z = (np.asarray(a) for a in project(gaussians.means, camera.viewmat, camera.K))
+    x, y = (np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(int)[:, axis] for axis in (0, 1))
+    inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    close = inside & (depth[y, x] > 0) & (np.abs(depth[y, x] - z) < TRUE_WITHIN)
+    return _labels(photographs, i)[y, x], close
+
+
+def _hidden(scene: FieldScene, truth: Int[np.ndarray, "n"]) -> dict[int, Bool[np.ndarray, "n"]]:
+    """Of each thing, the Gaussians that the first held-out camera does not see, though it sees some of it or
+    none."""
+    _, seen = _seen(scene.gaussians, scene.photographs, int(scene.held_out[0]))
+    return {int(k): (truth == k) & ~seen for k in np.unique(truth) if k > 0}
+
+
+def _iou(found: np.ndarray, true: np.ndarray, known: np.ndarray) -> float:
+    found, true = found & known, true & known
+    return float((found & true).sum() / max(1, (found | true).sum()))
+
+
+def _mean(values: list[float]) -> float | None:
+    known = [float(value) for value in values if value is not None and np.isfinite(value)]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,46 @@
+"""Labels of pixels lifted to Gaussians by majority: what a field is held against, and the least that lifting
+can be.
+
+A pixel's vote for a Gaussian is the share of its light that the Gaussian sends. So the votes of a view are
+the slope of sum over pixels p of F(p)[label of p] by the Gaussians' values, F being linear in these.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.rasterize.frozen import FrozenView, paint
+from gsjax.rasterize.plan import Plan
+
+
+@partial(jax.jit, static_argnames=("plan", "count"))
+def label_votes(
+    view: FrozenView, plan: Plan, ids: Int[Array, "height width"], count: int
+) -> Float[Array, "n count"]:
+    """How much light each Gaussian sends to the pixels of each label.
+
+    Args:
+        view, plan: of the scene.
+        ids: 0 to count - 1 of each pixel; with -1 it has no vote.
+        count: of labels.
+    """
+    ballots = jax.nn.one_hot(ids, count)  # a row of zeros for -1
+    nothing = jnp.zeros((view.opacities.shape[0], count), ballots.dtype)
+    _, back = jax.vjp(lambda values: paint(view, values, plan)[0], nothing)
+    return back(ballots)[0]
+
+
+def majority_labels(
+    views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int
+) -> Int[np.ndarray, "n"]:
+    """The label with most votes of all views; -1 for a Gaussian that sends no light to a pixel with one."""
+    votes = sum(
+        np.asarray(label_votes(view, plan, jnp.asarray(one), count), np.float64)
+        for (view, plan), one in zip(views, ids, strict=True)
+    )
+    assert isinstance(votes, np.ndarray)
+    return np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), -1)
