@@ -167,10 +167,9 @@ def select(run: FieldRun, question: Question) -> Selection:
             f"expected a query of {field.dimension} numbers like this field's features, found "
             f"{queries.shape[1]}: --weights are those of another encoder"
         )
-    ask = jax.jit(lambda f, where, q: relevancy(gaussian_cosines(f, where, q)))
-    jax.block_until_ready(ask(field, located, queries))  # what compiles is no answer's time
+    jax.block_until_ready(_scores(field, located, queries))  # what compiles is no answer's time
     begun = perf_counter()
-    scores = np.asarray(ask(field, located, queries))
+    scores = np.asarray(_scores(field, located, queries))
     seconds = perf_counter() - begun
     given = question.threshold
     if given is None and least is not None and len(queries) == 1:
@@ -178,6 +177,11 @@ def select(run: FieldRun, question: Question) -> Selection:
     else:
         threshold = threshold_for(scores, len(queries) > 1, given)
     return Selection(scores, threshold, against, seconds)
+
+
+@jax.jit
+def _scores(field, located, queries):
+    return relevancy(gaussian_cosines(field, located, queries))
 
 
 def _queries(run: FieldRun, question: Question) -> tuple[np.ndarray, tuple[str, ...], float | None]:

@@ -1,11 +1,15 @@
 """What `gsjax view` opens: a run of any kind, or a PLY file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from gsjax.cli.editing import Filmed, camera_names, editing_of
+from gsjax.cli.field_file import NAME
+from gsjax.cli.field_run import field_of, open_field_run
+from gsjax.cli.field_view import asking_of
 from gsjax.cli.messages import Notes
 from gsjax.cli.parts_run import blend_of, open_parts_run, read_parts
 from gsjax.cli.photographs import photographs_of_run
@@ -34,6 +38,8 @@ def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
     expect_run(path)
+    if (path / NAME).is_file():
+        return _of_field(path, notes), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
@@ -41,8 +47,33 @@ def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
         )
     if (path / "parts.npz").is_file():
         return _of_parts(path, notes), path
-    tracked = (path / "trajectory.npz").is_file()
-    return (_of_track if tracked else _of_fit)(path, notes), path
+    if (path / "trajectory.npz").is_file():
+        return _of_track(path, notes), path
+    return _asked(_of_fit(path, notes), path, notes), path
+
+
+def _asked(scene: Viewable, path: Path, notes: Notes) -> Viewable:
+    """With what its field, if it has one, can be asked."""
+    folder = field_of(path)
+    if folder is None:
+        return scene
+    try:
+        run = open_field_run(folder, notes)
+        if run.gaussians.num != scene.gaussians.num:
+            raise ValueError("it is of another scene")
+        return replace(scene, asking=asking_of(run))
+    except (ValueError, OSError) as error:
+        notes.warn(f"its field cannot be asked: {error}")
+        return scene
+
+
+def _of_field(path: Path, notes: Notes) -> Viewable:
+    """The scene of a field, with the photographs that taught it where they still are."""
+    run = open_field_run(path, notes)
+    antialiased = run.rasterize_mode == "antialiased"
+    title = f"{path.absolute().parent.name}, {path.name}"
+    shots = None if run.views is None else _shots_of(run.views.photographs)
+    return Viewable(title, run.gaussians, shots=shots, antialiased=antialiased, asking=asking_of(run))
 
 
 def _of_fit(path: Path, notes: Notes) -> Viewable:

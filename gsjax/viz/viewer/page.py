@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsjax.viz.viewer import words
+from gsjax.viz.viewer.ask_folder import AskFolder
 from gsjax.viz.viewer.cameras import (
     Pose,
     browser_camera,
@@ -102,6 +103,8 @@ class Page:
         self._renderer.close()
         if self._edits is not None:
             self._edits.close()
+        if self._questions is not None:
+            self._questions.close()
         if self._shots is not None:
             self._shots.close()
 
@@ -122,6 +125,9 @@ class Page:
         if scene.editing is not None and scene.num_frames > 1:
             shared = self._shared
             self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
+        self._questions = None
+        if scene.asking is not None and scene.num_frames == 1:
+            self._questions = AskFolder(gui, scene, scene.asking, self._show, self._picked_row)
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)
@@ -175,15 +181,19 @@ class Page:
         self._sender.ask()
 
     def _show(self, scene: Viewable | None) -> None:
-        """Show another film of the scene, or None: the scene itself again."""
+        """Show something else in the scene's place, a film or a part of it; or None: the scene again."""
         scene = self._shared.scene if scene is None else scene
         first, last = scene.at(0), scene.num_frames - 1  # what has to be compiled is, before it is shown
         with self._lock:
             self._frame = min(self._frame, last)
             self._now = Present(scene, Palette(scene), 0, first)
-        self._slider.value = min(int(self._slider.value), last)
-        self._slider.max = max(last, 1)  # sliders have some length
-        self._to_frame(self._frame)
+        if self._shared.scene.num_frames > 1:
+            self._slider.value = min(int(self._slider.value), last)
+            self._slider.max = max(last, 1)  # sliders have some length
+            self._to_frame(self._frame)
+        else:
+            self._unpick()
+            self._moved()
 
     def _to_frame(self, frame: int) -> None:
         with self._lock:
@@ -192,10 +202,17 @@ class Page:
         self._moment.content = words.moment(scene, frame)
         if self._shots is not None and scene.shots is not None:
             self._shots.move(scene.shots, frame)
-        if self._picked is not None:  # it may have moved away from under the mark
+        self._unpick()
+        self._moved()
+
+    def _unpick(self) -> None:
+        """What was picked may have moved away from under the mark, or be gone."""
+        if self._picked is not None:
             self._mark(None)
             self._told.content = words.HOW_TO_PICK
-        self._moved()
+
+    def _picked_row(self) -> int | None:
+        return None if self._picked is None else self._picked.index
 
     def _step(self) -> None:
         """To the next frame; after the last, to the first."""

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gsjax.scene.gaussians import Gaussians, take, valid_rows
 
@@ -112,6 +112,45 @@ class Editing:
     save: Callable[[Sequence[str], str, str, Callable[[int, int], bool]], Path]
 
 
+class Found(NamedTuple):
+    """The answer to a question.
+
+    Attributes:
+        what: was asked for, in a few words.
+        scores: of each Gaussian, [N].
+        threshold: from which on they are meant.
+        rule: by which that is so.
+        seconds: that it took.
+    """
+
+    what: str
+    scores: Float[np.ndarray, "..."]
+    threshold: float
+    rule: str
+    seconds: float
+
+
+Showing = Literal["heat of the scores", "only what was found", "all but that", "the scene"]
+"""What is shown of an answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asking:
+    """How a scene can be asked. A ValueError of it says what cannot be answered.
+
+    Attributes:
+        hint: what can be asked for.
+        ask: text -> the answer.
+        like: row of a Gaussian -> the answer to "what is like it".
+        save: (which Gaussians [N], a name) -> where they are kept as a PLY file; none is written over.
+    """
+
+    hint: str
+    ask: Callable[[str], Found]
+    like: Callable[[int], Found]
+    save: Callable[[Bool[np.ndarray, "n"], str], Path]
+
+
 @dataclass(frozen=True, eq=False)
 class Viewable:
     """A scene to look at. What it does not have is None, and the page does not offer it.
@@ -129,6 +168,7 @@ class Viewable:
         antialiased: whether it was fitted with `rasterize_mode="antialiased"`.
         unit: of lengths, as in "m"; empty where only their proportions are known.
         editing: how it can be edited.
+        asking: how it can be asked, where nothing moves.
 
     Raises:
         ValueError: shapes disagree, there is no Gaussian, or one holds a number that is not finite.
@@ -146,6 +186,7 @@ class Viewable:
     antialiased: bool = False
     unit: str = ""
     editing: Editing | None = None
+    asking: Asking | None = None
 
     def __post_init__(self):
         count = self.gaussians.num
