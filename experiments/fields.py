@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from recordings import recorded
 
 from gsjax.cli import fit as fit_command
+from gsjax.cli import track as track_command
 from gsjax.cli.field_scene import FieldScene, scene_of_run
 from gsjax.cli.field_scores import ClassScores, class_maps, classes_of
 from gsjax.data.photographs import Photographs
@@ -43,7 +44,7 @@ _LEAST_VOTES = 1
 def fitted(
     name: str, folder: Path, eval_cameras: tuple[int, ...] = (), preset: str = "depth", **options: Any
 ) -> FieldScene:
-    """The first frame of a recording as `gsjax fit` has it, made once for all experiments; beside `folder`."""
+    """The first frame of a recording as `gsjax fit` has it, made once for all experiments."""
     path = folder.parents[1] / "field_scenes" / name
     if not (path / "report.html").is_file():
         told = fit_command.Options(
@@ -55,6 +56,26 @@ def fitted(
             **options,
         )
         fit_command.run(told)
+    return scene_of_run(path)
+
+
+def first_tracked(
+    name: str, folder: Path, cameras: tuple[int, ...], mask_camera: int, eval_cameras: tuple[int, ...]
+) -> FieldScene:
+    """The scene that `gsjax track` begins with, for few cameras: a Gaussian a point of depth."""
+    path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
+    if not (path / "report.html").is_file():
+        track_command.run(
+            track_command.Options(
+                str(recorded(name)),
+                path,
+                frames="0:2",
+                cameras=cameras,
+                mask_camera=mask_camera,
+                eval_cameras=eval_cameras,
+                overwrite=True,
+            )
+        )
     return scene_of_run(path)
 
 
@@ -160,7 +181,7 @@ def scored(
             share = np.asarray(paint(view[0], jax.nn.one_hot(of_gaussians, len(names)), view[1])[0])
             in_space = np.where(share.max(-1) > _OPAQUE, share.argmax(-1), -1)
             by_pixel = np.full_like(in_space, -1)
-        scores.add(by_pixel, in_space, _labels(photographs, int(i)))
+        scores.add(by_pixel, in_space, _labels(photographs, i))
         covered.append(np.asarray(paint(view[0], jnp.ones((scene.gaussians.num, 1)), view[1])[1]) > _OPAQUE)
     rows = [row for row in scores.rows() if row["label"] != 0]
     truth = true_labels(scene.gaussians, photographs)
@@ -173,7 +194,7 @@ def scored(
         "hidden_recall": _mean(kept),
         "covered": float(np.mean(covered)),
         "things": [
-            f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f} / {ious.get(row['label'], np.nan):.2f}"
+            f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f} / {ious.get(row['label'], 0):.2f}"
             for row in rows
         ],
     }
@@ -220,7 +241,7 @@ def _seen(
 def _hidden(scene: FieldScene, truth: Int[np.ndarray, "n"]) -> dict[int, Bool[np.ndarray, "n"]]:
     """Of each thing, the Gaussians that the first held-out camera does not see, though it sees some of it or
     none."""
-    _, seen = _seen(scene.gaussians, scene.photographs, int(scene.held_out[0]))
+    _, seen = _seen(scene.gaussians, scene.photographs, scene.held_out[0])
     return {int(k): (truth == k) & ~seen for k in np.unique(truth) if k > 0}
 
 

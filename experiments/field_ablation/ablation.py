@@ -1,0 +1,94 @@
+"""What is each part of the distillation worth? One is left out, or made otherwise, at a time."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import jax.numpy as jnp
+import numpy as np
+from autoencoder import trained
+from fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
+
+from gsjax.cli.field_scene import FieldScene, scaled
+from gsjax.methods.feature_field import FieldConfig, FieldWeightsConfig, Teacher, features_of
+from gsjax.methods.feature_field.field import FeatureField
+
+SCALE, ITERATIONS = 0.5, 200
+BASE = FieldConfig(iterations=ITERATIONS)
+VARIANTS: dict[str, FieldConfig] = {
+    "all on": BASE,
+    "without contrast": replace(BASE, weights=FieldWeightsConfig(contrast=0.0)),
+    "without TV": replace(BASE, weights=FieldWeightsConfig(tv=0.0)),
+    "without both": replace(BASE, weights=FieldWeightsConfig(contrast=0.0, tv=0.0)),
+    "without the hash grid: a vector each": replace(BASE, encoding="table"),
+}
+SQUEEZED = {"autoencoder to 8 (as LangSplat)": 8, "autoencoder to 16 (as LangSplat)": 16}
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """One variant on articulated_0 with flawed masks, at half of its resolution."""
+    scene = scaled(fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1"), SCALE)
+    names, codes = codebook_of(scene.photographs)
+    teacher, _ = flawed_teacher(scene.photographs, scene.taught, codes, seed)
+    variant = options["variant"]
+    if variant in SQUEEZED:
+        found, aside = _squeezed(scene, teacher, SQUEEZED[variant], seed)
+    else:
+        found, aside = learned(scene, scene.taught, teacher, replace(VARIANTS[variant], seed=seed)), 0.0
+    asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
+    return {
+        **asked,
+        "step_ms": 1e3 * found.seconds / (ITERATIONS - 1),
+        "minutes": (found.seconds + found.compile_seconds + aside) / 60,
+        "memory_mb": found.memory_mb,
+        "trained": found.trained,
+    }
+
+
+def _squeezed(scene: FieldScene, teacher: Teacher, size: int, seed: int) -> tuple[Learned, float]:
+    """A code for each Gaussian, distilled from the embeddings' codes; decoded before it is asked. A pixel's
+    code is decoded as the mean of what its Gaussians decode to: what is asked in 3D is exact."""
+    assert teacher.codebook is not None
+    begun = perf_counter()
+    model, _ = trained(teacher.codebook, size, seed)
+    codes = np.asarray(model.encode(jnp.asarray(teacher.codebook)))
+    aside = perf_counter() - begun
+    config = replace(
+        BASE,
+        encoding="table",
+        channels=size,
+        weights=FieldWeightsConfig(rec=1000.0 / 512 * size, contrast=0.0, tv=0.0),
+        seed=seed,
+    )
+    found = learned(scene, scene.taught, teacher._replace(codebook=codes), config)
+    low = features_of(found.field, None) @ found.field.lift.T
+    features = model.decode(low)
+    features /= jnp.linalg.norm(features, axis=-1, keepdims=True)
+    decoded = FeatureField(features, jnp.eye(features.shape[1]))
+    return replace(found, field=decoded), aside
+
+
+PANELS = (
+    ("miou_3d", "mIoU, 3D query"),
+    ("mboundary_iou_3d", "boundary mIoU"),
+    ("gaussian_iou", "IoU of Gaussians"),
+    ("step_ms", "milliseconds a step"),
+)
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """A panel for each score, a bar for each variant."""
+    from matplotlib.figure import Figure
+    from plots import draw_variants
+
+    drawing = Figure(figsize=(14, 1.0 + 0.32 * len(rows)), dpi=100, layout="constrained")
+    panels = drawing.subplots(1, len(PANELS), sharey=True)
+    names = [row["variant"] for row in rows]
+    for axes, (key, title) in zip(panels, PANELS, strict=True):
+        draw_variants(axes, names, [row[key] or 0.0 for row in rows], title)
+    panels[0].invert_yaxis()
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
