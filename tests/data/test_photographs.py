@@ -156,3 +156,26 @@ def test_a_recording_as_photographs():
     np.testing.assert_array_equal(scene.depth(4), sequence.depth(1, 1))
     assert scene.where("depth", 4) == sequence.where("depth", 1, 1)
     assert photographs_of(sequence.select([0])).times is None
+
+
+def test_labels_are_read_selected_and_shrunk_as_they_are():
+    labels = [np.arange(w * h).reshape(h, w) % 7 for w, h in SIZES.tolist()]
+    found = photographs(load_labels=lambda i: None if i == 1 else labels[i], label_names={3: "cup"})
+    np.testing.assert_array_equal(found.labels(0), labels[0])
+    assert found.labels(1) is None
+    np.testing.assert_array_equal(found.select([2, 0]).labels(0), labels[2])
+    small = found.scaled(0.5)
+    assert small.labels(0).shape == tuple(small.sizes[0][::-1])
+    assert set(np.unique(small.labels(0))) <= set(range(7))
+    assert photographs().labels(0) is None
+    with pytest.raises(DataError, match="integers"):
+        photographs(load_labels=lambda i: labels[i].astype(float)).labels(0)
+
+
+def test_a_recordings_labels_and_names_come_along(tmp_path):
+    from gsjax.data.simulated import tabletop
+
+    sequence = tabletop(frames=2, width=48, height=36)
+    found = photographs_of(sequence)
+    np.testing.assert_array_equal(found.labels(1), sequence.mask(0, 1))
+    assert "can" in found.label_names.values()

@@ -22,8 +22,11 @@ from gsjax.methods.feature_field import (
     frozen_views,
     gaussian_cosines,
     init_field,
+    label_votes,
     learned_inverse,
+    majority_labels,
     pixel_cosines,
+    pixel_features,
     pixel_mask,
     pseudo_inverse,
     relevancy,
@@ -352,3 +355,38 @@ def test_a_teacher_of_other_views_is_refused(two_balls):
 def test_settings_without_meaning_are_refused(change, says):
     with pytest.raises(ValueError, match=says):
         replace(QUICK, **change)
+
+
+def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
+    scene, _, masks = two_balls
+    view, plan = frozen_views(scene, cameras(8))[0]
+    ids = jnp.asarray(masks[0])
+    votes = np.asarray(label_votes(view, plan, ids, 3))
+    # One Gaussian at a time: what it alone adds to the picture.
+    for row in (3, 90, 150):
+        own, _ = paint(view, jnp.zeros((scene.num, 1)).at[row].set(1.0), plan)
+        for label in range(3):
+            np.testing.assert_allclose(votes[row, label], own[..., 0][ids == label].sum(), atol=1e-4)
+    none = np.asarray(label_votes(view, plan, jnp.full_like(ids, -1), 3))
+    assert not none.any()
+
+
+def test_a_majority_of_true_masks_is_the_truth(two_balls):
+    scene, labels, masks = two_balls
+    found = majority_labels(frozen_views(scene, cameras(8)), masks, 3)
+    seen = found >= 0
+    assert seen.mean() > 0.9
+    assert (found[seen] == labels[seen]).mean() > 0.97
+
+
+def test_pixels_features_are_what_their_cosines_are_of(problem, learned):
+    told, _ = problem
+    batch = told.views[0]
+    cosines, alphas = pixel_cosines(learned, batch.located, batch.view, batch.plan, jnp.asarray(BOOK))
+    y, x = np.unravel_index(int(np.asarray(alphas).argmax()), alphas.shape)
+    features, there = pixel_features(
+        learned, batch.located, batch.view, batch.plan, jnp.array([[int(x), int(y)]])
+    )
+    np.testing.assert_allclose(there[0], alphas[y, x], rtol=1e-6)
+    unit = features[0] / jnp.linalg.norm(features[0])
+    np.testing.assert_allclose(unit @ BOOK.T, cosines[y, x], atol=1e-4)

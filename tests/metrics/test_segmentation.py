@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gsjax.metrics.segmentation import LabelOverlap, iou_of_masks
+from gsjax.metrics.segmentation import LabelOverlap, MaskOverlap, boundary, iou_of_masks
 
 
 def test_counts_are_pooled_over_pictures():
@@ -41,3 +41,35 @@ def test_masks_and_shapes():
     assert math.isnan(iou_of_masks(np.zeros(3, bool), np.zeros(3, bool)))
     with pytest.raises(ValueError, match=r"predicted: got shape \(2,\), want \(3,\)"):
         LabelOverlap().add(np.zeros(2, int), np.zeros(3, int))
+
+
+def square(low, high, size=200):
+    mask = np.zeros((size, size), bool)
+    mask[low:high, low:high] = True
+    return mask
+
+
+def test_a_boundary_is_a_band_of_two_percent_of_the_diagonal():
+    band = boundary(square(50, 150))
+    reach = round(0.02 * np.hypot(200, 200))
+    assert band.sum() == 100**2 - (100 - 2 * reach) ** 2
+    assert not band[100, 100]
+    whole = boundary(square(0, 200))
+    assert whole[0, 0]
+    assert not whole[100, 100]  # the picture's edge is an outline too
+    np.testing.assert_array_equal(boundary(square(50, 53)), square(50, 53))
+
+
+def test_boundaries_see_of_large_masks_what_areas_do_not():
+    overlap = MaskOverlap()
+    overlap.add(square(12, 190), square(10, 190))
+    assert overlap.iou > 0.97
+    assert overlap.boundary_iou < 0.85
+    overlap.add(square(10, 190), square(10, 190))
+    assert overlap.iou == pytest.approx((178**2 + 180**2) / (2 * 180**2))
+
+
+def test_overlaps_of_nothing_are_no_numbers():
+    overlap = MaskOverlap()
+    assert np.isnan(overlap.iou)
+    assert np.isnan(overlap.boundary_iou)

@@ -104,3 +104,14 @@ def test_any_colour_has_some_word():
         [colorsys.hsv_to_rgb(h, s, v) for h in np.linspace(0, 1, 50) for s, v in [(1, 1), (0.5, 0.6)]]
     )
     assert set(np.unique(color_words(hues[None]))) <= set(range(len(COLORS)))
+
+
+def test_without_sizes_a_thing_is_the_same_in_any_company():
+    image, labels = np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60), int)
+    image[5:15, 5:15], labels[5:15, 5:15] = (200, 30, 30), 1
+    alone = ClosedVocabulary(sizes=False).embed_objects(image, labels, 1)
+    image[5:38, 20:58], labels[5:38, 20:58] = (30, 30, 200), 2
+    np.testing.assert_allclose(ClosedVocabulary(sizes=False).embed_objects(image, labels, 2)[0], alone[0])
+    assert "size" not in ClosedVocabulary(sizes=False).words
+    with pytest.raises(ValueError, match="largest"):
+        ClosedVocabulary(sizes=False).embed_text("the largest")

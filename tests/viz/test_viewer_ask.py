@@ -1,0 +1,123 @@
+"""Questions on the page: typed, answered, shown as heat or in parts, kept. Who answers is made up here."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.scene.gaussians import concatenate
+from gsjax.viz.viewer import Asking, Found, Viewable, open_viewer
+from gsjax.viz.viewer.ask_folder import heat_of
+from tests.viz.test_viewer_edit import GREEN, RED, ball, rising
+from tests.viz.test_viewer_page import browser, color_share, until
+
+viser = pytest.importorskip("viser", reason="viser is not installed")
+HEAT, ONLY, WITHOUT, SCENE = "heat of the scores", "only what was found", "all but that", "the scene"
+
+
+class Answers:
+    """`green` means the second half of the Gaussians, by 0.9; others are refused."""
+
+    def __init__(self):
+        self.asked, self.saved = [], []
+
+    def asking(self):
+        return Asking("One of: green", self.ask, self.like, self.save)
+
+    def ask(self, text):
+        self.asked.append(text)
+        if text != "green":
+            raise ValueError(f"no class <{text}>")
+        return Found(text, np.repeat([0.1, 0.9], 150), 0.5, "better than each negative", 0.02)
+
+    def like(self, row):
+        self.asked.append(row)
+        return Found(
+            f"like {row}", np.repeat([0.9, 0.1] if row < 150 else [0.1, 0.9], 150), 0.5, "Otsu", 0.01
+        )
+
+    def save(self, selected, name):
+        if self.saved:
+            raise OSError("no space")
+        self.saved.append((np.flatnonzero(selected), name))
+        return Path("extracted") / f"{name}.ply"
+
+
+@pytest.fixture
+def answers():
+    return Answers()
+
+
+@pytest.fixture
+def scene(answers):
+    both = jax.tree.map(jnp.asarray, concatenate([ball(RED, -0.6), ball(GREEN, 0.6)]))
+    shots = rising(both, 2).shots
+    return Viewable("balls", both, np.repeat([1, 2], 150), shots=shots, asking=answers.asking())
+
+
+def test_a_question_is_answered_shown_and_kept(scene, answers):
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        folder = page._questions
+        folder._text.value = "green"
+        until(lambda: "150 of 300" in folder._count.content)
+        assert answers.asked == ["green"]
+        assert folder._threshold.value == 0.5
+        until(lambda: max(color_share(page._picture, GREEN).values()) < 0.001)  # heat in its place
+        # What was found alone, and then the rest, in their own colours.
+        folder._showing.value = ONLY
+        until(lambda: "all 150 Gaussians" in page._status.content)
+        until(lambda: max(color_share(page._picture, GREEN).values()) > 0.02)
+        assert max(color_share(page._picture, RED).values()) < 0.001
+        folder._showing.value = WITHOUT
+        until(lambda: max(color_share(page._picture, RED).values()) > 0.02)
+        until(lambda: page._splats._nodes["still"].rgbs[0, 0] > 150)
+        # The threshold slides.
+        folder._threshold.value = 0.1 - 1e-6
+        until(lambda: "nothing is left" in folder._count.content)
+        folder._threshold.value = 0.5
+        until(lambda: "150 of 300" in folder._count.content)
+        # It is kept once; then the disk is full, which is said.
+        folder._keep("object")
+        assert "kept as" in folder._kept.content
+        rows, name = answers.saved[0]
+        np.testing.assert_array_equal(rows, np.arange(150, 300))
+        assert name == "green object"
+        folder._keep("rest")
+        assert "no space" in folder._kept.content
+        # The scene again.
+        folder._showing.value = SCENE
+        until(lambda: page._now.scene is scene)
+
+
+def test_what_cannot_be_answered_is_said(scene, answers):
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        folder = page._questions
+        folder._keep("object")
+        assert "ask something first" in folder._kept.content
+        folder._like()
+        assert "pick something first" in folder._told.content
+        folder._text.value = "spoon"
+        until(lambda: "no class &lt;spoon&gt;" in folder._told.content)
+        assert page._now.scene is scene
+
+
+def test_what_is_picked_is_asked_for_by_its_row_in_the_whole_scene(scene, answers):
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        folder = page._questions
+        folder._text.value = "green"
+        until(lambda: "150 of 300" in folder._count.content)
+        folder._showing.value = ONLY
+        until(lambda: page._now.scene.gaussians.num == 150)
+        folder._picked = lambda: 7
+        folder._like()
+        assert answers.asked[-1] == 157
+
+
+def test_heat_is_bright_where_meant_and_grey_elsewhere(scene):
+    found = Found("x", np.linspace(0, 1, 300), 0.5, "", 0.0)
+    colors = heat_of(scene.gaussians, found, found.scores > 0.5)
+    assert colors.shape == (300, 3)
+    assert colors[found.scores > 0.5].mean() > 2 * colors[found.scores < 0.3].mean()
+    assert (colors[found.scores < 0.3].max(1) < 0.6).all()
