@@ -1,0 +1,63 @@
+"""What does speed cost? Channels, levels, table, resolution and steps, one after the other."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
+
+from gsjax.cli.field_scene import scaled
+from gsjax.methods.feature_field import FieldConfig
+from gsjax.scene.feature_grid import FeatureGridConfig
+
+AXES = {
+    "channels": "channels",
+    "levels": "levels of the grid",
+    "log2_entries": "log2 of a level's entries",
+    "hidden": "width of the network",
+    "scale": "resolution",
+    "iterations": "steps",
+}
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """One setting on articulated_0 with flawed masks; what is not named is as in the middle."""
+    told = {"channels": 256, "levels": 16, "log2_entries": 20, "hidden": 128, "scale": 0.5, "iterations": 200}
+    told |= options
+    scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    names, codes = codebook_of(scene.photographs)
+    small = scaled(scene, told["scale"])
+    teacher, _ = flawed_teacher(small.photographs, small.taught, codes, seed)
+    grid = FeatureGridConfig(levels=told["levels"], log2_entries=told["log2_entries"], hidden=told["hidden"])
+    config = FieldConfig(iterations=told["iterations"], channels=told["channels"], grid=grid, seed=seed)
+    found = learned(small, small.taught, teacher, config)
+    # Judged at full resolution, whatever it learned from.
+    asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
+    return {
+        **asked,
+        "step_ms": 1e3 * found.seconds / max(1, told["iterations"] - 1),
+        "minutes": found.seconds / 60,
+        "memory_mb": found.memory_mb,
+        "trained": found.trained,
+    }
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """IoU over minutes, a line for each setting that was changed."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(9, 5), dpi=110, layout="constrained")
+    axes = drawing.subplots()
+    for name, words in AXES.items():
+        some = sorted((row for row in rows if row.get(name) is not None), key=lambda row: row["minutes"])
+        if not some:
+            continue
+        axes.plot([r["minutes"] for r in some], [r["miou_3d"] for r in some], "o-", ms=4, label=words)
+        for row in some:
+            axes.annotate(f"{row[name]:g}", (row["minutes"], row["miou_3d"]), fontsize=7, va="bottom")
+    axes.set(xscale="log", xlabel="minutes of steps", ylabel="mIoU of held-out views, 3D query")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
