@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,11 +90,18 @@ def codebook_of(photographs: Photographs) -> tuple[dict[int, str], Float[np.ndar
 
 
 def flawed_teacher(
-    photographs: Photographs, which: Any, codes: np.ndarray, seed: int, flaws: Flaws | None = None
+    scene: FieldScene, codes: np.ndarray, seed: int, flaws: Flaws | None = None, scale: float = 1.0
 ) -> tuple[Teacher, list[np.ndarray]]:
-    """What a segmenter and an encoder might have said of photographs; and, for a vote of labels, which code
-    each pixel's embedding is nearest to."""
-    said = flawed_masks([_labels(photographs, i) for i in which], codes, seed, flaws)
+    """What a segmenter and an encoder might have said of a scene's photographs, then made smaller by `scale`;
+    and, for a vote of labels, which code each pixel's embedding is nearest to."""
+    said = flawed_masks([_labels(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
+    if scale < 1:
+        sizes = scene.photographs.scaled(scale).sizes[scene.taught].tolist()
+        small = [
+            cv2.resize(one.astype(np.int32), size, interpolation=cv2.INTER_NEAREST_EXACT)
+            for one, size in zip(said.labels, sizes, strict=True)
+        ]
+        said = said._replace(labels=small)
     nearest = [(rows @ codes.T).argmax(axis=1) for rows in said.embeddings]
     ids = [
         np.where(one < 0, -1, near[np.maximum(one, 0)])
@@ -173,7 +181,7 @@ def scored(
     views = frozen_views(
         scene.gaussians, [photographs.camera(i) for i in scene.held_out], scene.rasterize_mode
     )
-    scores, covered = ClassScores(names), []
+    scores, inside, covered = ClassScores(names), ClassScores(names), []
     for view, i in zip(views, scene.held_out, strict=True):
         if by_field is not None:
             by_pixel, in_space = class_maps(by_field[0], by_field[1], view, by_field[2], of_gaussians)
@@ -181,8 +189,10 @@ def scored(
             share = np.asarray(paint(view[0], jax.nn.one_hot(of_gaussians, len(names)), view[1])[0])
             in_space = np.where(share.max(-1) > _OPAQUE, share.argmax(-1), -1)
             by_pixel = np.full_like(in_space, -1)
-        scores.add(by_pixel, in_space, _labels(photographs, i))
-        covered.append(np.asarray(paint(view[0], jnp.ones((scene.gaussians.num, 1)), view[1])[1]) > _OPAQUE)
+        true, drawn = _labels(photographs, i), _drawn(scene, view)
+        scores.add(by_pixel, in_space, true)
+        inside.add(*(np.where(drawn, one, -1) for one in (by_pixel, in_space, true)))
+        covered.append(drawn)
     rows = [row for row in scores.rows() if row["label"] != 0]
     truth = true_labels(scene.gaussians, photographs)
     found = {f"m{name}": _mean([row[name] for row in rows]) for name in _NAMES}
@@ -193,11 +203,18 @@ def scored(
         "gaussian_iou": _mean(list(ious.values())),
         "hidden_recall": _mean(kept),
         "covered": float(np.mean(covered)),
+        "inside_miou_2d": _mean([row["iou_2d"] for row in inside.rows() if row["label"] != 0]),
+        "inside_miou_3d": _mean([row["iou_3d"] for row in inside.rows() if row["label"] != 0]),
         "things": [
             f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f} / {ious.get(row['label'], 0):.2f}"
             for row in rows
         ],
     }
+
+
+def _drawn(scene: FieldScene, view: Any) -> Bool[np.ndarray, "h w"]:
+    """Where a view shows the scene at all."""
+    return np.asarray(paint(view[0], jnp.ones((scene.gaussians.num, 1)), view[1])[1]) > _OPAQUE
 
 
 _NAMES = ("iou_2d", "iou_3d", "boundary_iou_2d", "boundary_iou_3d")

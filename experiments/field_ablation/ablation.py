@@ -30,16 +30,17 @@ SQUEEZED = {"autoencoder to 8 (as LangSplat)": 8, "autoencoder to 16 (as LangSpl
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """One variant on articulated_0 with flawed masks, at half of its resolution."""
-    scene = scaled(fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1"), SCALE)
-    names, codes = codebook_of(scene.photographs)
-    teacher, _ = flawed_teacher(scene.photographs, scene.taught, codes, seed)
+    """One variant on articulated_0 with flawed masks at half of its resolution, judged at all of it."""
+    whole = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    names, codes = codebook_of(whole.photographs)
+    teacher, _ = flawed_teacher(whole, codes, seed, scale=SCALE)
+    scene = scaled(whole, SCALE)
     variant = options["variant"]
     if variant in SQUEEZED:
         found, aside = _squeezed(scene, teacher, SQUEEZED[variant], seed)
     else:
         found, aside = learned(scene, scene.taught, teacher, replace(VARIANTS[variant], seed=seed)), 0.0
-    asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
+    asked = scored(whole, of_field(found, codes), names, (found.field, found.located, codes))
     return {
         **asked,
         "step_ms": 1e3 * found.seconds / (ITERATIONS - 1),

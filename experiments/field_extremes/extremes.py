@@ -27,6 +27,7 @@ from gsjax.methods.feature_field import (
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import take
 
+SCALE = 0.25
 BASE = FieldConfig(iterations=40, contrast_after=0.25)
 ONE_LEVEL = FeatureGridConfig(levels=1, least_resolution=16, most_resolution=16)
 
@@ -92,9 +93,10 @@ def _one_pixel(ids: np.ndarray) -> np.ndarray:
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Forty steps of one case at a quarter of the resolution, and a query of all Gaussians."""
-    scene = scaled(fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1"), 0.25)
+    scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
     _, codes = codebook_of(scene.photographs)
-    teacher, _ = flawed_teacher(scene.photographs, scene.taught, codes, seed)
+    teacher, _ = flawed_teacher(scene, codes, seed, scale=SCALE)
+    scene = scaled(scene, SCALE)
     assert isinstance(teacher, Teacher)
     scene, teacher, config = CASES[options["case"]](scene, teacher, BASE)
     cameras = [scene.photographs.camera(i) for i in scene.taught]

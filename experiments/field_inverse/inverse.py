@@ -29,11 +29,11 @@ _KEPT: dict[int, Any] = {}  # the field of each seed, distilled once
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """One way, on articulated_0 with flawed masks at half of its resolution."""
     if seed not in _KEPT:
-        scene = scaled(fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1"), SCALE)
+        scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
         names, codes = codebook_of(scene.photographs)
-        teacher, _ = flawed_teacher(scene.photographs, scene.taught, codes, seed)
-        config = FieldConfig(iterations=ITERATIONS, seed=seed)
-        _KEPT[seed] = scene, names, jnp.asarray(codes), learned(scene, scene.taught, teacher, config)
+        teacher, _ = flawed_teacher(scene, codes, seed, scale=SCALE)
+        config, small = FieldConfig(iterations=ITERATIONS, seed=seed), scaled(scene, SCALE)
+        _KEPT[seed] = scene, names, jnp.asarray(codes), learned(small, scene.taught, teacher, config)
     scene, names, codes, found = _KEPT[seed]
     field, located, way = found.field, found.located, options["way"]
     features, inverse, made_ms = features_of(field, located), None, 0.0

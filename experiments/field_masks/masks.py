@@ -36,7 +36,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     scene = scene_of(options["scene"], folder)
     names, codes = codebook_of(scene.photographs)
     flaws = NONE if options["masks"] == "true" else Flaws()
-    teacher, ids = flawed_teacher(scene.photographs, scene.taught, codes, seed, flaws)
+    teacher, ids = flawed_teacher(scene, codes, seed, flaws)
     voted = scored(scene, by_majority(scene, scene.taught, ids, len(names)), names)
     found = learned(scene, scene.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
     by_field = (found.field, found.located, codes)
@@ -44,6 +44,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     return {
         **asked,
         "voted_miou": voted["miou_3d"],
+        "voted_inside_miou": voted["inside_miou_3d"],
         "voted_mboundary_iou": voted["mboundary_iou_3d"],
         "voted_gaussian_iou": voted["gaussian_iou"],
         "gaussians": scene.gaussians.num,

@@ -29,7 +29,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
     names, codes = codebook_of(scene.photographs)
     small = scaled(scene, told["scale"])
-    teacher, _ = flawed_teacher(small.photographs, small.taught, codes, seed)
+    teacher, _ = flawed_teacher(scene, codes, seed, scale=told["scale"])
     grid = FeatureGridConfig(levels=told["levels"], log2_entries=told["log2_entries"], hidden=told["hidden"])
     config = FieldConfig(iterations=told["iterations"], channels=told["channels"], grid=grid, seed=seed)
     found = learned(small, small.taught, teacher, config)

@@ -1,0 +1,76 @@
+"""How long does a distillation take, and how much memory, at the paper's number of iterations and beyond?"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
+from timing import jitted, median_ms
+
+from gsjax.cli.field_scene import FieldScene
+from gsjax.data.photographs import Photographs
+from gsjax.methods.feature_field import FieldConfig, Teacher, gaussian_cosines
+from gsjax.scene.gaussians import concatenate, take
+
+FEW = 12  # steps where only their time is asked for
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """articulated_0 as it is, 320x240 and 5.7e4 Gaussians, all iterations; or twice as large, a few."""
+    scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
+    names, codes = codebook_of(scene.photographs)
+    teacher, _ = flawed_teacher(scene, codes, seed)
+    iterations = options["iterations"]
+    if options["size"] == "640x480":
+        scene, teacher, iterations = _doubled(scene), _enlarged(teacher), FEW
+    found = learned(scene, scene.taught, teacher, FieldConfig(iterations=iterations, seed=seed))
+    asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
+    step_s = found.seconds / (iterations - 1)
+    return {
+        "gaussians": scene.gaussians.num,
+        "step_ms": 1e3 * step_s,
+        "paper_minutes": 1500 * step_s / 60,
+        "compile_s": found.compile_seconds,
+        "memory_mb": found.memory_mb,
+        "trained": found.trained,
+        "query_ms": median_ms(jitted(gaussian_cosines), found.field, found.located, jnp.asarray(codes[:1])),
+        "miou_2d": asked["miou_2d"] if iterations > FEW else None,
+        "miou_3d": asked["miou_3d"] if iterations > FEW else None,
+        "mboundary_iou_3d": asked["mboundary_iou_3d"] if iterations > FEW else None,
+    }
+
+
+def _doubled(scene: FieldScene) -> FieldScene:
+    """Photographs of twice the size, and each Gaussian twice, a tenth of its size apart: 1.1e5 of them."""
+    gaussians = scene.gaussians
+    apart = 0.1 * jnp.exp(gaussians.log_scales)
+    twin = jax.tree.map(lambda leaf: leaf, gaussians)
+    twin = replace(twin, means=twin.means + apart)
+    both = concatenate([gaussians, twin])
+    return replace(scene, gaussians=take(both, np.arange(both.num)), photographs=_large(scene.photographs))
+
+
+def _large(photographs: Photographs) -> Photographs:
+    factors = np.array([2.0, 2.0, 1.0])
+
+    def twice(load):
+        return load and (lambda i: load(i).repeat(2, 0).repeat(2, 1))
+
+    return replace(
+        photographs,
+        sizes=2 * photographs.sizes,
+        Ks=photographs.Ks * factors[:, None],
+        load_image=twice(photographs.load_image),
+        load_labels=twice(photographs.load_labels),
+        load_depth=twice(photographs.load_depth),
+    )
+
+
+def _enlarged(teacher: Teacher) -> Teacher:
+    return teacher._replace(ids=[one.repeat(2, 0).repeat(2, 1) for one in teacher.ids])

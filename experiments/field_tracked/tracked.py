@@ -1,0 +1,88 @@
+"""Do features that were distilled once stay where they belong while the tracker moves the Gaussians?"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import equinox as eqx
+import jax
+import numpy as np
+from fields import codebook_of, flawed_teacher, learned, of_field
+from recordings import recorded
+
+from gsjax.cli import track as track_command
+from gsjax.cli.field_scene import scene_of_run
+from gsjax.cli.field_scores import ClassScores, class_maps
+from gsjax.cli.saved_run import open_run
+from gsjax.data.simulated.flawed_masks import Flaws
+from gsjax.methods.feature_field import FeatureField, FieldConfig, features_of, frozen_views
+from gsjax.methods.object_tracker import place
+
+CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, (2,), 6
+NONE = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """A recording tracked, the field of its first frame carried along, and both held against true masks."""
+    path = folder.parents[1] / "field_scenes" / f"{options['recording']}_all"
+    if not (path / "report.html").is_file():
+        track_command.run(
+            track_command.Options(
+                str(recorded(options["recording"])),
+                path,
+                cameras=CAMERAS,
+                mask_camera=MASK_CAMERA,
+                eval_cameras=HELD_OUT,
+                overwrite=True,
+            )
+        )
+    first, saved = scene_of_run(path), open_run(path)
+    names, codes = codebook_of(first.photographs)
+    teacher, _ = flawed_teacher(first, codes, seed, NONE if options["masks"] == "true" else Flaws())
+    found = learned(first, first.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
+    carried = FeatureField(
+        features_of(found.field, found.located), found.field.lift
+    )  # by Gaussian, not place
+    of_gaussians = of_field(found, codes)
+    rows, totals, cosines = [], ClassScores(names), []
+    recording = saved.recording.judged
+    for t in range(0, saved.tracking.num_frames, EVERY):
+        gaussians = eqx.tree_at(
+            lambda g: g.features, place(*saved.tracking.at(t)), None, is_leaf=lambda leaf: leaf is None
+        )
+        assert gaussians.num == len(of_gaussians)
+        at_t, sequence = ClassScores(names), recording.select(frames=slice(t, t + 1))
+        views = frozen_views(gaussians, _cameras(sequence))
+        for c, view in enumerate(views):
+            maps = class_maps(carried, None, view, codes, of_gaussians)
+            true = np.asarray(sequence.mask(0, c), np.int64)
+            drawn = maps[0] >= 0
+            inside = [np.where(drawn, one, -1) for one in (*maps, true)]
+            at_t.add(*inside)
+            totals.add(*inside)
+            cosines.append(float((maps[0] == true)[drawn].mean()))
+        things = [row for row in at_t.rows() if row["label"] != 0]
+        rows.append(float(np.nanmean([row["iou_3d"] for row in things])))
+    jax.clear_caches()
+    things = [row for row in totals.rows() if row["label"] != 0]
+    return {
+        "first_miou": rows[0],
+        "last_miou": rows[-1],
+        "least_miou": min(rows),
+        "miou_2d": float(np.nanmean([row["iou_2d"] for row in things])),
+        "miou_3d": float(np.nanmean([row["iou_3d"] for row in things])),
+        "pixels_right": float(np.mean(cosines)),
+        "things": [f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f}" for row in things],
+        "over_time": [f"{value:.3f}" for value in rows],
+        "minutes": (found.seconds + found.compile_seconds) / 60,
+        "update_hz": saved.tracking.hz,
+    }
+
+
+def _cameras(sequence: Any) -> list[Any]:
+    from gsjax.data.photographs import photographs_of
+
+    photographs = photographs_of(sequence)
+    return [photographs.camera(i) for i in range(photographs.num)]
