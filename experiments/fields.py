@@ -1,7 +1,6 @@
 """What experiments with feature fields share: fitted scenes, teachers with a segmenter's flaws, and scores
 against true labels, of pixels and of Gaussians."""
 
-import resource
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,11 @@ from gsjax.geometry.cameras import project
 from gsjax.methods.feature_field import (
     FeatureField,
     FieldConfig,
+    FieldProblem,
+    FieldState,
     Teacher,
     begin_field,
+    compiled_step,
     distill,
     finished,
     frozen_views,
@@ -33,6 +35,7 @@ from gsjax.methods.feature_field import (
 )
 from gsjax.methods.reconstruction import PRESETS
 from gsjax.perception.codebook import ClassCodebook
+from gsjax.perception.outlines import snap_outlines
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import Located, locate
 from gsjax.scene.gaussians import Gaussians
@@ -48,13 +51,9 @@ def fitted(
     """The first frame of a recording as `gsjax fit` has it, made once for all experiments."""
     path = folder.parents[1] / "field_scenes" / name
     if not (path / "report.html").is_file():
+        options.setdefault("fit", PRESETS[preset])
         told = fit_command.Options(
-            str(recorded(name)),
-            path,
-            eval_cameras=eval_cameras,
-            overwrite=True,
-            fit=PRESETS[preset],
-            **options,
+            str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options
         )
         fit_command.run(told)
     return scene_of_run(path)
@@ -90,11 +89,21 @@ def codebook_of(photographs: Photographs) -> tuple[dict[int, str], Float[np.ndar
 
 
 def flawed_teacher(
-    scene: FieldScene, codes: np.ndarray, seed: int, flaws: Flaws | None = None, scale: float = 1.0
+    scene: FieldScene,
+    codes: np.ndarray,
+    seed: int,
+    flaws: Flaws | None = None,
+    scale: float = 1.0,
+    snap: int = 0,
 ) -> tuple[Teacher, list[np.ndarray]]:
-    """What a segmenter and an encoder might have said of a scene's photographs, then made smaller by `scale`;
-    and, for a vote of labels, which code each pixel's embedding is nearest to."""
+    """What a segmenter and an encoder might have said of a scene's photographs, outlines put on edges within
+    `snap` pixels, then made smaller by `scale`; and, for a vote of labels, which code each pixel's embedding
+    is nearest to."""
     said = flawed_masks([_labels(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
+    images = (scene.photographs.image(i) for i in scene.taught)
+    said = said._replace(
+        labels=[snap_outlines(one, image, snap) for one, image in zip(said.labels, images, strict=True)]
+    )
     if scale < 1:
         sizes = scene.photographs.scaled(scale).sizes[scene.taught].tolist()
         small = [
@@ -124,7 +133,7 @@ class Learned:
         field, located: as queries take them.
         seconds: of the steps, without what compiled.
         compile_seconds: that compiling took.
-        memory_mb: most that the process had, so far.
+        memory_mb: of a step: what it is given and what it needs beside, as compiled.
         trained: how many numbers.
         losses: of the last steps, means.
     """
@@ -156,10 +165,18 @@ def learned(scene: FieldScene, which: Any, teacher: Teacher, config: FieldConfig
         located,
         seconds,
         compiling,
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        step_memory_mb(problem, state),
         sum(leaf.size for leaf in jax.tree.leaves(state.field)),
         {name: float(np.mean([info[name] for info in infos])) for name in names},
     )
+
+
+def step_memory_mb(problem: FieldProblem, state: FieldState) -> float:
+    """What a compiled step is given, and what it needs beside."""
+    batch, config = problem.views[0], problem.config
+    given = (state.field, state.optimizer, batch, jnp.asarray(0), jax.random.key(0))
+    needed = compiled_step(config).lower(*given).compile().memory_analysis()
+    return (needed.argument_size_in_bytes + needed.temp_size_in_bytes) / 2**20
 
 
 def scored(
@@ -194,21 +211,23 @@ def scored(
         inside.add(*(np.where(drawn, one, -1) for one in (by_pixel, in_space, true)))
         covered.append(drawn)
     rows = [row for row in scores.rows() if row["label"] != 0]
+    found: dict[str, Any] = {f"m{name}": _mean([row[name] for row in rows]) for name in _NAMES}
+    found |= {
+        "covered": float(np.mean(covered)),
+        "inside_miou_2d": _mean([row["iou_2d"] for row in inside.rows() if row["label"] != 0]),
+        "inside_miou_3d": _mean([row["iou_3d"] for row in inside.rows() if row["label"] != 0]),
+        "things": [f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f}" for row in rows],
+    }
+    if photographs.load_depth is None:  # where a Gaussian truly belongs is known by depth alone
+        return found
     truth = true_labels(scene.gaussians, photographs)
-    found = {f"m{name}": _mean([row[name] for row in rows]) for name in _NAMES}
     ious = {k: _iou(of_gaussians == k, truth == k, truth >= 0) for k in names if k and (truth == k).any()}
     hidden = _hidden(scene, truth)
     kept = [((of_gaussians == k) & one).sum() / one.sum() for k, one in hidden.items() if one.any()]
     return found | {
         "gaussian_iou": _mean(list(ious.values())),
         "hidden_recall": _mean(kept),
-        "covered": float(np.mean(covered)),
-        "inside_miou_2d": _mean([row["iou_2d"] for row in inside.rows() if row["label"] != 0]),
-        "inside_miou_3d": _mean([row["iou_3d"] for row in inside.rows() if row["label"] != 0]),
-        "things": [
-            f"{row['class']}: {row['iou_2d']:.2f} / {row['iou_3d']:.2f} / {ious.get(row['label'], 0):.2f}"
-            for row in rows
-        ],
+        "of_gaussians": [f"{names[k]}: {iou:.2f}" for k, iou in ious.items()],
     }
 
 
@@ -228,7 +247,9 @@ def of_field(found: Learned, codes: np.ndarray) -> Int[np.ndarray, "n"]:
 def by_majority(scene: FieldScene, which: Any, ids: list[np.ndarray], count: int) -> Int[np.ndarray, "n"]:
     """Plain lifting of the labels of pixels."""
     cameras = [scene.photographs.camera(i) for i in which]
-    return majority_labels(frozen_views(scene.gaussians, cameras, scene.rasterize_mode), ids, count)
+    return majority_labels(
+        frozen_views(scene.gaussians, cameras, scene.rasterize_mode), ids, count, scene.gaussians.num
+    )
 
 
 def true_labels(gaussians: Gaussians, photographs: Photographs) -> Int[np.ndarray, "n"]:
@@ -256,8 +277,7 @@ def _seen(
 
 
 def _hidden(scene: FieldScene, truth: Int[np.ndarray, "n"]) -> dict[int, Bool[np.ndarray, "n"]]:
-    """Of each thing, the Gaussians that the first held-out camera does not see, though it sees some of it or
-    none."""
+    """Of each thing, the Gaussians that the first held-out camera does not see."""
     _, seen = _seen(scene.gaussians, scene.photographs, scene.held_out[0])
     return {int(k): (truth == k) & ~seen for k in np.unique(truth) if k > 0}
 

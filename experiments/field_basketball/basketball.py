@@ -43,7 +43,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     found = learned(scene, taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
     return {
-        **{name: asked[name] for name in asked if name.startswith("m")},
+        **asked,
         "voted_miou": voted["miou_3d"],
         "voted_mboundary_iou": voted["mboundary_iou_3d"],
         "things": asked["things"],

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher
+from fields import codebook_of, fitted, flawed_teacher, true_labels
 
 from gsjax.cli.field_scene import FieldScene, scaled
 from gsjax.methods.feature_field import (
@@ -23,6 +23,7 @@ from gsjax.methods.feature_field import (
     distill,
     finished,
     gaussian_cosines,
+    teacher_of_objects,
 )
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import take
@@ -74,8 +75,11 @@ CASES: dict[str, Any] = {
     "gamma of the contrast 1e4": _config(contrast_gamma=1e4),
     "contrast alone": _config(weights=FieldWeightsConfig(rec=0.0, cos=0.0, tv=0.0)),
     "strips of one row of tiles": _config(strip_megabytes=0.1),
-    "embeddings of length 1e6": _teacher(lambda t: t._replace(codebook=t.codebook * 1e6)),
-    "embeddings of length 1e-6": _teacher(lambda t: t._replace(codebook=t.codebook * 1e-6)),
+    "embeddings of length 1e6": _teacher(lambda t: _longer(t, 1e6)),
+    "embeddings of length 1e-6": _teacher(lambda t: _longer(t, 1e-6)),
+    "one embedding 1e6 times as long": _teacher(
+        lambda t: _longer(t, np.r_[1e6, np.ones(len(t.codebook) - 1)])
+    ),
     "all embeddings alike": _teacher(lambda t: t._replace(codebook=np.ones_like(t.codebook))),
     "one pixel taught": _teacher(lambda t: t._replace(ids=[_one_pixel(ids) for ids in t.ids])),
     "one Gaussian": _scene(lambda scene: _first(scene, 1)),
@@ -83,6 +87,11 @@ CASES: dict[str, Any] = {
     "a Gaussian 1000 km away": _scene(_far),
     "100 Gaussians without a place": _scene(_unplaced),
 }
+
+
+def _longer(teacher: Teacher, factors: Any) -> Teacher:
+    rows = (np.asarray(factors).reshape(-1, 1) * teacher.codebook).astype(np.float32)
+    return teacher_of_objects(teacher.ids, [rows] * len(teacher.ids))
 
 
 def _one_pixel(ids: np.ndarray) -> np.ndarray:
@@ -109,6 +118,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     field = finished(problem, state)
     located = locate(field.encoding, jnp.asarray(scene.gaussians.means))
     cosines = np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)))
+    labels = true_labels(scene.gaussians, scene.photographs)
+    right = (cosines.argmax(1) == labels)[labels > 0]
     placed = np.isfinite(np.asarray(scene.gaussians.means)).all(axis=1)
     return {
         "finite_losses": float(np.isfinite(losses).mean()),
@@ -117,5 +128,6 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "last_loss": losses[-1],
         "finite_field": float(np.mean([np.isfinite(leaf).all() for leaf in jax.tree.leaves(field)])),
         "finite_cosines": float(np.isfinite(cosines[placed]).mean()),
+        "right": float(right.mean()) if len(right) else None,
         "largest_cosine": float(np.abs(cosines[placed]).max()),
     }

@@ -14,7 +14,7 @@ from gsjax.cli.comparison import Aspect, Comparison, Group, compare
 from gsjax.cli.comparison_pictures import shows_the_same, write_strip
 from gsjax.cli.messages import counted
 from gsjax.cli.report import Media, Table, format_number, write_report
-from gsjax.cli.run_folder import fresh_folder, is_run
+from gsjax.cli.run_folder import expect_ours, fresh_folder, is_run
 from gsjax.cli.run_records import read_record
 from gsjax.io.atomic import write_json
 from gsjax.viz.plots import fit_curves, save
@@ -22,6 +22,7 @@ from gsjax.viz.plots import fit_curves, save
 _ARROWS = {"more": " ↑", "less": " ↓", None: ""}
 _PICTURES = 6  # held-out views of a group in the report
 _JSON = "comparison.json"
+_FOLDERS = {"plots": "curves_*.svg", "pictures": "*_[0-9][0-9][0-9][0-9].png"}  # and what is in them
 _LOG_WIDTH = 200
 
 
@@ -66,14 +67,16 @@ def _check_folder(out: Path) -> None:
             f"--out {out}: expected a new folder, an empty one or an earlier comparison, found {what}; "
             "name another"
         )
+    for name, written in _FOLDERS.items():
+        expect_ours(out / name, (written,))
 
 
 def _write(out: Path, found: Comparison) -> None:
     """Writes report.html with its curves and pictures, and comparison.json."""
     out.mkdir(parents=True, exist_ok=True)
     plots, strips = [], []
-    for name in ("plots", "pictures"):
-        fresh_folder(out / name)
+    for name, written in _FOLDERS.items():
+        fresh_folder(out / name, (written,))
     for i, group in enumerate(found.groups):
         of = f"{group.dataset}: " if len(found.groups) > 1 else ""
         if not group.views:

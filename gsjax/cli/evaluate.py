@@ -19,7 +19,7 @@ from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
 from gsjax.cli.photographs import photographs_of_run, read_views, split
 from gsjax.cli.report import Media, Table, format_number, write_report
-from gsjax.cli.run_folder import fresh_folder
+from gsjax.cli.run_folder import replaced_folder
 from gsjax.cli.run_records import EVALUATION, Record, digest, read_record
 from gsjax.cli.summary import Column
 from gsjax.data.errors import DataError
@@ -43,6 +43,7 @@ COLUMNS = (
     Column("depth", "depth_mm", "mm", 1),
 )
 Color = tuple[float, float, float]
+_WRITTEN = (EVALUATION.name, "report.html", "renders")
 _PICTURES = 12  # in the report, at most
 _HELD_OUT, _TRAIN = "held out", "train"
 _PER_PHOTOGRAPH = {"exposure": "an exposure", "refine_poses": "a pose"}
@@ -92,33 +93,34 @@ def run(options: Options) -> int:
         gaussians, _ = read_ply(record.path / "scene.ply")
         photographs, indices, held_out = _choose(options, record)
         views = read_views(photographs.select(indices.tolist()), console)
-        folder, rows = fresh_folder(record.path / EVALUATION.parent), []
-        exposed = bool(record.config["fit"].get("exposure"))
-        looks = _looks(record, gaussians, views, photographs.background)
-        for seen in track(looks, "scoring", len(views), console=console, transient=True):
-            picture, i = Path("renders", f"{len(rows):06d}.png"), len(rows)
-            write_panel(folder / picture, seen)
-            row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
-            rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
-        _say_what_is_missing(notes, record, rows, views, weights)
-        known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
-        found = {
-            "kind": "eval",
-            "dataset": photographs.name,
-            "complete": record.complete,
-            "scene_sha256": digest(record.path / "scene.ply"),
-            "num_gaussians": gaussians.num,
-            "lpips": known or {"absent": NO_LPIPS},
-            "mean": {
-                kind: mean_scores([row for row in rows if row["split"] == kind], [c.key for c in COLUMNS])
-                for kind in dict.fromkeys(row["split"] for row in rows)
-            },
-            "views": rows,
-            "machine": describe_machine(),
-            "notes": notes.all,
-        }
-        _write_page(folder, record, found)
-        write_json(record.path / EVALUATION, found)
+        folder, rows = record.path / EVALUATION.parent, []
+        with replaced_folder(folder, _WRITTEN) as new:
+            exposed = bool(record.config["fit"].get("exposure"))
+            looks = _looks(record, gaussians, views, photographs.background)
+            for seen in track(looks, "scoring", len(views), console=console, transient=True):
+                picture, i = Path("renders", f"{len(rows):06d}.png"), len(rows)
+                write_panel(new / picture, seen)
+                row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
+                rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
+            _say_what_is_missing(notes, record, rows, views, weights)
+            known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
+            found = {
+                "kind": "eval",
+                "dataset": photographs.name,
+                "complete": record.complete,
+                "scene_sha256": digest(record.path / "scene.ply"),
+                "num_gaussians": gaussians.num,
+                "lpips": known or {"absent": NO_LPIPS},
+                "mean": {
+                    kind: mean_scores([row for row in rows if row["split"] == kind], [c.key for c in COLUMNS])
+                    for kind in dict.fromkeys(row["split"] for row in rows)
+                },
+                "views": rows,
+                "machine": describe_machine(),
+                "notes": notes.all,
+            }
+            _write_page(new, record, found)
+            write_json(new / EVALUATION.name, found)
     _print(found, folder)
     return 0
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import cv2
@@ -17,7 +18,8 @@ from rich.progress import track
 from gsjax.cli.messages import Notes
 from gsjax.cli.object_query import Answer, Asked, ask, progress, show
 from gsjax.cli.outputs import frame_rate, write_png
-from gsjax.cli.run_folder import fresh_folder
+from gsjax.cli.recording import Recording
+from gsjax.cli.run_folder import replaced_folder
 from gsjax.cli.saved_run import SavedRun
 from gsjax.cli.views import views
 from gsjax.geometry.cameras import project
@@ -28,6 +30,7 @@ from gsjax.methods.grasping import Grasp, Gripper, best_grasp
 from gsjax.optim.compiler import host_options
 from gsjax.viz.colors import captioned
 
+_WRITTEN = ("grasps.npz", "video.mp4", "frame_*.png")
 NOT_THERE = 3  # exit code: no frame has a feasible grasp
 _REACH = 0.35  # what never comes nearer to the object's centroid is no obstacle, metres
 _FEASIBLE, _IN_THE_WAY = (84, 222, 130), (235, 110, 90)
@@ -66,31 +69,45 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         saved, answer = ask(options, console, notes)
         recording = saved.seen_by(options.camera)
-        grasps = find_grasps(options, saved, answer, console)
-        folder = fresh_folder(saved.path / "grasp")
-        times = recording.tracked.times[: saved.tracking.num_frames]
-        write_npz(
-            folder / "grasps.npz",
-            {
-                "times": times,
-                "poses": grasps.pose,
-                "widths": grasps.width,
-                "scores": grasps.score,
-                "feasible": grasps.feasible,
-            },
-        )
-        middle = saved.tracking.num_frames // 2
-        with VideoWriter(folder / "video.mp4", frame_rate(times)) as video:
-            for view in progress(views(saved.tracking, recording), saved, console):
-                picture = show(view, view.groups == answer.group, answer.group)
-                camera = recording.tracked.viewmats[view.t, 0], recording.tracked.Ks[view.t, 0]
-                now = jax.tree.map(lambda a, t=view.t: a[t], grasps)
-                zoom = picture.shape[1] / view.groups.shape[1]
-                picture = draw_grasp(picture, now, options.gripper, *camera, zoom)
-                video.write(picture)
-                if view.t == middle:
-                    write_png(folder / f"frame_{recording.tracked.frame_ids[view.t]:06d}.png", picture)
+        folder = saved.path / "grasp"
+        with replaced_folder(folder, _WRITTEN) as new:
+            grasps = find_grasps(options, saved, answer, console)
+            _write(new, grasps, options.gripper, saved, answer, recording, console)
     return _report(grasps, answer, folder)
+
+
+def _write(
+    folder: Path,
+    grasps: Grasp,
+    gripper: Gripper,
+    saved: SavedRun,
+    answer: Answer,
+    recording: Recording,
+    console: Console,
+) -> None:
+    """Writes grasps.npz, the video and one of its frames."""
+    times = recording.tracked.times[: saved.tracking.num_frames]
+    write_npz(
+        folder / "grasps.npz",
+        {
+            "times": times,
+            "poses": grasps.pose,
+            "widths": grasps.width,
+            "scores": grasps.score,
+            "feasible": grasps.feasible,
+        },
+    )
+    middle = saved.tracking.num_frames // 2
+    with VideoWriter(folder / "video.mp4", frame_rate(times)) as video:
+        for view in progress(views(saved.tracking, recording), saved, console):
+            picture = show(view, view.groups == answer.group, answer.group)
+            camera = recording.tracked.viewmats[view.t, 0], recording.tracked.Ks[view.t, 0]
+            now = jax.tree.map(lambda a, t=view.t: a[t], grasps)
+            zoom = picture.shape[1] / view.groups.shape[1]
+            picture = draw_grasp(picture, now, gripper, *camera, zoom)
+            video.write(picture)
+            if view.t == middle:
+                write_png(folder / f"frame_{recording.tracked.frame_ids[view.t]:06d}.png", picture)
 
 
 def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Console) -> Grasp:

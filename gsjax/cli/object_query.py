@@ -16,7 +16,7 @@ from rich.table import Table
 
 from gsjax.cli.messages import Notes
 from gsjax.cli.outputs import frame_rate, write_png
-from gsjax.cli.run_folder import fresh_folder
+from gsjax.cli.run_folder import OF_QUERY, replaced_folder
 from gsjax.cli.saved_run import SavedRun, open_run
 from gsjax.cli.views import View, views
 from gsjax.io.atomic import write_json, write_npz
@@ -80,30 +80,31 @@ def ask_for_object(options: Asked, console: Console) -> None:
         saved, answer = ask(options, console, notes)
         recording = saved.seen_by(options.camera)
         camera = recording.tracked.camera_ids[0]
-        folder = fresh_folder(saved.path / "query")
-        write_npz(
-            folder / "selection.npz",
-            {
-                "indices": answer.rows,
-                "scores": np.array(list(answer.scores.values()), np.float32),
-                "names": np.array(list(answer.scores)),
-                "means": saved.tracking.means()[:, answer.rows],
-                "times": recording.tracked.times[: saved.tracking.num_frames],
-            },
-        )
-        pixels = []
-        with VideoWriter(folder / "video.mp4", frame_rate(recording.tracked.times)) as video:
-            for view in progress(views(saved.tracking, recording), saved, console):
-                mask = view.groups == answer.group
-                pixels.append(int(mask.sum()))
-                frame_id = recording.tracked.frame_ids[view.t]
-                write_png(folder / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
-                video.write(show(view, mask, answer.group))
-        told = {"text": options.text, "encoder": options.encoder, "camera": camera}
-        told |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
-        told |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
-        told |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
-        write_json(folder / "query.json", told)
+        folder = saved.path / "query"
+        with replaced_folder(folder, OF_QUERY) as new:
+            write_npz(
+                new / "selection.npz",
+                {
+                    "indices": answer.rows,
+                    "scores": np.array(list(answer.scores.values()), np.float32),
+                    "names": np.array(list(answer.scores)),
+                    "means": saved.tracking.means()[:, answer.rows],
+                    "times": recording.tracked.times[: saved.tracking.num_frames],
+                },
+            )
+            pixels = []
+            with VideoWriter(new / "video.mp4", frame_rate(recording.tracked.times)) as video:
+                for view in progress(views(saved.tracking, recording), saved, console):
+                    mask = view.groups == answer.group
+                    pixels.append(int(mask.sum()))
+                    frame_id = recording.tracked.frame_ids[view.t]
+                    write_png(new / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
+                    video.write(show(view, mask, answer.group))
+            told = {"text": options.text, "encoder": options.encoder, "camera": camera}
+            told |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
+            told |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
+            told |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
+            write_json(new / "query.json", told)
     hidden = sum(count == 0 for count in pixels)
     unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
     score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"

@@ -3,8 +3,11 @@
 import dataclasses
 import enum
 import json
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,9 @@ _FOLDERS = (
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
 _OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
+OF_QUERY = ("query.json", "selection.npz", "masks", "video.mp4", "overview.png")
+OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
+"""What `gsjax query` writes into its folder."""
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
@@ -233,12 +239,67 @@ class RunFolder:
         write_npz(self.path / "trajectory.npz", arrays)
 
 
-def fresh_folder(path: Path) -> Path:
-    """An empty folder; what an earlier question left there is removed."""
+def fresh_folder(path: Path, written: Sequence[str]) -> Path:
+    """An empty folder; what gsjax left there earlier is removed.
+
+    Args:
+        path: where it belongs.
+        written: what gsjax writes there, names or patterns; the first is always there.
+
+    Raises:
+        FileExistsError: something else is there; nothing of it is touched.
+    """
+    path = expect_ours(path, written)
     if path.exists():
         shutil.rmtree(path)
-    path.mkdir()
+    path.mkdir(parents=True)
     return path
+
+
+@contextmanager
+def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
+    """A new folder to write into, which takes the place of what gsjax left at `path` earlier when the block
+    ends well. Until then, and after an exception (Ctrl-C too), that is as it was.
+
+    Args, raises: as `fresh_folder`.
+    """
+    path = expect_ours(path, written)
+    new, old = (path.with_name(f".{path.name}.{os.getpid()}.partial{which}") for which in ("", "_old"))
+    for stale in (new, old):  # of a process that was killed, and had our number
+        shutil.rmtree(stale, ignore_errors=True)
+    try:
+        new.mkdir(parents=True)
+    except OSError as error:
+        raise type(error)(f"{path}: cannot write beside it ({error.strerror})") from error
+    try:
+        yield new
+        if path.exists():
+            path.rename(old)
+        new.rename(path)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        if old.exists():
+            shutil.rmtree(old) if path.exists() else old.rename(path)
+
+
+def expect_ours(path: Path, written: Sequence[str]) -> Path:
+    """The folder itself where `path` is a link, if it may be replaced.
+
+    Raises:
+        FileExistsError: something is there that gsjax did not write.
+    """
+    path = path.resolve()
+    if not path.exists():
+        return path
+    entries = sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
+    others = [n for n in entries if not n.startswith(".") and not any(fnmatch(n, w) for w in written)]
+    if path.is_dir() and not others and (not entries or any(fnmatch(n, written[0]) for n in entries)):
+        return path
+    found = "a file" if not path.is_dir() else (others or [f"no {written[0]}"])[0]
+    raise FileExistsError(
+        f"{path}: expected what gsjax writes there or nothing, for it is replaced; found {found}; move it "
+        "elsewhere"
+    )
 
 
 def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:

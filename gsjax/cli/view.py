@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,9 +11,11 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from gsjax.cli.field_run import Whereabouts
 from gsjax.cli.messages import Notes, say_error, stage
 from gsjax.cli.outputs import write_png
 from gsjax.cli.viewables import open_viewable
+from gsjax.io.atomic import write_new
 from gsjax.optim.compiler import host_options
 from gsjax.viz.viewer import Viewable, Viewer, open_viewer
 from gsjax.viz.viewer.server import PORT, is_loopback, load_viser
@@ -25,8 +28,9 @@ _NUMBERED = re.compile(r"(\d+)_")
 class Options:
     """What `gsjax view` is told."""
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE.ply")]
-    """Folder of a run of `gsjax fit`, `gsjax track` or `gsjax parts`, or a PLY file of Gaussians."""
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE.ply")]
+    """Folder of a run of `gsjax fit`, `gsjax track` or `gsjax parts`; of a field (`gsjax distill`), which can
+    then be asked, as can that of a fit; or a PLY file of Gaussians."""
     host: str = "127.0.0.1"
     """Address to listen on. Only this machine can look unless it is another than the default."""
     port: int | None = None
@@ -35,6 +39,12 @@ class Options:
     """The browser gets so many Gaussians at most, the most opaque ones; our render has all."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """Which way is up; as photographs were held, else z, unless given."""
+    scene: Path | None = None
+    """Of a field: the PLY file of its scene, where it is now."""
+    images: str | None = None
+    """Of a field or a fit: where the photographs are now."""
+    weights: Path | None = None
+    """Of a field: the folder of CLIP's weights, where it is now."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
@@ -52,7 +62,8 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         with stage(console, f"reading {options.path}"):
-            scene, folder = open_viewable(options.path, notes)
+            now = Whereabouts(options.scene, options.images, options.weights)
+            scene, folder = open_viewable(options.path, notes, now)
         if options.up != "auto":
             scene = replace(scene, up=_UP[options.up])
         with open_viewer(
@@ -73,10 +84,10 @@ def run(options: Options) -> int:
 
 def _say(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -> None:
     """Where it can be looked at, and by whom."""
-    count = scene.gaussians.num
-    if count > options.max_gaussians:
+    num = scene.gaussians.num
+    if num > options.max_gaussians:
         notes.warn(
-            f"the browser gets the {options.max_gaussians} most opaque of {count} Gaussians "
+            f"the browser gets the {options.max_gaussians} most opaque of {num} Gaussians "
             "(--max-gaussians); our render has all"
         )
     if options.port is None and viewer.port != PORT:
@@ -107,20 +118,7 @@ def screenshots(folder: Path) -> Callable[[str, np.ndarray], Path]:
     def save(kind: str, picture: np.ndarray) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         numbers = [int(found[1]) for file in folder.iterdir() if (found := _NUMBERED.match(file.name))]
-        number = max(numbers, default=0)
-        while True:
-            number += 1
-            path = folder / f"{number:04d}_{kind}.png"
-            try:
-                path.open("x").close()  # the number is ours, whoever else saves here
-                break
-            except FileExistsError:
-                continue
-        try:
-            write_png(path, picture)
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
-        return path
+        names = (folder / f"{number:04d}_{kind}.png" for number in count(max(numbers, default=0) + 1))
+        return write_new(names, lambda path: write_png(path, picture))
 
     return save

@@ -4,7 +4,7 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,28 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_new(paths: Iterable[Path], write: Callable[[Path], None]) -> Path:
+    """Write to the first of the paths that nothing has, and return it. None is written over, whoever else
+    writes there, and where `write` fails nothing is left.
+
+    Args:
+        paths: as many as it may take; their folder is there.
+        write: puts a file at a path.
+    """
+    for path in paths:
+        try:
+            path.open("x").close()  # the name is ours
+        except FileExistsError:
+            continue
+        try:
+            write(path)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return path
+    raise FileExistsError("paths: expected one that nothing has, found none")
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:

@@ -44,12 +44,14 @@ class PlyReport:
         stored: rows in the file.
         culled: rows left out, for a value that is NaN or infinite or a quaternion of no length.
         extra: properties that were not read.
+        rows: of the file, one for each Gaussian returned.
         labels: int32 label of each Gaussian returned, or None where the file has no labels.
     """
 
     stored: int
     culled: int
     extra: tuple[str, ...]
+    rows: Int[np.ndarray, "N"]
     labels: Int[np.ndarray, "N"] | None = None
 
 
@@ -121,13 +123,15 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
         gaussians, known = _uncompressed(path, vertices)
     names = vertices.dtype.names or ()
     valid = valid_rows(gaussians)
+    rows = np.flatnonzero(valid)
     report = PlyReport(
         stored=len(vertices),
         culled=int(np.sum(~valid)),
         extra=tuple(name for name in names if name not in {*known, "label"}),
-        labels=np.asarray(vertices["label"])[valid].astype(np.int32) if "label" in names else None,
+        rows=rows,
+        labels=np.asarray(vertices["label"])[rows].astype(np.int32) if "label" in names else None,
     )
-    return take(gaussians, np.flatnonzero(valid)), report
+    return take(gaussians, rows), report
 
 
 def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]]:

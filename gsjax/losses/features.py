@@ -82,6 +82,25 @@ def cosine_error(likeness: Likeness) -> Float[Array, "*pixels"]:
     return 1 - jnp.where(there, product / lengths, 0.0)
 
 
+def cycle_error(
+    low: Float[Array, "n c"],
+    high: Float[Array, "n d"],
+    weights: Float[Array, "d c"],
+    inverse: Float[Array, "c d"],
+) -> Float[Array, "n"]:
+    """L_cyc of each pixel or Gaussian (eq. 9): |W' F - F'_low|_1 + |W F'_low - F|_1.
+
+    Args:
+        low: F'_low, in the field's channels.
+        high: F, in the teacher's.
+        weights: W, from the former to the latter.
+        inverse: W', the way back.
+    """
+    back = jnp.matmul(high, inverse.T, precision="highest") - low
+    forth = jnp.matmul(low, weights.T, precision="highest") - high
+    return jnp.abs(back).sum(axis=-1) + jnp.abs(forth).sum(axis=-1)
+
+
 def max_pooled(features: Float[Array, "h w c"], edge: int) -> Float[Array, "h_ w_ c"]:
     """The largest of each channel in windows of `edge` x `edge` pixels; what is left over at the far sides is
     left out."""

@@ -1,8 +1,9 @@
 """Views of Gaussians that stand still: projected and listed once, painted as often as their values change.
 
 Where values alone train, as features do on a scene that somebody else has fitted, a render would project,
-sort and list the same Gaussians in every step. What it finds is kept here instead, 24 bytes a Gaussian and 4
-a pair. An image of many channels need not be there as a whole either: a strip of its tile rows can be
+sort and list the same Gaussians in every step. What it finds is kept here instead, 28 bytes a Gaussian that
+the view shows and 4 a pair. Those that it does not show, for they are beside it or behind others, need no
+values. An image of many channels need not be there as a whole either: a strip of its tile rows can be
 painted, and used up, after the other.
 """
 
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.binning import bin_gaussians
 from gsjax.rasterize.compositing import Lists, Splats
@@ -27,14 +28,17 @@ class FrozenView(NamedTuple):
     """What a camera sees of N Gaussians, whatever they are painted with; or a strip of it.
 
     Attributes:
-        means2d, conics, opacities: as projected, in pixels of the image or of the strip.
-        ids: Gaussians of all tiles' lists, front to back, no further than they are read.
+        rows: which of the N are shown, in the order in which tiles list them; views are filled up to one
+            length by the first of the N, which these lists do not have.
+        means2d, conics, opacities: of these, as projected, in pixels of the image or of the strip.
+        ids: places in `rows`, of all tiles' lists, front to back, no further than they are read.
         starts, counts: of each tile's list in `ids`.
     """
 
-    means2d: Float[Array, "*views n 2"]
-    conics: Float[Array, "*views n 3"]
-    opacities: Float[Array, "*views n"]
+    rows: Int[Array, "*views seen"]
+    means2d: Float[Array, "*views seen 2"]
+    conics: Float[Array, "*views seen 3"]
+    opacities: Float[Array, "*views seen"]
     ids: Int[Array, "*views pairs"]
     starts: Int[Array, "*views tiles"]
     counts: Int[Array, "*views tiles"]
@@ -61,11 +65,18 @@ def freeze_views(
     """
     scene = (means, quats, scales, opacities)
     plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
-    views = [_freeze(*scene, viewmat, K, plan) for viewmat, K in zip(viewmats, Ks, strict=True)]
-    ends = [int((view.starts + view.counts).max(initial=0)) for view in views]
-    pairs = max([1, *ends])
-    kept = [jax.device_get(view._replace(ids=view.ids[:pairs])) for view in views]
-    return jax.tree.map(lambda *a: jnp.asarray(np.stack(a)), *kept), plan
+    frozen = [_freeze(*scene, viewmat, K, plan) for viewmat, K in zip(viewmats, Ks, strict=True)]
+    if any(bool(overflow) for _, overflow in frozen):
+        raise RuntimeError("a plan that was made for these views did not hold them; please report this")
+    shown = [_shown(jax.device_get(view)) for view, _ in frozen]
+    seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
+
+    def filled_up(name: str, a: np.ndarray) -> np.ndarray:
+        most = {"ids": pairs, "starts": len(a), "counts": len(a)}.get(name, seen)
+        return np.concatenate([a, np.zeros((most - len(a), *a.shape[1:]), a.dtype)])
+
+    stacked = {n: np.stack([filled_up(n, getattr(view, n)) for view in shown]) for n in FrozenView._fields}
+    return jax.tree.map(jnp.asarray, FrozenView(**stacked)), plan
 
 
 def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
@@ -84,10 +95,18 @@ def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: in
 def paint(
     view: FrozenView, values: Float[Array, "n d"], plan: Plan
 ) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
-    """The image of one view, sum_i w_i v_i without background, and its alphas. Differentiable by the values.
+    """The image of one view, sum_i w_i v_i without background, and its alphas. Differentiable by the values,
+    which are those of all Gaussians.
 
     The weights are those of `gsjax.rasterization`, so the image is too.
     """
+    return paint_shown(view, values[view.rows], plan)
+
+
+def paint_shown(
+    view: FrozenView, values: Float[Array, "seen d"], plan: Plan
+) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
+    """As `paint`, with the values of `view.rows` alone."""
     view = jax.lax.stop_gradient(view)
     splats = Splats(view.means2d, view.conics, view.opacities, values)
     lists = Lists(view.ids, view.starts, view.counts)
@@ -103,12 +122,31 @@ def _untiled(
     return image.reshape(plan.tiles_y * edge, plan.tiles_x * edge, -1)[: plan.height, : plan.width]
 
 
+def _shown(view: FrozenView) -> FrozenView:
+    """Without the Gaussians that no list has, and lists one after another. On the host."""
+    counts, total = view.counts, int(view.counts.sum())
+    starts = np.cumsum(counts) - counts
+    ids = view.ids[np.repeat(view.starts - starts, counts) + np.arange(total)]
+    there, first, place = np.unique(ids, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # tile by tile: what is painted together lies together
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    rows = there[order]
+    return FrozenView(
+        rows.astype(np.int32),
+        *(getattr(view, name)[rows] for name in ("means2d", "conics", "opacities")),
+        rank[place].astype(np.int32),
+        starts.astype(np.int32),
+        counts,
+    )
+
+
 @partial(jax.jit, static_argnames="plan")
-def _freeze(means, quats, scales, opacities, viewmat, K, plan: Plan) -> FrozenView:
+def _freeze(means, quats, scales, opacities, viewmat, K, plan: Plan) -> tuple[FrozenView, Bool[Array, ""]]:
     usable = jnp.ones(len(means), bool)
     projected = project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan)
     binned = bin_gaussians(projected, None, plan)
     splats = Splats(projected.means2d, projected.conics, projected.opacities, jnp.ones((len(means), 1)))
     *_, reads = composite(splats, Lists(binned.ids, binned.starts, binned.counts), None, plan)
     shapes = (projected.means2d, projected.conics, projected.opacities)
-    return FrozenView(*shapes, binned.ids, binned.starts, reads)
+    return FrozenView(jnp.arange(len(means)), *shapes, binned.ids, binned.starts, reads), binned.overflow

@@ -18,6 +18,7 @@ ones they share entries by the paper's hash (eq. 4).
 """
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
@@ -144,9 +146,7 @@ class FeatureGrid(eqx.Module):
 
     def encode(self, located: Located) -> Float[Array, "N features"]:
         """What the network is given: the interpolated features of all levels; 0 where a position is NaN."""
-        # As a sum of products, which XLA fuses with the gather, it takes two to nine times as long on a CPU.
-        near = self.table[located.indices]
-        found = jnp.einsum("nlc,nlcf->nlf", located.weights, near, precision="highest")
+        found = _interpolated(self.table, located.weights, located.indices)
         return found.reshape(len(found), -1)
 
 
@@ -201,6 +201,34 @@ def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
     weights = jnp.stack([x * y * z for x, y, z in product(*along)], axis=-1)
     weights = jnp.where(valid[:, None, None], weights, 0.0)
     return Located(_entries(grid.config, cells.astype(jnp.uint32)), weights, valid)
+
+
+@jax.custom_jvp
+def _interpolated(
+    table: Float[Array, "entries F"], weights: Float[Array, "N L 8"], indices: Int[Array, "N L 8"]
+) -> Float[Array, "N L F"]:
+    """Features between the vertices. One vertex after another, and positions along the last axis, XLA:CPU
+    fuses gather, product and sum, a sixth of the time of a gather that is written out; but not on the way
+    back, for which the derivative has the other form."""
+    columns, found = table.T, jnp.zeros((), table.dtype)
+    for weight, rows in zip(
+        jnp.moveaxis(weights, (2, 1), (0, 1)), jnp.moveaxis(indices, (2, 1), (0, 1)), strict=True
+    ):
+        found += weight * columns.at[:, rows].get(mode="promise_in_bounds")
+    return found.transpose(2, 1, 0)
+
+
+@partial(_interpolated.defjvp, symbolic_zeros=True)
+def _interpolated_jvp(primals, tangents):
+    table, weights, indices = primals
+    d_table, d_weights, _ = tangents
+    found = _interpolated(*primals)
+    turned = jnp.zeros_like(found)
+    if type(d_table) is not SymbolicZero:
+        turned += jnp.einsum("nlc,nlcf->nlf", weights, d_table[indices], precision="highest")
+    if type(d_weights) is not SymbolicZero:
+        turned += jnp.einsum("nlc,nlcf->nlf", d_weights, table[indices], precision="highest")
+    return found, turned
 
 
 def _entries(config: FeatureGridConfig, cells: UInt32[Array, "N L 3"]) -> Int[Array, "N L 8"]:

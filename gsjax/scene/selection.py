@@ -1,18 +1,34 @@
 """What is done with some of a scene's Gaussians: taken out, tinted, put elsewhere."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.spherical_harmonics import SH_C0, rgb_to_sh0
-from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.gaussians import Gaussians
 
 _LUMA = (0.2126, 0.7152, 0.0722)  # of linear RGB (ITU-R BT.709), here of colours as they are
+_DARK = 0.02  # a mean luma of which shades are noise
+_INVISIBLE = -40.0  # a logit
 
 
-def without(gaussians: Gaussians, selected: Bool[Array, "n"]) -> Gaussians:
-    """All others. Outside of a trace."""
-    return take(gaussians, ~jnp.asarray(selected))
+def only(gaussians: Gaussians, selected: Bool[Array | np.ndarray, "n"]) -> Gaussians:
+    """Those alone, in their order. On the host, where another number of them compiles nothing."""
+    rows = np.flatnonzero(selected)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), gaussians)
+
+
+def without(gaussians: Gaussians, selected: Bool[Array | np.ndarray, "n"]) -> Gaussians:
+    """All others; as `only`."""
+    return only(gaussians, ~np.asarray(selected))
+
+
+def hidden(gaussians: Gaussians, selected: Bool[Array, "n"]) -> Gaussians:
+    """As many Gaussians, of which the selected ones cannot be seen: it draws as `without` does."""
+    logits = jnp.where(selected, _INVISIBLE, gaussians.logit_opacities)
+    return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 def tinted(gaussians: Gaussians, selected: Bool[Array, "n"], color: Float[Array, "3"]) -> Gaussians:
@@ -22,11 +38,13 @@ def tinted(gaussians: Gaussians, selected: Bool[Array, "n"], color: Float[Array,
     Args:
         gaussians: the scene.
         selected: whose colour changes.
-        color: RGB, 0 to 1: what the selected ones are on average.
+        color: RGB, 0 to 1: what the selected ones are on average, but for shades brighter than 1. All of a
+            black thing have this colour, for what shades it has are noise.
     """
     luma = jnp.clip(0.5 + SH_C0 * gaussians.sh0[:, 0], 0, 1) @ jnp.asarray(_LUMA, gaussians.sh0.dtype)
     mean = jnp.sum(jnp.where(selected, luma, 0)) / jnp.maximum(jnp.sum(selected), 1)
-    rgb = jnp.clip(jnp.asarray(color) * (luma / jnp.maximum(mean, 1e-3))[:, None], 0, 1)
+    shades = jnp.where(mean < _DARK, 1.0, luma / jnp.maximum(mean, _DARK))
+    rgb = jnp.clip(jnp.asarray(color) * shades[:, None], 0, 1)
     sh0 = jnp.where(selected[:, None, None], rgb_to_sh0(rgb)[:, None], gaussians.sh0)
     found = eqx.tree_at(lambda g: g.sh0, gaussians, sh0)
     if gaussians.shN is None:

@@ -44,6 +44,21 @@ def test_a_third_of_the_views_overlooks_each_thing_and_all_of_them_a_speck(seed)
         np.testing.assert_array_equal(label[true == 0], 0)
 
 
+def test_of_few_views_flaws_come_by_chance_as_often_as_asked():
+    counts = np.zeros(2)
+    for seed in range(100):
+        said = " ".join(flawed_masks(masks(2), CODES, seed, Flaws(outline=0, missing=0.0)).said)
+        counts += said.count("are one"), said.count("is two")
+    assert (np.abs(counts / 200 - 0.2) < 0.08).all()  # standard deviation 0.03
+
+
+def test_what_is_overlooked_can_be_said_to_be_background():
+    flaws = Flaws(outline=0, merged=0.0, split=0.0, missing_label=0)
+    for label, true in zip(flawed_masks(masks(), CODES, 0, flaws).labels, masks(), strict=True):
+        assert not (label < 0).any()
+        assert set(np.unique(label[label != true])) <= {0}
+
+
 def test_nothing_is_overlooked_everywhere():
     found = flawed_masks(masks(2), CODES, 0, Flaws(outline=0, merged=0.0, split=0.0, missing=1.0))
     for k in (1, 2, 3):
@@ -69,7 +84,7 @@ def test_a_split_thing_has_a_piece_that_looks_half_like_another():
     assert len(split) == 2
     for v in split:
         cosines = np.sort(found.embeddings[v][5] @ CODES.T)
-        np.testing.assert_allclose(cosines[-2:], 0.5**0.5, rtol=1e-5)
+        np.testing.assert_allclose(cosines[-2:], np.array([0.4, 0.6]) / np.hypot(0.4, 0.6), rtol=1e-5)
         assert (found.labels[v] == 5).any()
 
 

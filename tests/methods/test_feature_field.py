@@ -15,6 +15,7 @@ from gsjax.methods.feature_field import (
     back_projected_cosines,
     begin_field,
     carried,
+    compiled_step,
     distill,
     features_of,
     field_loss,
@@ -37,7 +38,7 @@ from gsjax.methods.feature_field import (
     used_part,
     whole,
 )
-from gsjax.rasterize.frozen import paint
+from gsjax.rasterize.frozen import paint, paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import gaussians_from_activated
 
@@ -101,6 +102,8 @@ def test_what_is_rendered_of_the_hidden_layer_is_what_features_render_as(problem
     batch = told.views[0]
     parts = carried(state.field, batch.located)
     image, alphas = paint(batch.view, parts.values, batch.plan)
+    some = carried(state.field, batch.located, batch.view.rows)
+    np.testing.assert_array_equal(paint_shown(batch.view, some.values, batch.plan)[0], image)
     of_hidden = parts.channels_of(parts.joined(image, alphas))
     of_features, _ = paint(batch.view, features_of(state.field, batch.located), batch.plan)
     assert parts.values.shape[1] == 16 != of_features.shape[-1]
@@ -123,7 +126,7 @@ def test_strips_change_neither_the_loss_nor_its_slope(two_balls, teacher):
         found.append(
             jax.jit(value, static_argnames="step")(state.field, told.views[0], step=0, key=jax.random.key(0))
         )
-    assert rows == 5  # which 0.1 MiB do not hold: 28 numbers of 384 pixels a row
+    assert rows == 5  # which 0.1 MiB do not hold: 28 numbers and more of 384 pixels a row
     ((one, aux), slope), ((other, other_aux), other_slope) = found
     assert float(aux["contrast"]) > 0
     np.testing.assert_allclose(one, other, rtol=1e-5)
@@ -212,6 +215,7 @@ def test_views_of_one_size_share_one_program(two_balls):
     config = replace(QUICK, iterations=9, contrast_after=0.5, seed=3)
     told, state = begin_field(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
     assert sum(now.compile_seconds > 0 for now in distill(told, state)) == 1
+    assert compiled_step(config)._cache_size() == 1
 
 
 def test_poison_skips_the_step(problem):
@@ -361,7 +365,8 @@ def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
     scene, _, masks = two_balls
     view, plan = frozen_views(scene, cameras(8))[0]
     ids = jnp.asarray(masks[0])
-    votes = np.asarray(label_votes(view, plan, ids, 3))
+    votes = np.zeros((scene.num, 3))
+    np.add.at(votes, view.rows, np.asarray(label_votes(view, plan, ids, 3)))
     # One Gaussian at a time: what it alone adds to the picture.
     for row in (3, 90, 150):
         own, _ = paint(view, jnp.zeros((scene.num, 1)).at[row].set(1.0), plan)
@@ -373,7 +378,7 @@ def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
 
 def test_a_majority_of_true_masks_is_the_truth(two_balls):
     scene, labels, masks = two_balls
-    found = majority_labels(frozen_views(scene, cameras(8)), masks, 3)
+    found = majority_labels(frozen_views(scene, cameras(8)), masks, 3, scene.num)
     seen = found >= 0
     assert seen.mean() > 0.9
     assert (found[seen] == labels[seen]).mean() > 0.97

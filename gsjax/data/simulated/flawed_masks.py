@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 _CLOSE = 3  # pixels between things that a segmenter may run together
+_LIKE_ITSELF = 0.6  # of half of a thing; the rest is like another
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ def flawed_masks(
     """Masks of true labels 0 to K, with flaws.
 
     A mask has the embedding of its label. Two things in one mask have the mean of theirs, by their pixels, as
-    an encoder of crops would say; of one that is two, the smaller piece has one halfway to another thing's,
-    for half of a thing looks like something else. Nothing is overlooked in all pictures that show enough of
+    an encoder of crops would say; of one that is two, the smaller piece has one almost halfway to another
+    thing's, for half of a thing looks like something else. Nothing is overlooked in all pictures that show enough of
     it.
 
     Args:
@@ -74,8 +75,11 @@ def flawed_masks(
         shown = np.flatnonzero(~missing[:, k])
         number = min(int(flaws.missing * len(shown) + random.uniform()), max(len(shown) - 1, 0))
         missing[random.permutation(shown)[:number], k] = True
-    merged = set(random.permutation(count)[: round(flaws.merged * count)].tolist())
-    split = set(random.permutation(count)[: round(flaws.split * count)].tolist())
+    # Of few pictures a share is no whole number: then by chance, so that it holds over seeds.
+    merged, split = (
+        set(random.permutation(count)[: int(share * count + random.uniform())].tolist())
+        for share in (flaws.merged, flaws.split)
+    )
     labels, embeddings, said = [], [], []
     for v, mask in enumerate(masks):
         found, rows = _outlined(mask, missing[v], flaws, random), np.array(codebook)
@@ -91,8 +95,9 @@ def flawed_masks(
             whole = int(random.choice(there))
             other = int(random.choice([k for k in range(len(codebook)) if k != whole]))
             found[_smaller_piece(found == whole, random)] = len(rows)
-            rows = np.concatenate([rows, _unit(rows[whole] + np.asarray(codebook)[other])[None]])
-            said.append(f"picture {v}: {whole} is two, one of which looks half like {other}")
+            mixed = _LIKE_ITSELF * rows[whole] + (1 - _LIKE_ITSELF) * np.asarray(codebook)[other]
+            rows = np.concatenate([rows, _unit(mixed)[None]])
+            said.append(f"picture {v}: {whole} is two, one of which looks almost as much like {other}")
         labels.append(found)
         embeddings.append(rows.astype(np.float32))
     return FlawedMasks(labels, embeddings, said)

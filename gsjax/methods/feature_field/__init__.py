@@ -34,12 +34,13 @@ from gsjax.methods.feature_field.query import (
     selection_mask,
     threshold_for,
 )
-from gsjax.methods.feature_field.teacher import Teacher, teacher_of_maps, teacher_of_objects
+from gsjax.methods.feature_field.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.feature_field.training import (
     Distilled,
     FieldProblem,
     FieldState,
     begin_field,
+    compiled_step,
     distill,
     finished,
     frozen_views,
@@ -60,6 +61,7 @@ __all__ = [
     "back_projected_cosines",
     "begin_field",
     "carried",
+    "compiled_step",
     "distill",
     "distillation_step",
     "features_of",
@@ -82,4 +84,5 @@ __all__ = [
     "threshold_for",
     "used_part",
     "whole",
+    "with_maps",
 ]

@@ -38,9 +38,11 @@ class FieldWeightsConfig:
     """Of what pulls pixels of one thing together and those of others apart."""
     tv: float = 1.0
     """Of differences between neighbouring pixels."""
+    map: float = 1.0
+    """Of a pixel of a map beside one of a mask, where there are both."""
 
     def __post_init__(self):
-        expect(self, "weights.", **dict.fromkeys(("rec", "cos", "contrast", "tv"), (0, np.inf)))
+        expect(self, "weights.", **dict.fromkeys(("rec", "cos", "contrast", "tv", "map"), (0, np.inf)))
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class FieldConfig:
             channels=(1, 4096),
             contrast_after=(0, 1),
             contrast_gamma=(1e-6, np.inf),
-            contrast_patch=(2, 256),
+            contrast_patch=(2, 64),
             strip_megabytes=(0.1, np.inf),
         )
         if self.contrast_pool not in POOLS:

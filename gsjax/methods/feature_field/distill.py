@@ -21,7 +21,7 @@ from gsjax.losses.regularization import total_variation
 from gsjax.methods.feature_field.config import FieldConfig
 from gsjax.methods.feature_field.field import Carried, FeatureField, carried
 from gsjax.optim.step import Step, gradient_step
-from gsjax.rasterize.frozen import FrozenView, paint, strip_of
+from gsjax.rasterize.frozen import FrozenView, paint_shown, strip_of
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 
@@ -35,8 +35,8 @@ class FieldBatch(NamedTuple):
         view: of the scene, which stands still.
         located: where its Gaussians lie in the grid; None without one.
         ids: rows of the codebook, or things; -1 unknown.
-        codebook: of the teacher; None where there are maps only.
-        map: of the teacher, of any size; None where there is none.
+        codebook: of the teacher, what this view shows of it; None where there are maps only.
+        map: of the teacher, of any size; None where there is none. It stays on the host until its step.
         plan: of the view.
     """
 
@@ -84,7 +84,8 @@ def field_loss(config: FieldConfig) -> Callable:
     weights, edge = config.weights, config.contrast_pool
 
     def loss(field: FeatureField, batch: FieldBatch, *, step: Any, key: Any):
-        sums, pooled = _drawn(field, batch, config)
+        corner = _corner(key, batch.ids.shape, config) if weights.contrast else None
+        sums, pooled = _drawn(field, batch, corner, config)
         channels = field.channels
         height, width = batch.ids.shape
         known = jnp.maximum(sums.pixels, 1.0)
@@ -97,7 +98,7 @@ def field_loss(config: FieldConfig) -> Callable:
             assert pooled is not None
             aux["contrast"] = jax.lax.cond(
                 jnp.asarray(step) >= config.contrast_after * config.iterations,
-                lambda: _contrast(pooled, pooled_ids(batch.ids, edge), key, config),
+                lambda: _contrast(pooled, pooled_ids(batch.ids, edge), corner, config),
                 lambda: jnp.zeros((), pooled.dtype),
             )
             value += weights.contrast * aux["contrast"]
@@ -106,29 +107,33 @@ def field_loss(config: FieldConfig) -> Callable:
     return loss
 
 
-def strip_rows(config: FieldConfig, hidden: int, plan: Plan) -> int:
-    """Rows of tiles in a strip whose pixels' features take no more memory than they may."""
-    a_row = 4 * (hidden + config.channels) * plan.tile_size * plan.width
+def strip_rows(config: FieldConfig, hidden: int, batch: FieldBatch) -> int:
+    """Rows of tiles in a strip whose pixels' numbers take no more memory than they may."""
+    plan, numbers = batch.plan, hidden + config.channels
+    numbers += 0 if batch.codebook is None else len(batch.codebook)
+    numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # what it says, and what the field does
+    a_row = 4 * numbers * plan.tile_size * plan.width
     return int(max(1, min(plan.tiles_y, config.strip_megabytes * 2**20 // a_row)))
 
 
 def _drawn(
-    field: FeatureField, batch: FieldBatch, config: FieldConfig
-) -> tuple[_Sums, Float[Array, "h_ w_ channels"] | None]:
-    """What losses there are in a view, and its pooled features where the contrast asks for them.
+    field: FeatureField, batch: FieldBatch, corner: Any, config: FieldConfig
+) -> tuple[_Sums, Float[Array, "h_ patch channels"] | None]:
+    """What losses there are in a view, and pooled features of the columns that the contrast looks at.
 
     The image is worked through strip by strip, each of which forgets its pixels and is drawn once more on the
     way back. So the memory is that of a strip.
     """
-    parts, plan = carried(field, batch.located), batch.plan
-    rows = strip_rows(config, parts.values.shape[1], plan)
+    # Of the Gaussians that the view shows; those behind others need no features.
+    parts, plan = carried(field, batch.located, batch.view.rows), batch.plan
+    rows = strip_rows(config, parts.values.shape[1], batch)
     strips = -(-plan.tiles_y // rows)
     high = rows * plan.tile_size
     ids = jnp.pad(batch.ids, ((0, strips * high - plan.height), (0, 0)), constant_values=-1)
     padded = batch._replace(ids=ids)
 
     def strip(above, number):
-        return _strip(field, parts, padded, above, number, rows, config)
+        return _strip(field, parts, padded, above, number, rows, corner, config)
 
     above = jnp.zeros((plan.width, field.channels), parts.values.dtype)
     if strips == 1:
@@ -147,33 +152,54 @@ def _strip(
     above: Float[Array, "width channels"],
     number: Int[Array, ""] | int,
     rows: int,
+    corner: Any,
     config: FieldConfig,
 ):
-    """One strip: its last row, its sums, and its pooled features."""
+    """One strip: its last row, its sums, and pooled features of some of its columns."""
     plan, weights = batch.plan, config.weights
     high = rows * plan.tile_size
     view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
-    image, alphas = paint(view, parts.values, strip_plan)
+    image, alphas = paint_shown(view, parts.values, strip_plan)
     # Pixels on one axis: a matmul over two of them, as in the slope by the weights, XLA:CPU does ten times as
     # slowly.
     alphas = alphas.ravel()
     rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
     inside = number * high + jnp.arange(high) < plan.height
-    sums = _teacher_sums(field, parts, batch, rendered, alphas, number * high, inside)
+    sums = _teacher_sums(
+        field,
+        parts,
+        batch,
+        rendered,
+        alphas,
+        number * high,
+        inside,
+        1.0 if batch.codebook is None else weights.map,
+    )
     if not weights.tv and not weights.contrast:
         return above, (sums, None)
     channels = parts.channels_of(rendered).reshape(high, plan.width, -1)
     if weights.tv:
         before = jnp.where(number == 0, channels[0], above)
         sums = sums._replace(tv=total_variation(channels, before, inside))
-    pooled = max_pooled(channels, config.contrast_pool) if weights.contrast else None
-    if pooled is not None and rows == plan.tiles_y:
-        pooled = pooled[: plan.height // config.contrast_pool]
+    if not weights.contrast:
+        return channels[-1], (sums, None)
+    edge, (_, wide) = config.contrast_pool, _patch_shape(batch.ids.shape, config)
+    columns = jax.lax.dynamic_slice_in_dim(channels, corner[1] * edge, wide * edge, axis=1)
+    pooled = max_pooled(columns, edge)
+    if rows == plan.tiles_y:
+        pooled = pooled[: plan.height // edge]
     return channels[-1], (sums, pooled)
 
 
 def _teacher_sums(
-    field: FeatureField, parts: Carried, batch: FieldBatch, rendered, alphas, first_row, inside
+    field: FeatureField,
+    parts: Carried,
+    batch: FieldBatch,
+    rendered,
+    alphas,
+    first_row,
+    inside,
+    weight_of_maps: float,
 ) -> _Sums:
     """By how much a strip's pixels, in one row, differ from what the teacher says of them."""
     lifted = parts.lifted(field.lift)
@@ -189,9 +215,10 @@ def _teacher_sums(
         said = _stretched(batch.map, first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
-        rec += jnp.where(known, feature_error(like, alphas, field.dimension), 0.0).sum()
-        cos += jnp.where(known, cosine_error(like), 0.0).sum()
-        pixels += known.sum(dtype=zero.dtype)
+        weight = jnp.where(known, weight_of_maps, 0.0)
+        rec += (weight * feature_error(like, alphas, field.dimension)).sum()
+        cos += (weight * cosine_error(like)).sum()
+        pixels += weight.sum()
     return _Sums(rec, cos, pixels, zero)
 
 
@@ -212,16 +239,24 @@ def _stretched(
     return lines[:, left] * (1 - across)[:, None] + lines[:, right] * across[:, None]
 
 
+def _patch_shape(shape: tuple[int, ...], config: FieldConfig) -> tuple[int, int]:
+    """Windows, down and across, of a patch in a view of so many pixels."""
+    high, wide = (min(config.contrast_patch, side // config.contrast_pool) for side in shape)
+    return high, wide
+
+
+def _corner(key: Any, shape: tuple[int, ...], config: FieldConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The first window, down and across, of the patch that a key chooses."""
+    (first, second), size = jax.random.split(key), _patch_shape(shape, config)
+    down, across = (side // config.contrast_pool - some for side, some in zip(shape, size, strict=True))
+    return jax.random.randint(first, (), 0, down + 1), jax.random.randint(second, (), 0, across + 1)
+
+
 def _contrast(
-    pooled: Float[Array, "h w channels"], ids: Int[Array, "h w"], key: Any, config: FieldConfig
+    columns: Float[Array, "h patch channels"], ids: Int[Array, "h w"], corner: Any, config: FieldConfig
 ) -> Float[Array, ""]:
-    """The contrast within a patch of pooled features that a key chooses."""
-    high, wide = (min(config.contrast_patch, side) for side in ids.shape)
-    first, second = jax.random.split(key)
-    corner = (
-        jax.random.randint(first, (), 0, ids.shape[0] - high + 1),
-        jax.random.randint(second, (), 0, ids.shape[1] - wide + 1),
-    )
-    patch = jax.lax.dynamic_slice(pooled, (*corner, 0), (high, wide, pooled.shape[2]))
+    """The contrast within a patch of pooled features, of which the columns are cut out already."""
+    high, wide = min(config.contrast_patch, ids.shape[0]), columns.shape[1]
+    patch = jax.lax.dynamic_slice_in_dim(columns, corner[0], high)
     seen = jax.lax.dynamic_slice(ids, corner, (high, wide))
     return contrastive_loss(patch.reshape(high * wide, -1), seen.ravel(), config.contrast_gamma)

@@ -22,7 +22,8 @@ from gsjax.methods.feature_field.config import FieldConfig
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
 _MARGIN = 0.02  # of the box, beyond the outermost Gaussians, in its own size
-_LEAST_NORM = 1e-12
+_MOST = 0.01  # of the Gaussians, that may lie far out to either side of an axis
+_FAR_OUT = 0.5  # of the size of what holds all others
 
 
 class FeatureField(eqx.Module):
@@ -80,7 +81,8 @@ def init_field(
     Args:
         key: of first values.
         config: its sizes.
-        means: of the scene's Gaussians, metres; the grid is over the box of those that are finite.
+        means: of the scene's Gaussians, metres; the grid is over the box of those that are finite, and of a
+            few that lie far out the features are those of its surface.
         dimension: D, of the teacher's features.
 
     Raises:
@@ -95,17 +97,26 @@ def init_field(
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise ValueError(f"means: expected Gaussians with a place, found {len(means)}, none of them finite")
-    low, high = points.min(0), points.max(0)
+    low, high = _box(points)
     room = _MARGIN * max((high - low).max(), 1e-3)
     grid = init_feature_grid(first, config.grid, config.channels, np.stack([low - room, high + room]))
     return FeatureField(grid, lift), locate(grid, jnp.asarray(means))
 
 
-def carried(field: FeatureField, located: Located | None) -> Carried:
-    """What to render of a field."""
+def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
+    """Around all points, but for those of a few that would make its cells much larger for all others."""
+    low, high = np.quantile(points, [_MOST, 1 - _MOST], axis=0).astype(np.float32)
+    room = _FAR_OUT * max((high - low).max(), 1e-3)
+    return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
+
+
+def carried(field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None) -> Carried:
+    """What to render of a field: of all Gaussians, or of some."""
     if not isinstance(field.encoding, FeatureGrid):
-        return Carried(field.encoding, None)
+        return Carried(field.encoding if rows is None else field.encoding[rows], None)
     assert located is not None
+    if rows is not None:
+        located = Located(*(a[rows] for a in located))
     last = field.encoding.layers[-1]
     assert last.bias is not None
     head = jnp.concatenate([last.weight, last.bias[:, None]], axis=1)

@@ -1,10 +1,8 @@
 """The way back from the teacher's channels to the field's (papers/002, eq. 9): the pseudo-inverse, or
-learned.
+learned by the cycle loss (`gsjax.losses.features.cycle_error`).
 
-    L_cyc = |W' F - F'_low|_1 + |W F'_low - F|_1
-
-with F'_low rendered features of C channels and F = W F'_low. With W fixed the second term is 0, and what is
-left is linear regression in L1 on features as they occur: the learned inverse need not be one elsewhere.
+With W fixed, as the paper has it, and F = W F'_low, the second of its terms is 0, and what is left is linear
+regression in L1 on features as they occur: the learned inverse need not be one elsewhere.
 """
 
 from functools import partial
@@ -13,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
+
+from gsjax.losses.features import cycle_error
 
 _RATE = 3e-3
 
@@ -42,7 +42,7 @@ def learned_inverse(
     optimizer = optax.adam(optax.exponential_decay(_RATE, iterations, 0.03))
 
     def loss(inverse, some):
-        return jnp.abs(some @ lift.T @ inverse.T - some).sum(axis=-1).mean()
+        return cycle_error(some, jnp.matmul(some, lift.T, precision="highest"), lift, inverse).mean()
 
     def step(carry, key):
         inverse, state = carry

@@ -86,7 +86,8 @@ def back_projected_cosines(
     parts = carried(field, located)
     rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
     features = parts.channels_of(rendered)
-    return _normalised(features) @ _normalised(queries @ inverse.T).T
+    back = jnp.matmul(queries, inverse.T, precision="highest")
+    return jnp.matmul(_normalised(features), _normalised(back).T, precision="highest")
 
 
 def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -> Float[Array, "*n"]:
@@ -118,7 +119,7 @@ def threshold_for(
 
 
 def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> Bool[Array, "height width"]:
-    """Where selected Gaussians make up most of what a view shows: what stands before them hides them."""
+    """Where selected Gaussians send more than half of a pixel's light: what stands before them hides them."""
     share, _ = paint(view, selected.astype(view.opacities.dtype)[:, None], plan)
     return share[..., 0] > _OPAQUE
 
@@ -126,7 +127,7 @@ def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> 
 def pixel_mask(
     scores: Float[Array, "height width"], alphas: Float[Array, "height width"], threshold: float
 ) -> Bool[Array, "height width"]:
-    """Where a view's own scores reach the threshold."""
+    """Where a view's own scores are above the threshold, and the scene sends more than half of the light."""
     return (scores > threshold) & (alphas > _OPAQUE)
 
 
@@ -135,7 +136,8 @@ def _cosines(
 ) -> Float[Array, "n q"]:
     gram = jnp.matmul(lifted.T, lifted, precision="highest")
     squared = jnp.sum(jnp.matmul(rendered, gram, precision="highest") * rendered, axis=-1, keepdims=True)
-    product = jnp.matmul(rendered, jnp.matmul(_normalised(queries), lifted, precision="highest").T)
+    toward = jnp.matmul(_normalised(queries), lifted, precision="highest")
+    product = jnp.matmul(rendered, toward.T, precision="highest")
     return jnp.where(squared > _LEAST_NORM, product / jnp.sqrt(jnp.maximum(squared, _LEAST_NORM)), 0.0)
 
 

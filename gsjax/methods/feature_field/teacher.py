@@ -23,6 +23,9 @@ class Teacher(NamedTuple):
         codebook: the embeddings, [K, D], no two alike; None where there are maps only.
         maps: a feature a pixel of a picture of any size, [h,w,D] a view, stretched over the view; None where
             there are none.
+
+    Embeddings, and features of maps, have a mean length of 1, whatever the encoder's had: cosines do not
+    depend on it, but how fast a field learns would.
     """
 
     ids: list[np.ndarray]
@@ -82,7 +85,7 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
         for mask, begin in zip(masks, begins[:-1], strict=True)
     ]
     _warn_of_silence(ids)
-    return Teacher(ids, codebook[known])
+    return Teacher(ids, codebook[known] / _mean_length([codebook[known]]))
 
 
 def teacher_of_maps(
@@ -117,9 +120,58 @@ def teacher_of_maps(
             )
     if ids is None:
         ids = [np.full(size, UNKNOWN_ID, np.int32) for size in sizes]
-    return Teacher(
-        [np.asarray(one, np.int32) for one in ids], None, [np.asarray(m, np.float32) for m in maps]
-    )
+    length = _mean_length(maps)
+    scaled = [(np.asarray(one, np.float32) / length).astype(np.float32) for one in maps]
+    return Teacher([np.asarray(one, np.int32) for one in ids], None, scaled)
+
+
+def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
+    """One that says of each pixel both what its object's embedding is and what a map has there.
+
+    The maps are a second opinion: what no mask holds has a feature by them, and what they are worth beside
+    the masks is `FieldWeightsConfig.map`.
+
+    Args:
+        objects: a teacher of masks.
+        dense: a teacher of maps, of the same views, by the same encoder.
+
+    Raises:
+        ValueError: views or dimensions differ, or one of them is not of its kind.
+    """
+    if objects.codebook is None or dense.maps is None:
+        raise ValueError("teachers: expected one of objects and one of maps, found others")
+    if len(objects.ids) != len(dense.maps):
+        raise ValueError(f"dense: expected maps of {len(objects.ids)} views, found {len(dense.maps)}")
+    if objects.dimension != dense.dimension:
+        raise ValueError(
+            f"dense: expected features of {objects.dimension} numbers as the objects have, found "
+            f"{dense.dimension}; both must come from one encoder"
+        )
+    return objects._replace(maps=dense.maps)
+
+
+def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """What pixels of a view show, as rows of a small codebook of its own, which zeros fill up to `rows`; the
+    ids as they are, and None, where there are maps only."""
+    ids = np.asarray(teacher.ids[v], np.int32)
+    if teacher.codebook is None:
+        return ids, None
+    there, place = np.unique(ids, return_inverse=True)
+    unknown = int(there[0] < 0) if len(there) else 0
+    book = np.zeros((rows, teacher.dimension), np.float32)
+    book[: len(there) - unknown] = teacher.codebook[there[unknown:]]
+    return (place.reshape(ids.shape) - unknown).astype(np.int32), book
+
+
+def most_rows(teacher: Teacher) -> int:
+    """How many rows of the codebook a view shows at most, and at least 1."""
+    return max(1, *(len(np.unique(ids[ids >= 0])) for ids in teacher.ids))
+
+
+def _mean_length(features: Sequence[np.ndarray]) -> np.float32:
+    """Of all features; 1 where all are zeros."""
+    lengths = [np.linalg.norm(np.asarray(one, np.float64), axis=-1).ravel() for one in features]
+    return np.float32(np.concatenate(lengths).mean() or 1.0)
 
 
 def _warn_of_silence(ids: list[np.ndarray]) -> None:

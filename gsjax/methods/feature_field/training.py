@@ -15,7 +15,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.feature_field.config import FieldConfig
 from gsjax.methods.feature_field.distill import FieldBatch, distillation_step
 from gsjax.methods.feature_field.field import FeatureField, init_field, used_part, whole
-from gsjax.methods.feature_field.teacher import Teacher
+from gsjax.methods.feature_field.teacher import Teacher, most_rows, of_view
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, freeze_views
 from gsjax.rasterize.plan import Plan
@@ -90,13 +90,15 @@ def begin_field(
     _check(cameras, teacher)
     field, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
     field, located, rows = used_part(field, located)
-    codebook = None if teacher.codebook is None else jnp.asarray(teacher.codebook)
     frozen, views = frozen_views(gaussians, cameras, rasterize_mode), []
+    most = most_rows(teacher)
     for v, (view, plan) in enumerate(frozen):
         if teacher.maps is None and not (teacher.ids[v] >= 0).any():
             continue  # it teaches nothing
-        of_pixels = None if teacher.maps is None else jnp.asarray(teacher.maps[v])
-        views.append(FieldBatch(view, located, jnp.asarray(teacher.ids[v]), codebook, of_pixels, plan))
+        ids, codebook = of_view(teacher, v, most)
+        codebook = None if codebook is None else jnp.asarray(codebook)
+        of_pixels = None if teacher.maps is None else teacher.maps[v]
+        views.append(FieldBatch(view, located, jnp.asarray(ids), codebook, of_pixels, plan))
     state = FieldState(field, distillation_step(config).init(field), 0)
     return FieldProblem(config, views, rows), state
 
@@ -105,17 +107,15 @@ def distill(problem: FieldProblem, state: FieldState) -> Iterator[Distilled]:
     """Step by step, until all is done. The same state and problem give the same bits, wherever the
     distillation was begun or resumed."""
     config = problem.config
-    advance = _compiled(config)
+    advance = compiled_step(config)
     key = jax.random.fold_in(jax.random.key(config.seed), _PATCHES)
-    field, optimizer, compiled = state.field, state.optimizer, set()
+    field, optimizer = state.field, state.optimizer
     for i in range(state.step, config.iterations):
-        begun = perf_counter()
+        begun, programs = perf_counter(), advance._cache_size()
         batch = problem.views[_turn(config.seed, i, len(problem.views))]
-        shapes = (batch.plan, *(leaf.shape for leaf in jax.tree.leaves(batch)))
         field, optimizer, info = advance(field, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i))
         jax.block_until_ready(info)
-        seconds, new = perf_counter() - begun, shapes not in compiled
-        compiled.add(shapes)
+        seconds, new = perf_counter() - begun, advance._cache_size() > programs
         now = FieldState(field, optimizer, i + 1)
         yield Distilled(now, info, 0.0 if new else seconds, seconds if new else 0.0)
 
@@ -144,8 +144,8 @@ def frozen_views(
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: FieldConfig) -> Callable:
-    """The jitted step; buffers that it replaces are given away."""
+def compiled_step(config: FieldConfig) -> Callable:
+    """The jitted step: field, optimizer, batch, number, key. Buffers that it replaces are given away."""
     step = distillation_step(config)
 
     @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
@@ -164,6 +164,8 @@ def _turn(seed: int, step: int, count: int) -> int:
 def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:
     if len(cameras) != len(teacher.ids):
         raise ValueError(f"teacher: expected that of {len(cameras)} views, found {len(teacher.ids)}")
+    if teacher.maps is not None and len(teacher.maps) != len(cameras):
+        raise ValueError(f"teacher: expected maps of {len(cameras)} views, found {len(teacher.maps)}")
     for v, (camera, ids) in enumerate(zip(cameras, teacher.ids, strict=True)):
         if ids.shape != (camera.height, camera.width):
             raise ValueError(

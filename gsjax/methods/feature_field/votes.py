@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from gsjax.rasterize.frozen import FrozenView, paint
+from gsjax.rasterize.frozen import FrozenView, paint_shown
 from gsjax.rasterize.plan import Plan
 
 
 @partial(jax.jit, static_argnames=("plan", "count"))
 def label_votes(
     view: FrozenView, plan: Plan, ids: Int[Array, "height width"], count: int
-) -> Float[Array, "n count"]:
-    """How much light each Gaussian sends to the pixels of each label.
+) -> Float[Array, "seen count"]:
+    """How much light each Gaussian that a view shows, `view.rows`, sends to the pixels of each label.
 
     Args:
         view, plan: of the scene.
@@ -30,17 +30,16 @@ def label_votes(
     """
     ballots = jax.nn.one_hot(ids, count)  # a row of zeros for -1
     nothing = jnp.zeros((view.opacities.shape[0], count), ballots.dtype)
-    _, back = jax.vjp(lambda values: paint(view, values, plan)[0], nothing)
+    _, back = jax.vjp(lambda values: paint_shown(view, values, plan)[0], nothing)
     return back(ballots)[0]
 
 
 def majority_labels(
-    views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int
+    views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
 ) -> Int[np.ndarray, "n"]:
-    """The label with most votes of all views; -1 for a Gaussian that sends no light to a pixel with one."""
-    votes = sum(
-        np.asarray(label_votes(view, plan, jnp.asarray(one), count), np.float64)
-        for (view, plan), one in zip(views, ids, strict=True)
-    )
-    assert isinstance(votes, np.ndarray)
+    """The label with most votes of all views, of each of `num` Gaussians; -1 for one that sends no light to a
+    pixel with a label."""
+    votes = np.zeros((num, count))
+    for (view, plan), one in zip(views, ids, strict=True):
+        np.add.at(votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(one), count)))
     return np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), -1)
