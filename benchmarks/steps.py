@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from benchmarks.floors import Floors, is_calm, measure_floors
 from benchmarks.metrics import Metric
@@ -16,6 +17,7 @@ from benchmarks.workloads import ball
 from gsjax.data import open_sequence
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
+from gsjax.methods.feature_field import FieldConfig, begin_field, distill, teacher_of_objects
 from gsjax.methods.object_tracker import PRESETS, start_scene, track
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
@@ -77,6 +79,21 @@ def fit(repeats: int) -> StepTimes:
     return StepTimes(f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}", seconds, compiled.seconds)
 
 
+def field(repeats: int) -> StepTimes:
+    """One step of a feature field's distillation, as it comes: 256 channels, 16 levels, all losses on."""
+    width, height = FIT_SIZE
+    scene = ball(FIT_GAUSSIANS, width, height)
+    camera = Camera(scene.viewmat, scene.K, width, height)
+    thing = np.indices((height, width)).sum(axis=0) // 40 % 3  # stripes
+    teacher = teacher_of_objects([thing], [np.eye(3, 512, dtype=np.float32)])
+    config = FieldConfig(iterations=repeats + 1, contrast_after=0.0)
+    updates = list(distill(*begin_field(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
+    if any(bool(update.info["skipped"]) for update in updates):
+        raise RuntimeError("a step of the distillation was skipped: a number is not finite")
+    what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {config.channels} channels"
+    return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
+
+
 def _loss(gaussians, target, *, step, key, plan, camera):
     rendered = render(gaussians, camera, plan)
     return photometric_loss(rendered.colors, target), {"overflow": rendered.meta.overflow}
@@ -86,6 +103,7 @@ STEPS: dict[str, Callable[[int], StepTimes]] = {
     "steps-tracker": tracker,
     "steps-tracker-fast": partial(tracker, preset="fast"),
     "steps-fit": fit,
+    "steps-field": field,
 }
 
 

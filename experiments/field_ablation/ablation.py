@@ -19,7 +19,7 @@ from gsjax.cli.field_scene import FieldScene, scaled
 from gsjax.methods.feature_field import FieldConfig, FieldWeightsConfig, Teacher, features_of
 from gsjax.methods.feature_field.field import FeatureField
 
-SCALE, ITERATIONS = 0.5, 150
+SCALE, ITERATIONS = 0.5, 100
 BASE = FieldConfig(iterations=ITERATIONS)
 NEITHER = replace(BASE, weights=FieldWeightsConfig(contrast=0.0, tv=0.0))
 VARIANTS: dict[str, FieldConfig] = {

@@ -1,6 +1,7 @@
 """The steps of `gsjax distill`: shown and saved while they go on, until there are enough."""
 
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -16,7 +17,7 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.saving import Saver
 from gsjax.io.atomic import atomic_write
 from gsjax.io.checkpoints import load_checkpoint, load_metadata
-from gsjax.methods.feature_field import FieldProblem, FieldState, distill
+from gsjax.methods.feature_field import Distilled, FieldProblem, FieldState, distill
 
 LOSSES = ("rec", "cos", "contrast", "tv")
 _STATE = "field.npz"
@@ -31,15 +32,19 @@ class Learning:
 
     Attributes:
         state: to go on from.
+        about: what it is of: digests, by what they are of in words.
         rows: step, seconds, and the means of each loss over the steps since the row before.
+        recent: losses of the steps since the last row.
         seconds: of all steps so far, without what compiled.
         compile_seconds: that compiling took.
-        skipped: steps that met numbers that are not finite, and changed nothing.
+        skipped: steps up to the last row that met numbers that are not finite, and changed nothing.
         stopped: what ended it early, or None.
     """
 
     state: FieldState
+    about: Mapping[str, str | None]
     rows: list[dict[str, Any]] = field(default_factory=list)
+    recent: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     compile_seconds: float = 0.0
     skipped: int = 0
@@ -47,25 +52,36 @@ class Learning:
 
     def metadata(self) -> dict[str, Any]:
         """What is saved beside the state."""
-        return {name: getattr(self, name) for name in ("rows", "seconds", "compile_seconds", "skipped")}
+        recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
+        kept = ("rows", "seconds", "compile_seconds", "skipped")
+        return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
 
 def load(folder: Path, first: Learning) -> Learning:
     """What a run had come to; `first` where it was stopped before it had saved anything.
 
     Raises:
-        CheckpointError: it is damaged, or of another scene.
+        CheckpointError: it is damaged.
+        ValueError: it is of something else than `first`.
     """
     path = folder / _STATE
     if not path.is_file():
         return first
+    stored = load_metadata(path)
+    about = stored.pop("about", {})
+    others = [what for what, digest in first.about.items() if about.get(what) != digest]
+    if others:
+        raise ValueError(
+            f"--resume: {' and '.join(others)}: expected what the run in {folder.parent} was begun with, "
+            "found something else; put that back, or replace the run with --overwrite instead"
+        )
     state, _ = load_checkpoint(path, first.state)
-    return Learning(state, **load_metadata(path))
+    return Learning(state, about, **stored)
 
 
 def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console: Console) -> Learning:
     """Go on until all steps are made, Ctrl-C or an error."""
-    save, total, recent = Saver(folder.resume / _STATE, "distilling"), problem.config.iterations, []
+    save, total = Saver(folder.resume / _STATE, "distilling"), problem.config.iterations
     columns = (TextColumn("distilling"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
     words = TextColumn("{task.description}")
     if not console.is_terminal:
@@ -75,14 +91,10 @@ def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console:
         task = bar.add_task("compiling", total=total, completed=learning.state.step)
         steps = distill(problem, learning.state)
         try:
-            while (found := undisturbed(next, steps, None)) is not None:
-                learning.state, step = found.state, found.state.step
-                learning.seconds += found.seconds
-                learning.compile_seconds += found.compile_seconds
-                recent.append(found.info)
+            while undisturbed(_made_one_more, steps, learning):
+                step = learning.state.step
                 if step % _LOGGED_EVERY == 0 or step == total:
-                    _add_row(learning, recent, folder)
-                    recent = []
+                    undisturbed(_add_row, learning, folder)
                 if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
                     bar.update(task, completed=step, description=_told(learning.rows[-1]))
                     shown = perf_counter()
@@ -101,11 +113,23 @@ def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console:
     return learning
 
 
-def _add_row(learning: Learning, infos: list[dict[str, Any]], folder: RunFolder) -> None:
+def _made_one_more(steps: Iterator[Distilled], learning: Learning) -> bool:
+    """Whether there was a step to make, which gives away the buffers of the state before."""
+    if (found := next(steps, None)) is None:
+        return False
+    learning.state = found.state
+    learning.seconds += found.seconds
+    learning.compile_seconds += found.compile_seconds
+    learning.recent.append(found.info)
+    return True
+
+
+def _add_row(learning: Learning, folder: RunFolder) -> None:
     """A row of means, which stands in metrics.jsonl at once."""
-    infos = jax.device_get(infos)
+    infos = jax.device_get(learning.recent)
     sound = [info for info in infos if not info["skipped"]]
     learning.skipped += len(infos) - len(sound)
+    learning.recent = []
     row: dict[str, Any] = {
         "step": learning.state.step,
         "seconds": learning.seconds + learning.compile_seconds,

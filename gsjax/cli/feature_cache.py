@@ -16,6 +16,11 @@ Arrays = Mapping[str, np.ndarray]
 _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
+def cache_folder() -> Path:
+    """Where answers are kept unless told; what lies there may be deleted."""
+    return Path(user_cache_dir("gsjax", appauthor=False)) / "features"
+
+
 class FeatureCache:
     """A folder of answers. One that is damaged is asked for again, and one that cannot be written is not.
 
@@ -28,7 +33,7 @@ class FeatureCache:
         Args:
             folder: where; in the user's cache folder unless given.
         """
-        self._folder = folder or Path(user_cache_dir("gsjax", appauthor=False)) / "features"
+        self._folder = folder or cache_folder()
         self.found = self.asked = 0
 
     def __call__(self, who: str, shown: Arrays, ask: Callable[[], Arrays]) -> dict[str, np.ndarray]:
@@ -39,7 +44,7 @@ class FeatureCache:
             shown: arrays.
             ask: works it out.
         """
-        path = self._folder / f"{_content(who, shown)}.npz"
+        path = self._folder / f"{content_digest(who, shown)}.npz"
         try:
             with np.load(path, allow_pickle=False) as stored:
                 said = dict(stored)
@@ -66,7 +71,8 @@ def folder_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _content(who: str, shown: Arrays) -> str:
+def content_digest(who: str, shown: Arrays) -> str:
+    """SHA-256 over what is shown to whom."""
     digest = hashlib.sha256(json.dumps(who).encode())
     for name, array in sorted(shown.items()):
         array = np.ascontiguousarray(array)

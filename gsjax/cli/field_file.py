@@ -18,6 +18,8 @@ from gsjax.methods.feature_field import FeatureField
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig, Located, locate
 
 NAME = "field.npz"
+FOLDER = "field"
+"""Within a run, where its field lies."""
 _AGAIN = "distil it again with this version of gsjax"
 _FORMAT = 1
 

@@ -1,69 +1,115 @@
-"""Pictures of what a query found: the photograph, the heat of the scores, and the scene without, alone,
-recoloured, moved."""
+"""Pictures of what a query found: masks, and the photograph, the heat of the scores, and the scene without
+it, alone, recoloured, moved.
 
+All are drawn by one program a size of picture, for as many Gaussians in one colour each: compiling takes
+longer than drawing. What is not to be seen is hidden, not left out.
+"""
+
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track
 
-from gsjax.cli.field_run import FieldRun
+from gsjax.cli.field_run import FieldRun, short_names
+from gsjax.cli.messages import Notes, describe
 from gsjax.cli.outputs import write_png
-from gsjax.geometry.cameras import Camera
-from gsjax.methods.feature_field import frozen_views
-from gsjax.rasterize.frozen import paint
+from gsjax.geometry.cameras import Camera, camera_centers
+from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import render_with_room
-from gsjax.scene.selection import shifted, tinted, without
+from gsjax.scene.selection import hidden
 from gsjax.viz.colors import heat, highlight, in_rows, to_uint8
-
-if TYPE_CHECKING:
-    from gsjax.cli.field_query import Selection
+from gsjax.viz.viewer.drawing import Drawer, recolored
 
 _MARK = (255, 70, 160)
 _PANEL_HEIGHT = 240  # pixels, at least
+_MOST = 0.5  # of a pixel's light
+_SAID = {"recolored": "recoloured", "moved": "moved"}
 
 
-def telling_view(masks: list[Bool[np.ndarray, "h w"]]) -> int:
-    """Which mask has the largest share of its picture."""
-    return int(np.argmax([mask.mean() for mask in masks]))
-
-
-def draw_overview(
-    path: Path,
+def draw(
+    folder: Path,
     run: FieldRun,
-    v: int,
-    mask: Bool[np.ndarray, "h w"],
-    found: "Selection",
-    color: Any,
-    move: Any,
-) -> None:
-    """Writes a picture of one camera: what was found in the photograph, how all Gaussians scored, and the
-    scene with and without it."""
-    assert run.views is not None
-    photographs, gaussians = run.views.photographs, run.gaussians
-    camera, there = photographs.camera(v), jnp.asarray(found.selected)
-    view, plan = frozen_views(gaussians, [camera], run.rasterize_mode)[0]
-    scores = np.nan_to_num(found.scores)
-    low, high = np.percentile(scores, 1), max(scores.max(), np.percentile(scores, 1) + 1e-6)
-    shares = np.clip((scores - low) / (high - low), 0, 1)
-    drawn, _ = paint(view, jnp.asarray(shares[:, None], jnp.float32), plan)
+    which: Sequence[int],
+    selected: Bool[np.ndarray, "n"],
+    scores: Float[np.ndarray, "n"],
+    scenes: Mapping[str, Gaussians],
+    notes: Notes,
+    console: Console,
+) -> dict[str, int]:
+    """Writes masks/CAMERA.png for each camera, and overview.png of the one that shows most.
 
-    def rendered(scene: Gaussians) -> np.ndarray:
-        if not scene.num:
-            return np.zeros((camera.height, camera.width, 3), np.uint8)
-        one = Camera(camera.viewmat[None], camera.K[None], camera.width, camera.height, camera.near)
-        image = render_with_room(scene, one, None, rasterize_mode=run.rasterize_mode)[0].colors[0]
-        return to_uint8(np.clip(np.asarray(image), 0, 1))
+    Args:
+        folder: for them.
+        run: what was asked.
+        which: of its photographs.
+        selected: what was found: a pixel shows it that has more than half of its light from there.
+        scores: of all.
+        scenes: with it changed, by name.
+        notes: told which photograph cannot be read.
+        console: shows how far it is.
 
-    panels = {
-        "found": highlight(photographs.image(v), mask, _MARK),
-        "scores": heat(np.asarray(drawn[..., 0])),
-        "the object alone": rendered(without(gaussians, ~there)),
-        "without it": rendered(without(gaussians, there)),
-        "recoloured": rendered(tinted(gaussians, there, jnp.asarray(color))),
+    Returns:
+        How many pixels each mask has.
+    """
+    photographs = run.photographs
+    drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
+    assert photographs is not None
+    names, pixels = short_names(photographs.names), {}
+    painted = np.stack([selected, _shares(scores), np.zeros(len(scores))], axis=1).astype(np.float32)
+    values = _painted(run.gaussians, painted)
+    best: tuple[float, int, np.ndarray] | None = None
+    for v in track(which, "drawing", console=console, transient=True):
+        drawn = drawer(values, _one(photographs.camera(v))).colors
+        mask = drawn[..., 0] > _MOST
+        write_png(folder / "masks" / f"{names[v]}.png", np.where(mask, 255, 0).astype(np.uint8))
+        pixels[names[v]] = int(mask.sum())
+        if best is None or mask.mean() > best[0]:
+            best = (float(mask.mean()), v, drawn)
+    assert best is not None
+    _, v, drawn = best
+    camera, there = _one(photographs.camera(v)), jnp.asarray(selected)
+    shown = {
+        "the object alone": hidden(run.gaussians, ~there),
+        "without it": hidden(run.gaussians, there),
+        **{_SAID[name]: scene for name, scene in scenes.items()},
     }
-    if move is not None:
-        panels["moved"] = rendered(shifted(gaussians, there, jnp.asarray(move)))
-    write_png(path, in_rows(panels, 3, _PANEL_HEIGHT))
+    try:
+        behind = photographs.image(v)
+    except (ValueError, OSError) as error:
+        notes.warn(f"overview.png shows a render in place of a photograph: {describe(error)}")
+        behind = to_uint8(drawer(_seen_from(run.gaussians, camera), camera).colors)
+    panels = {"found": highlight(behind, drawn[..., 0] > _MOST, _MARK), "scores": heat(drawn[..., 1])}
+    for words, scene in shown.items():
+        panels[words] = to_uint8(drawer(_seen_from(scene, camera), camera).colors)
+    write_png(folder / "overview.png", in_rows(panels, 3, _PANEL_HEIGHT))
+    return pixels
+
+
+def _one(camera: Camera) -> Camera:
+    """A batch of one."""
+    return Camera(camera.viewmat[None], camera.K[None], camera.width, camera.height, camera.near)
+
+
+def _shares(scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Scores between the least and the largest, but for a few outliers at the lower end, as 0 to 1."""
+    scores = np.nan_to_num(scores)
+    low = np.percentile(scores, 1)
+    return np.clip((scores - low) / max(scores.max() - low, 1e-6), 0, 1)
+
+
+def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """The scene in the colours that it has from one camera, the same from all sides."""
+    toward = gaussians.means - camera_centers(camera.viewmat)[0]
+    colors = jnp.maximum(evaluate_sh(gaussians.sh_degree, gaussians.sh, toward), 0)
+    return _painted(gaussians, np.asarray(colors))
+
+
+def _painted(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
+    """The scene in one colour a Gaussian, and nothing else to be drawn."""
+    return eqx.tree_at(lambda g: g.features, recolored(gaussians, colors), None, is_leaf=lambda x: x is None)

@@ -1,6 +1,7 @@
 """`gsjax query` on a field: the Gaussians that a text, a picture or a point means, and what is done with
 them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -12,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
-from rich.progress import track
 
-from gsjax.cli.field_pictures import draw_overview, telling_view
-from gsjax.cli.field_run import FieldRun, camera_names
+from gsjax.cli.field_pictures import draw
+from gsjax.cli.field_run import FieldRun, short_names
 from gsjax.cli.messages import Notes
-from gsjax.cli.outputs import write_png
-from gsjax.cli.run_folder import fresh_folder
-from gsjax.io.atomic import write_npz
+from gsjax.cli.run_folder import OF_QUERY, replaced_folder
+from gsjax.data.photographs import Photographs
+from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
 from gsjax.methods.feature_field import (
     Threshold,
@@ -27,11 +27,10 @@ from gsjax.methods.feature_field import (
     gaussian_cosines,
     pixel_features,
     relevancy,
-    selection_mask,
     threshold_for,
 )
-from gsjax.scene.gaussians import take
-from gsjax.scene.selection import shifted, tinted, without
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.selection import only, shifted, tinted
 
 _LITTLE = 0.5  # of a pixel's light that the scene must send
 
@@ -47,7 +46,6 @@ class Question:
         camera: short name of the photograph that the point is in, and of the only mask to draw.
         negatives: texts that it is held against; the source's own unless given.
         threshold: of the score; by a rule unless given.
-        weights: of CLIP, where they are now.
     """
 
     text: str | None = None
@@ -56,7 +54,6 @@ class Question:
     camera: str | None = None
     negatives: tuple[str, ...] | None = None
     threshold: float | None = None
-    weights: Path | None = None
 
     @property
     def words(self) -> str:
@@ -64,6 +61,27 @@ class Question:
         if self.point is not None:
             return f"what is at {self.point[0]:g},{self.point[1]:g} of {self.camera}"
         return repr(self.text) if self.image is None else f"what {self.image.name} shows"
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What is done with what was found.
+
+    Attributes:
+        color: RGB, 0 to 1, that it has in recolored.ply.
+        move: metres by which it is moved in moved.ply; None writes none.
+    """
+
+    color: tuple[float, float, float]
+    move: tuple[float, float, float] | None = None
+
+    def of(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
+        """Scenes with the selected ones changed, by the names of their files."""
+        there = jnp.asarray(selected)
+        scenes = {"recolored": tinted(gaussians, there, jnp.asarray(self.color))}
+        if self.move is not None:
+            scenes["moved"] = shifted(gaussians, there, jnp.asarray(self.move))
+        return scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,22 +106,32 @@ class Selection:
 
 
 def answer(
-    run: FieldRun, question: Question, folder: Path, color: Any, move: Any, notes: Notes, console: Console
+    run: FieldRun, question: Question, changes: Changes, folder: Path, notes: Notes, console: Console
 ) -> dict[str, Any]:
     """Ask, and write what is found into a folder; returns what query.json says.
+
+        query/
+          query.json          what was asked, by which rule, how many Gaussians, where and how large it is
+          selection.npz       indices [n], rows of the scene's PLY file; their scores [n] and means [n,3]; and
+                              all_scores, one for each row of the file, NaN for one that cannot be drawn
+          object.ply          what was found; without.ply the scene without it, recolored.ply with it in
+                              another colour, moved.ply with it elsewhere
+          masks/CAMERA.png    255 where it shows
+          overview.png        it in a photograph, the scores, and these scenes
 
     Args:
         run: the field.
         question: what is asked.
-        folder: for it; what an earlier question left there is removed.
-        color: RGB, 0 to 1, of the recoloured object.
-        move: metres by which it is moved, or None.
+        changes: what is done with what is found.
+        folder: for it, in place of an earlier answer, which stays until this one is whole.
         notes: told of what is odd.
         console: shows how far it is.
 
     Raises:
         ValueError: the question cannot be understood, or means nothing of the scene.
+        FileExistsError: something is in the folder that is no answer.
     """
+    chosen = _chosen(run, question)
     found = select(run, question)
     selected, count = found.selected, int(found.selected.sum())
     if count == 0:
@@ -116,41 +144,60 @@ def answer(
         notes.warn(
             f"{question.words} means all {count} Gaussians; a higher --threshold would tell them apart"
         )
-    fresh_folder(folder)  # from here on an earlier answer is gone
-    gaussians, there = run.gaussians, jnp.asarray(selected)
-    means = np.asarray(gaussians.means)[selected]
-    write_npz(
-        folder / "selection.npz",
-        {
-            "indices": np.flatnonzero(selected),
-            "scores": found.scores[selected].astype(np.float32),
-            "means": means,
-            "all_scores": found.scores.astype(np.float32),
-        },
-    )
-    write_ply(folder / "object.ply", take(gaussians, there))
-    if count < len(selected):
-        write_ply(folder / "without.ply", without(gaussians, there))
-    write_ply(folder / "recolored.ply", tinted(gaussians, there, jnp.asarray(color)))
-    if move is not None:
-        write_ply(folder / "moved.ply", shifted(gaussians, there, jnp.asarray(move)))
-    told = {
-        "text": question.text,
-        "image": None if question.image is None else str(question.image),
-        "point": question.point,
-        "camera": question.camera,
-        "against": found.against,
-        "threshold": found.threshold.value,
-        "rule": found.threshold.rule,
-        "gaussians": count,
-        "of": len(selected),
-        "best_score": float(found.scores.max()),
-        "center": means.mean(axis=0),
-        "size": np.ptp(means, axis=0),
-        "query_seconds": found.seconds,
-        "pixels": _draw(run, question, found, folder, color, move, console),
-    }
+    scenes = changes.of(run.gaussians, selected)
+    with replaced_folder(folder, OF_QUERY) as new:
+        _write_selection(new / "selection.npz", run, found)
+        _write_scenes(new, run, selected, scenes)
+        pixels = draw(new, run, chosen, selected, found.scores, scenes, notes, console) if chosen else {}
+        means = np.asarray(run.gaussians.means)[selected]
+        told = {
+            "text": question.text,
+            "image": None if question.image is None else str(question.image),
+            "point": question.point,
+            "camera": question.camera,
+            "features": run.stored.source.kind,
+            "scene": str(run.file),
+            "against": found.against,
+            "threshold": found.threshold.value,
+            "rule": found.threshold.rule,
+            "gaussians": count,
+            "of": len(selected),
+            "best_score": float(found.scores.max()),
+            "center": means.mean(axis=0),
+            "size": np.ptp(means, axis=0),
+            "query_seconds": found.seconds,
+            "pixels": pixels,
+            "notes": notes.all,
+        }
+        write_json(new / "query.json", told)
     return told
+
+
+def _write_selection(path: Path, run: FieldRun, found: Selection) -> None:
+    """Writes selection.npz, by rows of the scene's file."""
+    selected = found.selected
+    all_scores = np.full(run.num_rows, np.nan, np.float32)
+    all_scores[run.rows] = found.scores
+    arrays = {
+        "indices": run.rows[selected],
+        "scores": found.scores[selected].astype(np.float32),
+        "means": np.asarray(run.gaussians.means)[selected],
+        "all_scores": all_scores,
+    }
+    write_npz(path, arrays)
+
+
+def _write_scenes(
+    folder: Path, run: FieldRun, selected: Bool[np.ndarray, "n"], scenes: Mapping[str, Gaussians]
+) -> None:
+    """Writes PLY files of what was found, of the rest, and of the changed scenes, with the file's labels."""
+    labels = run.labels
+    for name, kept in (("object", selected), ("without", ~selected)):
+        if kept.any():
+            part = None if labels is None else labels[kept]
+            write_ply(folder / f"{name}.ply", only(run.gaussians, kept), labels=part)
+    for name, scene in scenes.items():
+        write_ply(folder / f"{name}.ply", scene, labels=labels)
 
 
 def select(run: FieldRun, question: Question) -> Selection:
@@ -186,33 +233,32 @@ def _scores(field, located, queries):
 
 def _queries(run: FieldRun, question: Question) -> tuple[np.ndarray, tuple[str, ...], float | None]:
     """The vector that is asked for and those of negatives, their texts, and the encoder's own threshold."""
-    source = run.stored.source
+    source, against, least = run.stored.source, question.negatives, None
     if question.point is not None:
-        vector, encoder = _at_point(run, question), None
-        if source.kind != "classes":
-            return vector[None], (), None
-        encoder = source.encoder()
-        codes = np.stack([encoder.embed_text(name) for name in encoder.names])
-        name = encoder.names[int((codes @ vector).argmax())]
-        against = encoder.others(name) if question.negatives is None else question.negatives
-        return np.stack([encoder.embed_text(text) for text in (name, *against)]), against, None
-    encoder = source.encoder(question.weights)
-    if question.image is not None:
+        vector = _at_point(run, question)
+        if source.kind == "classes":  # it means the class that it is nearest to
+            names = list(source.names.values())
+            codes = np.stack([run.encoder.embed_text(name) for name in names])
+            name = names[int((codes @ vector).argmax())]
+            vector, against = run.encoder.embed_text(name), _against(against, source.negatives(name))
+    elif question.image is not None:
         if source.kind == "classes":
             raise ValueError("--image: classes are known by name, not by sight; ask by text or --point")
-        vector, text = _of_image(encoder, question.image), None
+        vector = _of_image(run, question.image)
     else:
         assert question.text is not None
-        vector, text = encoder.embed_text(question.text), question.text
-    against = question.negatives
-    if against is None:
-        against = () if text is None else source.negatives(text)
-    closed = source.kind == "closed" and text is not None
-    vectors = np.stack([vector, *(encoder.embed_text(negative) for negative in against)])
-    return vectors, tuple(against), encoder.min_score if closed else None
+        vector = run.encoder.embed_text(question.text)
+        against = _against(against, source.negatives(question.text))
+        least = run.encoder.min_score if source.kind == "closed" else None
+    against = against or ()
+    return np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against, least
 
 
-def _of_image(encoder: Any, path: Path) -> np.ndarray:
+def _against(given: tuple[str, ...] | None, otherwise: tuple[str, ...]) -> tuple[str, ...]:
+    return otherwise if given is None else given
+
+
+def _of_image(run: FieldRun, path: Path) -> np.ndarray:
     """The vector of a picture."""
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
@@ -224,67 +270,57 @@ def _of_image(encoder: Any, path: Path) -> np.ndarray:
     opaque = picture[..., 3] > 127 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)
     if not opaque.any():
         raise ValueError(f"--image {path}: expected something opaque in it, found nothing")
-    image = np.ascontiguousarray(picture[..., 2::-1])
-    return np.asarray(encoder.embed_objects(image, opaque.astype(np.int32), 1))[0]
+    label = max(run.stored.source.names, default=0) + 1  # which has no name: it is known by sight
+    image, labels = np.ascontiguousarray(picture[..., 2::-1]), np.where(opaque, label, 0).astype(np.int32)
+    return np.asarray(run.encoder.embed_objects(image, labels, label))[-1]
 
 
 def _at_point(run: FieldRun, question: Question) -> np.ndarray:
     """What the field says of a pixel, in the teacher's channels."""
+    photographs = run.photographs
     assert question.point is not None
-    if run.views is None:
-        raise ValueError("--point: expected the photographs that it is in, found none; see the warning above")
-    photographs, v = run.views.photographs, view_number(run, question.camera)
+    assert question.camera is not None
+    assert photographs is not None
+    v = _number(photographs, question.camera)
     width, height = (int(side) for side in photographs.sizes[v])
     x, y = question.point
     if not (0 <= x < width and 0 <= y < height):
         raise ValueError(f"--point: expected one in {width}x{height} pixels, found {x:g},{y:g}")
     field, located = run.stored.at(run.gaussians.means)
     view, plan = frozen_views(run.gaussians, [photographs.camera(v)], run.rasterize_mode)[0]
-    features, alphas = pixel_features(field, located, view, plan, jnp.array([[int(x), int(y)]]))
+    pixel = jnp.array([[int(x), int(y)]])
+    features, alphas = jax.jit(pixel_features)(field, located, view, plan, pixel)
     if float(alphas[0]) < _LITTLE:
         raise ValueError(f"--point {x:g},{y:g}: expected something of the scene, found nothing there")
     return np.asarray(features[0])
 
 
-def view_number(run: FieldRun, camera: str | None) -> int:
-    """Which photograph a short name means; the first that is held out, else the first, unless given.
+def _chosen(run: FieldRun, question: Question) -> list[int]:
+    """Which photographs a mask is drawn for.
+
+    Raises:
+        ValueError: the question names one that is not there.
+    """
+    if run.photographs is None:
+        if question.camera is not None:
+            raise ValueError(
+                "--camera: expected photographs, found none (see the warning); --images says where they are"
+            )
+        return []
+    number = None if question.camera is None else _number(run.photographs, question.camera)
+    everywhere = number is None or question.point is not None
+    return list(range(run.photographs.num)) if everywhere else [number]
+
+
+def _number(photographs: Photographs, camera: str) -> int:
+    """Which photograph a name means, in short or in full.
 
     Raises:
         ValueError: there is none of that name.
     """
-    assert run.views is not None
-    names = camera_names(run.views.photographs.names)
-    if camera is None:
-        return int([*run.views.held_out, *run.views.taught][0])
-    for known in (names, run.views.photographs.names):
+    names = short_names(photographs.names)
+    for known in (names, photographs.names):
         if camera in known:
             return known.index(camera)
     listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     raise ValueError(f"--camera: expected one of {listed}, found {camera}")
-
-
-def _draw(
-    run: FieldRun, question: Question, found: Selection, folder: Path, color: Any, move: Any, console: Console
-) -> dict[str, int]:
-    """Writes a mask for each camera and overview.png; returns how many pixels each mask has."""
-    if run.views is None:
-        return {}
-    photographs, names = run.views.photographs, camera_names(run.views.photographs.names)
-    which = range(photographs.num)
-    if question.camera is not None and question.point is None:
-        which = [view_number(run, question.camera)]
-    cameras = [photographs.camera(v) for v in which]
-    views = frozen_views(run.gaussians, cameras, run.rasterize_mode)
-    draw = jax.jit(selection_mask, static_argnums=1)
-    selected, pixels = jnp.asarray(found.selected), {}
-    masks = []
-    for v, (view, plan) in zip(track(which, "drawing", console=console, transient=True), views, strict=True):
-        mask = np.asarray(draw(view, plan, selected))
-        path = folder / "masks" / f"{names[v]}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_png(path, np.where(mask, 255, 0).astype(np.uint8))
-        pixels[names[v]] = int(mask.sum())
-        masks.append(mask)
-    best = telling_view(masks)
-    draw_overview(folder / "overview.png", run, list(which)[best], masks[best], found, color, move)
-    return pixels

@@ -1,25 +1,26 @@
 """What a distillation came to: how it agrees with its teacher, pictures of what it learned, the report."""
 
-from collections.abc import Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, UInt8
 from rich.console import Console
 from rich.table import Table as Grid
 
-from gsjax.cli.feature_cache import FeatureCache
 from gsjax.cli.field_file import StoredField
 from gsjax.cli.field_scene import FieldScene
-from gsjax.cli.field_scores import ClassScores, Frozen, angle_errors, class_maps, classes_of
-from gsjax.cli.field_teacher import Asked, Said, teach
+from gsjax.cli.field_scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
+from gsjax.cli.field_teacher import Teaching
 from gsjax.cli.fit_results import mean_scores
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, describe
 from gsjax.cli.outputs import write_png
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
-from gsjax.methods.feature_field import FieldConfig, carried, features_of, frozen_views
+from gsjax.methods.feature_field import FeatureField, FieldConfig, carried
 from gsjax.rasterize.frozen import paint
+from gsjax.scene.feature_grid import Located
 from gsjax.viz.colors import (
     PcaColors,
     colorize_features,
@@ -38,53 +39,44 @@ _PANEL_HEIGHT = 240  # pixels, at least
 def judge(
     folder: RunFolder,
     scene: FieldScene,
-    said: Said,
-    asked: Asked,
-    cache: FeatureCache,
+    teaching: Teaching,
     stored: StoredField,
     config: FieldConfig,
     notes: Notes,
 ) -> dict[str, Any]:
     """Compares held-out views, or those that taught where none is held out, with what the teacher says of
-    them, and draws some."""
-    held_out, console = len(scene.held_out) > 0, Console(quiet=True)
+    them, and draws some. What cannot be read is noted, and nothing is compared there."""
+    held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
-    photographs = scene.photographs
     field, located = stored.at(scene.gaussians.means)
-    cameras = [photographs.camera(i) for i in which]
-    views = frozen_views(scene.gaussians, cameras, scene.rasterize_mode)
-    errors: Sequence[float | None] = [None] * len(which)
-    try:
-        truth = teach(photographs, which, asked, cache, console).teacher if held_out else None
-        if truth is None:
-            places = [scene.taught.index(i) for i in which]
-            truth = said.teacher._replace(
-                ids=[said.teacher.ids[p] for p in places],
-                maps=None if said.teacher.maps is None else [said.teacher.maps[p] for p in places],
-            )
-        errors = angle_errors(field, located, views, truth, config)
-    except (ValueError, OSError) as error:
-        notes.add(f"Held-out views were not compared with the teacher: {describe(error)}")
-    names = {label - 1: name for label, name in said.source.names.items()}
+    views = one_by_one(scene.gaussians, (photographs.camera(i) for i in which), scene.rasterize_mode)
+    names = {label - 1: name for label, name in teaching.source.names.items()}
     codes = of_gaussians = None
-    if said.source.kind == "classes":
-        encoder = said.source.encoder()
+    if teaching.source.kind == "classes":
+        encoder = teaching.source.encoder()
         codes = np.stack([encoder.embed_text(name) for name in names.values()])
         of_gaussians, order = classes_of(field, located, codes), np.array(list(names))
-    scores, rows, pca = ClassScores(names), [], _colors(field, located)
-    for view, i, error in zip(views, which, errors, strict=True):
-        row: dict[str, Any] = {"view": photographs.names[i], "cosine": None if error is None else 1 - error}
-        panels = {
-            "photograph": to_uint8(photographs.image(i)),
-            "features": _features(field, located, view, pca),
-        }
+    scores, rows, error_of = ClassScores(names), [], angle_error(config)
+    colors, pca = feature_colors(field, located)
+    for view, i in zip(views, which, strict=True):
+        row: dict[str, Any] = {"view": photographs.names[i], "cosine": None}
+        panels, true, shown = {}, None, len(rows) < _SHOWN
+        try:
+            panels["photograph"] = to_uint8(photographs.image(i))
+            true = photographs.labels(i)
+            if (said := teaching.of(i)) is not None:
+                row["cosine"] = 1 - error_of(field, located, view, said)
+        except (ValueError, OSError) as error:
+            notes.warn(f"{row['view']} was not compared with the teacher: {describe(error)}")
+        if shown:
+            panels["features"] = draw_features(colors, view, pca)
         if codes is not None and of_gaussians is not None:
             found = class_maps(field, located, view, codes, of_gaussians)
             by_pixel, in_space = (np.where(one < 0, -1, order[np.maximum(one, 0)]) for one in found)
             panels["classes, by Gaussians"] = colorize_labels(np.maximum(in_space, 0))
-            if (true := photographs.labels(i)) is not None:
+            if true is not None:
                 scores.add(by_pixel, in_space, true)
-        if len([r for r in rows if "picture" in r]) < _SHOWN:
+        if shown:
             path = folder.render("held_out" if held_out else "taught", len(rows))
             write_png(path, in_rows(panels, len(panels), _PANEL_HEIGHT))
             row["picture"] = str(path.relative_to(folder.path))
@@ -102,19 +94,25 @@ def judge(
     }
 
 
-def _colors(field, located) -> PcaColors:
-    features = np.asarray(features_of(field, located))
-    return fit_pca_colors(features[:: max(1, len(features) // _OF_PCA)])
-
-
-def _features(field, located, view: Frozen, pca: PcaColors) -> np.ndarray:
-    """A view in the colours of its features; what shows little of the scene is near black."""
+def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[Array, "n three"], PcaColors]:
+    """The three numbers of each Gaussian's feature that its colour comes from, and which colours they are."""
     parts = carried(field, located)
-    image, alphas = paint(view[0], parts.values, view[1])
-    channels = np.asarray(parts.channels_of(parts.joined(image, alphas)))
-    alphas = np.asarray(alphas)
-    mean = channels / np.maximum(alphas[..., None], 0.5)
-    return colorize_features(np.where(alphas[..., None] > 0.5, mean, np.nan), pca)
+    some = parts.values[:: max(1, len(parts.values) // _OF_PCA)]
+    pca = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(some, jnp.ones(len(some), some.dtype)))))
+    axes = jnp.asarray(pca.axes, parts.values.dtype)
+    # Linear, as rendering is: three numbers a pixel are painted, not all channels.
+    ones = jnp.ones(len(parts.values), parts.values.dtype)
+    numbers = jnp.matmul(parts.joined(parts.values, ones), parts.lifted(axes.T).T, precision="highest")
+    return numbers, pca._replace(mean=pca.mean @ pca.axes, axes=np.eye(3))
+
+
+def draw_features(
+    numbers: Float[Array, "n three"], frozen: Frozen, pca: PcaColors
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A view in the colours of its features; what shows little of the scene is near black."""
+    image, alphas = (np.asarray(a) for a in paint(frozen[0], numbers, frozen[1]))
+    alphas = alphas[..., None]
+    return colorize_features(np.where(alphas > 0.5, image / np.maximum(alphas, 0.5), np.nan), pca)
 
 
 def write_results(folder: RunFolder, found: dict[str, Any]) -> None:

@@ -1,15 +1,19 @@
 """The scene that a field is distilled for, and the photographs of it: those of a run, or of a PLY file that
 others made."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
-from gsjax.cli.photographs import choose_photographs, photographs_of_run, split
+from gsjax.cli.photographs import choose_photographs, photographs_of_run, smaller, split
+from gsjax.cli.recording import expect_scale
 from gsjax.cli.run_files import read_arrays, reopen
+from gsjax.cli.run_folder import expect_run
 from gsjax.cli.run_records import read_record
 from gsjax.data.errors import DataError
 from gsjax.data.open import ReadOptions
@@ -18,6 +22,32 @@ from gsjax.io.ply import read_ply
 from gsjax.scene.gaussians import Gaussians
 
 _AGAIN = "run it again with this version of gsjax"
+_OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  # a run has chosen these
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which scene, and which photographs of it."""
+
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
+    """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
+    or a PLY file that anybody made, with --images and --out."""
+    images: str | None = None
+    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`. Of a run: where
+    they are now."""
+    scale: float = 1.0
+    """Width and height that photographs are to have, as a share of what they have: 0.5 is half of each. Time
+    goes with the number of pixels."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Of --images: which photographs, or which frame of a recording, as Python slices them."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Of --images, a recording: ids of the cameras to learn from. All that are not held out, unless given."""
+    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Of --images, a recording: ids of cameras that only judge."""
+    test_every: int = 8
+    """Of --images: hold out every N-th photograph where the data has no split; 0 holds out none."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """Of --images: what the layout of the data leaves open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,24 +71,58 @@ class FieldScene:
     rasterize_mode: str = "classic"
 
 
-def scene_of_run(path: Path, images: str | None = None) -> FieldScene:
+def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> FieldScene:
+    """The scene and its photographs.
+
+    Args:
+        options: which.
+        gaussians: the scene's, where they were read already.
+
+    Raises:
+        ValueError, OSError: they are not there, or options are given that a run has chosen itself.
+    """
+    expect_scale(options.scale)
+    path = options.scene
+    if path.is_file():
+        if options.images is None:
+            raise ValueError(f"{path}: a PLY file has no photographs; --images names a folder of them")
+        if options.test_every < 0 or options.test_every == 1:
+            raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
+        chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
+        scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
+    else:
+        expect_run(path, "`gsjax fit`, `gsjax track` or `gsjax parts`, or a PLY file")
+        given = [n for n in _OF_PHOTOGRAPHS if getattr(options, n) != getattr(SceneOptions(path), n)]
+        if given:
+            flag = f"--{given[0].replace('_', '-')}"
+            raise ValueError(
+                f"{flag}: {path} is a run, which has its photographs chosen and split; leave it out"
+            )
+        scene = scene_of_run(path, options.images, gaussians)
+    if not scene.gaussians.num:
+        raise ValueError(f"{scene.file}: expected Gaussians to give a meaning to, found none")
+    return scaled(scene, options.scale)
+
+
+def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | None = None) -> FieldScene:
     """That of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame).
 
     Args:
         path: the run's folder.
         images: where its photographs are now; where they were, unless given.
+        gaussians: the scene's, where they were read already.
 
     Raises:
         FileNotFoundError, ValueError: there is no such run, or it has no scene, or no photographs that can be
             read.
     """
     if (path / "canonical" / "scene.ply").is_file():
-        return scene_of_run(path / "canonical", images)
+        return scene_of_run(path / "canonical", images, gaussians)
     record = read_record(path)
     file = path / "scene.ply"
     if not file.is_file():
         raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run goes on still, or failed")
-    gaussians = _read(file)
+    gaussians = _read(file) if gaussians is None else gaussians
     if record.kind == "track":
         if images is not None:
             raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
@@ -75,7 +139,14 @@ def scene_of_run(path: Path, images: str | None = None) -> FieldScene:
     return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)
 
 
-def scene_of_file(file: Path, images: str, read: ReadOptions, test_every: int, **chosen) -> FieldScene:
+def scene_of_file(
+    file: Path,
+    images: str,
+    read: ReadOptions,
+    test_every: int,
+    gaussians: Gaussians | None = None,
+    **chosen,
+) -> FieldScene:
     """A PLY file with photographs of the same world.
 
     Args:
@@ -83,18 +154,24 @@ def scene_of_file(file: Path, images: str, read: ReadOptions, test_every: int, *
         images: a dataset.
         read: what its layout leaves open.
         test_every: hold out every so-manieth photograph where the data has no split.
+        gaussians: the scene's, where they were read already.
         **chosen: as `choose_photographs` has them.
 
     Raises:
         PlyError, DataError, ValueError: one of them cannot be read.
     """
     photographs = choose_photographs(images, read, **chosen)
-    return FieldScene(file, _read(file), photographs, *_split(photographs, test_every))
+    gaussians = _read(file) if gaussians is None else gaussians
+    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every))
 
 
 def scaled(scene: FieldScene, scale: float) -> FieldScene:
-    """With smaller photographs."""
-    return replace(scene, photographs=scene.photographs.scaled(scale))
+    """With smaller photographs.
+
+    Raises:
+        ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of them.
+    """
+    return replace(scene, photographs=smaller(scene.photographs, scale))
 
 
 def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:

@@ -1,6 +1,6 @@
 """How well a field says of views what its teacher would have said: angles, and masks of classes."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -10,20 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.feature_field import (
     FeatureField,
     FieldBatch,
     FieldConfig,
     Teacher,
     field_loss,
+    frozen_views,
     gaussian_cosines,
     pixel_cosines,
 )
+from gsjax.methods.feature_field.teacher import most_rows, of_view
 from gsjax.metrics.segmentation import MaskOverlap
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, paint
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.feature_grid import Located
+from gsjax.scene.gaussians import Gaussians
 
 _OPAQUE = 0.5
 Frozen = tuple[FrozenView, Plan]
@@ -108,28 +112,41 @@ def classes_of(
     return np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)).argmax(axis=-1))
 
 
-def angle_errors(
-    field: FeatureField,
-    located: Located | None,
-    views: list[Frozen],
-    teacher: Teacher,
-    config: FieldConfig,
-) -> list[float | None]:
-    """1 - cosine to what the teacher says, the mean over each view's pixels; None where it says nothing."""
+def angle_error(config: FieldConfig) -> Callable[[FeatureField, Located | None, Frozen, Teacher], float]:
+    """1 - cosine to what a teacher of one view says, the mean over its pixels, by a program that is compiled
+    once for views of one kind."""
     quiet = replace(config, weights=replace(config.weights, rec=1.0, contrast=0.0, tv=0.0))
     loss = jax.jit(partial(field_loss(quiet), step=0, key=None), compiler_options=host_options())
-    codebook = None if teacher.codebook is None else jnp.asarray(teacher.codebook)
-    found: list[float | None] = []
-    for v, (view, plan) in enumerate(views):
-        ids, said = (
-            jnp.asarray(teacher.ids[v]),
-            None if teacher.maps is None else jnp.asarray(teacher.maps[v]),
+
+    def error(field: FeatureField, located: Located | None, frozen: Frozen, teacher: Teacher) -> float:
+        view, plan = frozen
+        rows = 1 << (most_rows(teacher) - 1).bit_length()  # few lengths
+        ids, codebook = of_view(teacher, 0, rows)
+        said = None if teacher.maps is None else teacher.maps[0]
+        batch = FieldBatch(
+            view, located, jnp.asarray(ids), None if codebook is None else jnp.asarray(codebook), said, plan
         )
-        if said is None and not (teacher.ids[v] >= 0).any():
-            found.append(None)
-            continue
-        found.append(float(loss(field, FieldBatch(view, located, ids, codebook, said, plan))[1]["cos"]))
-    return found
+        return float(loss(field, batch)[1]["cos"])
+
+    return error
+
+
+def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: str) -> Iterator[Frozen]:
+    """The scene in each camera, of which only one is in memory. Lists are filled up to few lengths, which
+    never shrink, so that views of one size share what is compiled for them."""
+    largest: dict[tuple[int, int], tuple[int, int, int]] = {}
+    for camera in cameras:
+        ((view, plan),) = frozen_views(gaussians, [camera], rasterize_mode)
+        needed = (plan.capacity, rung(len(view.rows)), rung(len(view.ids)))
+        before = largest.get((plan.width, plan.height), needed)
+        capacity, seen, pairs = largest[plan.width, plan.height] = tuple(map(max, needed, before))
+        lengths = {"rows": seen, "means2d": seen, "conics": seen, "opacities": seen, "ids": pairs}
+        filled = {name: _filled_up(getattr(view, name), length) for name, length in lengths.items()}
+        yield view._replace(**filled), replace(plan, capacity=capacity)
+
+
+def _filled_up(a: Array, length: int) -> Array:
+    return jnp.pad(a, ((0, length - len(a)), *[(0, 0)] * (a.ndim - 1)))
 
 
 @partial(jax.jit, static_argnums=(5, 6))

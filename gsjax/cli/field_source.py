@@ -59,9 +59,11 @@ class Source:
             weights: of CLIP, where they are now; or for features from files, if they are CLIP's.
 
         Raises:
-            ValueError: nobody does, or a package is missing.
+            ValueError: nobody does, a package is missing, or weights are given to one that has none.
             FileNotFoundError: the weights are not there.
         """
+        if self.kind in ("classes", "closed") and weights is not None:
+            raise ValueError(f"--weights: features of {self.kind} have none; leave it out")
         if self.kind == "classes":
             return ClassCodebook(self.names)
         if self.kind == "closed":
@@ -69,7 +71,7 @@ class Source:
         if self.kind == "files" and weights is None:
             raise ValueError(
                 "these features are from files, and nobody here reads texts in their space; if they are "
-                "CLIP's, --weights names its folder; else ask by --point"
+                "CLIP's, --weights names its folder; else ask by --point, or in gsjax view for what is picked"
             )
         from gsjax.perception.clip import load_clip
 
@@ -77,6 +79,8 @@ class Source:
             return load_clip(weights or str(self.weights))
         except ImportError as error:
             raise ValueError(f"{self.kind}: {error}") from error
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{error}; --weights says where they are now") from error
 
     def negatives(self, text: str) -> tuple[str, ...]:
         """What a text is held against unless told: with classes all others, with CLIP what is meant by

@@ -1,7 +1,9 @@
 """A field in the viewer: what the page asks it, and what it keeps."""
 
 import re
+import threading
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 
@@ -12,11 +14,11 @@ from jaxtyping import Bool
 
 from gsjax.cli.field_query import Question, select
 from gsjax.cli.field_run import FieldRun
-from gsjax.cli.field_source import Source
+from gsjax.io.atomic import write_new
 from gsjax.io.ply import write_ply
 from gsjax.methods.feature_field import FeatureField, features_of, gaussian_cosines, threshold_for
 from gsjax.perception.closed_vocabulary import COLORS, OUTLINES
-from gsjax.scene.gaussians import take
+from gsjax.scene.selection import only
 from gsjax.viz.viewer import Asking, Found
 
 FOLDER = "extracted"
@@ -25,8 +27,8 @@ FOLDER = "extracted"
 def asking_of(run: FieldRun) -> Asking:
     """How the page asks a field; what it saves goes to `extracted/` in the field's folder."""
     grid, located = run.stored.at(run.gaussians.means)
-    # Asked again and again: features are worked out once.
-    field = FeatureField(features_of(grid, located), grid.lift)
+    # Asked again and again: features are worked out once, and who reads texts is loaded once.
+    field, one_by_one = FeatureField(features_of(grid, located), grid.lift), threading.Lock()
     run = replace(run, stored=replace(run.stored, field=field, rows=None))
 
     @jax.jit
@@ -35,7 +37,8 @@ def asking_of(run: FieldRun) -> Asking:
         return gaussian_cosines(field, None, vector[None])[:, 0]
 
     def ask(text: str) -> Found:
-        found = select(run, Question(text=text))
+        with one_by_one:  # several pages may ask before the encoder is loaded
+            found = select(run, Question(text=text))
         return Found(text, found.scores, found.threshold.value, found.threshold.rule, found.seconds)
 
     def like(row: int) -> Found:
@@ -49,28 +52,21 @@ def asking_of(run: FieldRun) -> Asking:
     def save(selected: Bool[np.ndarray, "n"], name: str) -> Path:
         folder = run.path / FOLDER
         folder.mkdir(exist_ok=True)
-        path = _free(folder, "_".join(re.findall(r"[^\W_]+", name.lower())) or "selection")
-        write_ply(path, take(run.gaussians, selected))
-        return path
+        stem = "_".join(re.findall(r"[^\W_]+", name.lower())) or "selection"
+        names = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
+        labels = None if run.labels is None else run.labels[selected]
+        return write_new(names, lambda path: write_ply(path, only(run.gaussians, selected), labels=labels))
 
-    return Asking(_hint(run.stored.source), ask, like, save)
+    return Asking(_hint(run), ask, like, save)
 
 
-def _hint(source: Source) -> str:
+def _hint(run: FieldRun) -> str:
+    """What can be asked for."""
+    source = run.stored.source
     if source.kind == "classes":
         return "One of: " + ", ".join(sorted(source.names.values()))
     if source.kind == "closed":
         return "Colours and outlines: " + ", ".join((*COLORS, *OUTLINES, *source.names.values()))
-    return "Any words" if source.kind in ("clip", "maskclip") else "No words: ask for what is picked"
-
-
-def _free(folder: Path, name: str) -> Path:
-    """A path of that name that nothing has; a file is put there at once."""
-    number = 1
-    while True:
-        path = folder / (f"{name}.ply" if number == 1 else f"{name}_{number}.ply")
-        try:
-            path.open("x").close()
-            return path
-        except FileExistsError:
-            number += 1
+    if source.kind == "files" and run.weights is None:
+        return "No words (--weights, if these features are CLIP's): ask for what is picked"
+    return "Any words"

@@ -63,22 +63,27 @@ def choose_photographs(
                 f"--frames: {frames} holds no photograph of {photographs.name}, which has 0 to "
                 f"{photographs.num - 1}."
             )
-        return _scaled(photographs.select(chosen), scale)
+        return smaller(photographs.select(chosen), scale)
     recording = open_recording(dataset, cameras, eval_cameras, frames, read)
     photographs = photographs_of(recording.judged)
     if eval_cameras:
         places = np.arange(photographs.num) % recording.judged.num_cameras
         held_out = places >= recording.tracked.num_cameras
         photographs = replace(photographs, splits=tuple("test" if out else "train" for out in held_out))
-    return _scaled(photographs, scale)
+    return smaller(photographs, scale)
 
 
-def _scaled(photographs: Photographs, scale: float) -> Photographs:
-    smaller = photographs.scaled(scale)
-    least = smaller.sizes.min(1).argmin()
-    sizes = (tuple(of.sizes[least].tolist()) for of in (photographs, smaller))
+def smaller(photographs: Photographs, scale: float) -> Photographs:
+    """The same views in smaller photographs.
+
+    Raises:
+        ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of one.
+    """
+    scaled = photographs.scaled(scale)
+    least = scaled.sizes.min(1).argmin()
+    sizes = (tuple(of.sizes[least].tolist()) for of in (photographs, scaled))
     expect_enough_left(scale, "a photograph", *sizes)
-    return smaller
+    return scaled
 
 
 def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) -> Photographs:

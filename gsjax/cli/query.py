@@ -1,18 +1,29 @@
 """`gsjax query`: what of a run a text means: an object of a tracked one, in every frame; or, where there is a
 field (`gsjax distill`), Gaussians."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from time import perf_counter
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from gsjax.cli.field_query import Question, answer
-from gsjax.cli.field_run import field_of, open_field_run
-from gsjax.cli.messages import Notes
+from gsjax.cli.field_query import Changes, Question, answer
+from gsjax.cli.field_run import FieldRun, Whereabouts, field_of, open_field_run, unfinished_field_of
+from gsjax.cli.messages import Notes, stage
 from gsjax.cli.object_query import Asked, ask_for_object
-from gsjax.io.atomic import write_json
+from gsjax.cli.run_folder import is_run
+from gsjax.cli.run_records import read_record
+
+HELP = (
+    " Of a run of `gsjax track` a text means an object, of whatever has a field Gaussians; of a tracked run "
+    "that has a field too RUN/field asks that by text."
+)
+_COLOR = (1.0, 0.25, 0.6)
+_OF_FIELDS = ("image", "point", "negatives", "threshold", "color", "move", "scene", "images")
+_LISTED = 6  # photographs, at most
 
 
 @dataclass(frozen=True)
@@ -20,7 +31,8 @@ class Options:
     """What `gsjax query` is told."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder of a run of `gsjax track`, or of any run with a field (`gsjax distill`), or of such a field."""
+    """Folder of a run of `gsjax track`; of any run with a field (`gsjax distill`); or that holds field.npz.
+    The answer is written to query/ in it, in place of an earlier one."""
     text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")] = None
     """What is looked for: "red can". Or say it by --image or --point."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
@@ -31,15 +43,21 @@ class Options:
     point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
     """Of a field: a pixel of --camera that shows what is looked for."""
     negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
-    """Of a field: what the text is held against. Of classes all others, of CLIP "object", "things",
-    "stuff", "texture", unless given."""
+    """Of a field: what it is held against. A text is, of classes, against all others, of CLIP against
+    "object", "things", "stuff", "texture", unless given."""
     threshold: float | None = None
-    """Of a field: score from which on a Gaussian is meant. 1/2 against negatives, else where the scores part
-    best into two kinds (Otsu), unless given."""
-    color: tuple[float, float, float] = (1.0, 0.25, 0.6)
-    """Of a field: RGB, 0 to 1, of what was found in recolored.ply."""
+    """Of a field: score above which a Gaussian is meant. Unless given, 1/2 against negatives; of a text of
+    the closed vocabulary its own; else where the scores part best into two kinds (Otsu)."""
+    color: tuple[float, float, float] | None = None
+    """Of a field: RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
     move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Of a field: metres by which what was found is moved in moved.ply; not written unless given."""
+    """Of a field: by how much along each axis, in the scene's unit, what was found is moved in moved.ply; not
+    written unless given."""
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
+    """Of a field: the file of its scene, where it is now. Found where it was, or beside the field, unless
+    given."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Of a field: the photographs, where they are now."""
     encoder: Literal["closed", "clip"] = "closed"
     """Of a tracked run: who understands the text, a closed vocabulary without weights, or CLIP."""
     weights: Path | None = None
@@ -58,29 +76,73 @@ def run(options: Options) -> int:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
-    tracked = (options.run / "trajectory.npz").is_file()  # which answers over time, unless by sight
-    if field is not None and not (tracked and options.image is None and options.point is None):
+    tracked = (
+        options.run / "trajectory.npz"
+    ).is_file()  # which answers over time, but to what only fields can
+    if field is not None and not (tracked and _for_fields(options) is None):
         return _ask_field(options, field, console)
+    if field is None and not tracked:
+        _expect_track(options.run)
     ask_for_object(_asked(options), console)
     return 0
 
 
+def _for_fields(options: Options) -> str | None:
+    """An option that only a field has a use for, if one is given."""
+    return next((name for name in _OF_FIELDS if getattr(options, name) is not None), None)
+
+
+def _expect_track(path: Path) -> None:
+    """Raises a ValueError where a run has no field (yet), and is none of `gsjax track` either."""
+    unfinished = unfinished_field_of(path)
+    if unfinished is not None:
+        raise ValueError(
+            f"{unfinished}: expected field.npz, found none yet: it is still being distilled, or was killed; "
+            "then gsjax distill goes on with --resume"
+        )
+    if not is_run(path):
+        return
+    try:
+        kind = read_record(path).kind
+    except ValueError:
+        kind = "another"
+    if kind != "track":
+        raise ValueError(f"{path}: expected a field, found none; gsjax distill {path} makes one")
+
+
 def _ask_field(options: Options, field: Path, console: Console) -> int:
     """Answer by a field."""
-    question = _question(options)
+    begun = perf_counter()
+    question, changes = _question(options), Changes(options.color or _COLOR, options.move)
+    folder = options.run / "query"
     with Notes(console) as notes:
-        with console.status("reading the field"):
-            found = open_field_run(field, notes)
-        folder = options.run / "query"
-        told = answer(found, question, folder, options.color, options.move, notes, console)
-        write_json(folder / "query.json", told | {"features": found.stored.source.kind, "notes": notes.all})
-    unseen = [name for name, pixels in told["pixels"].items() if not pixels]
-    hidden = f"; not seen by {', '.join(unseen[:6])}{', ...' if len(unseen) > 6 else ''}" if unseen else ""
-    score = f"score above {told['threshold']:.2f}: {told['rule']}"
-    print(f"{told['gaussians']:,} of {told['of']:,} Gaussians ({score}){hidden}")
-    print(f"asked in {1e3 * told['query_seconds']:.1f} ms")
-    print(f"query   {folder}")
+        with stage(console, "reading the field"):
+            found = open_field_run(field, notes, Whereabouts(options.scene, options.images, options.weights))
+        told = answer(found, question, changes, folder, notes, console)
+    _print(question, found, told, perf_counter() - begun)
+    print(f"query     {folder}")
     return 0
+
+
+def _print(question: Question, run: FieldRun, told: dict[str, Any], seconds: float) -> None:
+    """What was found, in a few lines."""
+    unit = f" {run.unit}" if run.unit else ""
+    against = f", against {', '.join(told['against'][:_LISTED])}" if told["against"] else ""
+    rows = {
+        "found": f"{question.words}: {told['gaussians']:,} of {told['of']:,} Gaussians",
+        "centre": ", ".join(f"{x:.3f}" for x in told["center"]) + unit,
+        "size": " x ".join(f"{x:.3f}" for x in told["size"]) + unit,
+        "score": f"above {told['threshold']:.2f} ({told['rule']}), {told['best_score']:.2f} at best{against}",
+    }
+    if pixels := told["pixels"]:
+        unseen = [name for name, count in pixels.items() if not count]
+        more = ", ..." if len(unseen) > _LISTED else ""
+        rows["seen"] = f"in {len(pixels) - len(unseen)} of {len(pixels)} photographs" + (
+            f"; not in {', '.join(unseen[:_LISTED])}{more}" if unseen else ""
+        )
+    rows["time"] = f"{seconds:.1f} s, of which the query took {1e3 * told['query_seconds']:.1f} ms"
+    for name, words in rows.items():
+        print(f"{name:<10}{words}")
 
 
 def _question(options: Options) -> Question:
@@ -108,17 +170,17 @@ def _question(options: Options) -> Question:
         point = (x, y)
         if options.camera is None:
             raise ValueError("--point: expected --camera too, the photograph that it is in, found none")
-    if any(not 0 <= value <= 1 for value in options.color):
-        raise ValueError(f"--color: expected three numbers of 0 to 1, found {options.color}")
-    return Question(
-        options.text,
-        options.image,
-        point,
-        options.camera,
-        options.negatives,
-        options.threshold,
-        options.weights,
-    )
+    if options.color is not None and any(not 0 <= value <= 1 for value in options.color):
+        raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(options.color)}")
+    if options.move is not None and not all(map(math.isfinite, options.move)):
+        raise ValueError(f"--move: expected three finite numbers, found {_spaced(options.move)}")
+    if options.threshold is not None and not math.isfinite(options.threshold):
+        raise ValueError(f"--threshold: expected a finite number, found {options.threshold}")
+    return Question(options.text, options.image, point, options.camera, options.negatives, options.threshold)
+
+
+def _spaced(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
 
 
 def _asked(options: Options) -> Asked:
@@ -127,12 +189,11 @@ def _asked(options: Options) -> Asked:
     Raises:
         ValueError: it cannot be asked of one.
     """
-    for name in ("image", "point", "negatives", "threshold", "move"):
-        if getattr(options, name) is not None:
-            raise ValueError(
-                f"--{name}: {options.run} has no field that could be asked so; gsjax distill {options.run} "
-                "makes one"
-            )
+    if (name := _for_fields(options)) is not None:
+        raise ValueError(
+            f"--{name}: {options.run} has no field that could be asked so; gsjax distill {options.run} "
+            "makes one"
+        )
     if options.text is None:
         raise ValueError(
             f'expected a TEXT that says which object, found none; gsjax query {options.run} "can"'

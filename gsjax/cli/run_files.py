@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from gsjax.cli.messages import Notes
 from gsjax.cli.recording import Recording, open_recording
 from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
-from gsjax.io.ply import read_ply
+from gsjax.io.ply import PlyReport, read_ply
 from gsjax.scene.gaussians import Gaussians
 
 _SETTINGS = ("dataset", "cameras", "eval_cameras", "frames")
@@ -71,6 +72,21 @@ def check_arrays(
             found = f"{wrong} of {array.size} that are not"
             raise ValueError(f"{file}: {name}: expected finite numbers, found {found}; {again}")
     return sizes
+
+
+def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
+    """The Gaussians of a PLY file that can be drawn, and what else it held; says how many cannot.
+
+    Raises:
+        FileNotFoundError, PlyError: as `read_ply`.
+        ValueError: it holds none.
+    """
+    gaussians, report = read_ply(file)
+    if report.culled:
+        notes.warn(f"{file}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
+    if gaussians.num == 0:
+        raise ValueError(f"{file}: expected Gaussians, found none that can be drawn")
+    return gaussians, report
 
 
 def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:

@@ -109,6 +109,8 @@ def in_words(scene: Viewable) -> str:
         told.append(f"{scene.num_frames} frames")
     if scene.shots is not None:
         told.append(f"{len(scene.shots.names)} {'cameras' if scene.num_frames > 1 else 'photographs'}")
+    if scene.asking is not None:
+        told.append("a field to be asked")
     return ", ".join(told)
 
 

@@ -1,6 +1,6 @@
 """What `gsjax view` opens: a run of any kind, or a PLY file."""
 
-from dataclasses import replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -8,95 +8,132 @@ import yaml
 
 from gsjax.cli.editing import Filmed, camera_names, editing_of
 from gsjax.cli.field_file import NAME
-from gsjax.cli.field_run import field_of, open_field_run
+from gsjax.cli.field_run import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
 from gsjax.cli.field_view import asking_of
-from gsjax.cli.messages import Notes
+from gsjax.cli.messages import Notes, describe
 from gsjax.cli.parts_run import blend_of, open_parts_run, read_parts
 from gsjax.cli.photographs import photographs_of_run
 from gsjax.cli.recording import Recording
+from gsjax.cli.run_files import read_drawable
 from gsjax.cli.run_folder import expect_run
 from gsjax.cli.saved_run import open_run, read_tracking
 from gsjax.data.photographs import Photographs
-from gsjax.io.ply import read_ply
-from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.colors import to_uint8
 from gsjax.viz.viewer import Shots, Viewable, moved
 
 
-def open_viewable(path: Path, notes: Notes) -> tuple[Viewable, Path]:
+def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:
     """What there is to see, and the folder that screenshots belong to.
+
+    Args:
+        path: of a run, a field, or a PLY file.
+        notes: told what is odd.
+        now: where things of a field or a fit are.
 
     Raises:
         FileNotFoundError: there is no such file, or the folder is no run with a scene.
-        ValueError: the file holds no Gaussians, or something else than a run writes.
+        ValueError: the file holds no Gaussians, or something else than a run writes; or it has no use for
+            something in `now`.
     """
     if path.is_file():
         if path.suffix.lower() != ".ply":
             raise ValueError(f"{path}: expected a PLY file or the folder of a run, found another file")
-        gaussians, labels = _read(path, notes)
-        return Viewable(path.name, gaussians, labels), path.absolute().parent
+        _expect_only((), now, f"{path} is a PLY file")
+        gaussians, report = read_drawable(path, notes)
+        return Viewable(path.name, gaussians, report.labels), path.absolute().parent
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
-    expect_run(path)
     if (path / NAME).is_file():
-        return _of_field(path, notes), path
+        return _of_field(path, notes, now), path
+    expect_run(path)
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
             "keeps no scene; let it finish (--resume goes on)"
         )
-    if (path / "parts.npz").is_file():
-        return _of_parts(path, notes), path
-    if (path / "trajectory.npz").is_file():
-        return _of_track(path, notes), path
-    return _asked(_of_fit(path, notes), path, notes), path
+    for file, of_run in (("parts.npz", _of_parts), ("trajectory.npz", _of_track)):
+        if (path / file).is_file():
+            _expect_only((), now, f"{path} is a run that moves")
+            if (field := field_of(path)) is not None:
+                notes.warn(
+                    f"a scene that moves cannot be asked; gsjax view {field} shows what its field is of"
+                )
+            return of_run(path, notes), path
+    return _of_fit(path, notes, now), path
 
 
-def _asked(scene: Viewable, path: Path, notes: Notes) -> Viewable:
-    """With what its field, if it has one, can be asked."""
+def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
+    """Raises a ValueError where something is said to be elsewhere that is not looked for."""
+    unused = [f.name for f in fields(now) if f.name not in used and getattr(now, f.name) is not None]
+    if unused:
+        raise ValueError(f"--{unused[0]}: {because}, which has no use for it; leave it out")
+
+
+def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+    """The scene of a field, with the photographs that taught it where they still are."""
+    run = open_field_run(path, notes, now)
+    folder = path.absolute()
+    return Viewable(
+        f"{folder.parent.name}, {folder.name}",
+        run.gaussians,
+        run.labels,
+        shots=None if run.photographs is None else _shots_of(run.photographs),
+        antialiased=run.rasterize_mode == "antialiased",
+        unit=run.unit,
+        asking=asking_of(run),
+    )
+
+
+def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None:
+    """The field of a fit's scene, where it has one that can be asked."""
     folder = field_of(path)
     if folder is None:
-        return scene
+        _expect_only(("images",), now, f"{path} has no field")
+        return None
+    _expect_only(("images", "weights"), now, f"{path} is a run with its scene")
     try:
-        run = open_field_run(folder, notes)
-        if run.gaussians.num != scene.gaussians.num:
-            raise ValueError("it is of another scene")
-        return replace(scene, asking=asking_of(run))
+        run = open_field_run(folder, notes, now, photographs=False)
     except (ValueError, OSError) as error:
-        notes.warn(f"its field cannot be asked: {error}")
-        return scene
+        notes.warn(f"its field cannot be asked: {describe(error)}")
+        return None
+    if not run.file.samefile(path / "scene.ply"):
+        notes.warn(f"its field is of another scene, {run.file}; gsjax view {folder} shows that")
+        return None
+    return run
 
 
-def _of_field(path: Path, notes: Notes) -> Viewable:
-    """The scene of a field, with the photographs that taught it where they still are."""
-    run = open_field_run(path, notes)
-    antialiased = run.rasterize_mode == "antialiased"
-    title = f"{path.absolute().parent.name}, {path.name}"
-    shots = None if run.views is None else _shots_of(run.views.photographs)
-    return Viewable(title, run.gaussians, shots=shots, antialiased=antialiased, asking=asking_of(run))
-
-
-def _of_fit(path: Path, notes: Notes) -> Viewable:
-    """The scene of a run of `gsjax fit`, with its photographs where they still are."""
-    gaussians, labels = _read(path / "scene.ply", notes)
-    config = path / "config.yml"
+def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+    """The scene of a run of `gsjax fit`, with its photographs where they still are, and its field."""
+    field, config = _field_of_fit(path, notes, now), path / "config.yml"
+    if field is None:
+        gaussians, report = read_drawable(path / "scene.ply", notes)
+        labels = report.labels
+    else:
+        gaussians, labels = field.gaussians, field.labels
     try:
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         antialiased = bool(settings["fit"]["antialiased"])
         behind = settings["fit"]["background"]
         shots, photographs = None, None
         try:
-            photographs = photographs_of_run(settings)
+            photographs = photographs_of_run(settings, now.images)
             shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
-            notes.warn(f"its photographs are not shown: {error}")
+            notes.warn(f"its photographs are not shown: {describe(error)} (--images says where they are now)")
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
     background = photographs.background if photographs is not None and behind == "data" else None
     if background is None:
         background = (1.0, 1.0, 1.0) if behind == "white" else (0.0, 0.0, 0.0)
-    title = path.absolute().name
-    return Viewable(title, gaussians, labels, shots=shots, background=background, antialiased=antialiased)
+    return Viewable(
+        path.absolute().name,
+        gaussians,
+        labels,
+        shots=shots,
+        background=background,
+        antialiased=antialiased,
+        asking=None if field is None else asking_of(field),
+    )
 
 
 def _of_track(path: Path, notes: Notes) -> Viewable:
@@ -141,20 +178,6 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
     times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
     return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
-
-
-def _read(path: Path, notes: Notes) -> tuple[Gaussians, np.ndarray | None]:
-    """The Gaussians of a file, and their labels.
-
-    Raises:
-        ValueError: it holds none.
-    """
-    gaussians, report = read_ply(path)
-    if report.culled:
-        notes.warn(f"{path}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
-    if gaussians.num == 0:
-        raise ValueError(f"{path}: expected Gaussians, found none that can be drawn")
-    return gaussians, report.labels
 
 
 def _shots_of(photographs: Photographs) -> Shots:

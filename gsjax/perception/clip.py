@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from gsjax.perception.pictures import square_crop, to_bytes
-from gsjax.perception.weights import foundation_modules, weights_folder
+from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 _FILES = ("preprocessor_config.json|processor_config.json", "tokenizer.json|vocab.json")
 
@@ -75,14 +75,15 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
+        ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    folder = weights_folder(path, "CLIP's weights", _FILES, "openai/clip-vit-base-patch32")
+    folder = weights_folder(path, "CLIP's weights", _FILES, "openai/clip-vit-large-patch14")
     torch, transformers = foundation_modules("CLIP")
-    model = transformers.CLIPModel.from_pretrained(folder, local_files_only=True).eval().to(device)
+    model = transformers.CLIPModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
     # The processor that needs no torchvision.
-    processor = transformers.AutoImageProcessor.from_pretrained(folder, local_files_only=True, backend="pil")
-    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, local_files_only=True)
+    processor = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **LOCAL_FILES)
     return ClipEncoder(model, processor, tokenizer, torch, device)
 
 

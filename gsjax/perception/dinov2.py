@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import foundation_modules, weights_folder
+from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,13 @@ def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
+        ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
     files = ("preprocessor_config.json|processor_config.json",)
     folder = weights_folder(path, "DINOv2's weights", files, "facebook/dinov2-base")
     torch, transformers = foundation_modules("DINOv2")
-    model = transformers.AutoModel.from_pretrained(folder, local_files_only=True).eval().to(device)
+    model = transformers.AutoModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
     # The processor that needs no torchvision.
-    processor = transformers.AutoImageProcessor.from_pretrained(folder, local_files_only=True, backend="pil")
+    processor = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
     return Dinov2Encoder(model, processor, torch, device, resolution)

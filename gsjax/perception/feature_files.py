@@ -5,7 +5,7 @@ langsplat       NAME_s.npy, NAME_f.npy                        [4,H,W] rows (-1: 
                                                               objects, of [n,512]
 feature-3dgs    NAME_fmap_CxHxW.npy, or .pt                   [C,H,W]: LSeg's, SAM's
 lerf            level_0.npy, level_1.npy, ... (CLIP), or      [pictures,h,w,C], in the order of the pictures
-                any one .npy of that shape (DINO)
+                the folder's only .npy (DINO)
 plain           NAME.npy, or .npz with `features`             [h,w,C]
 plain           NAME.npz with `ids` and `codebook`            [H,W] rows (-1: none) of [n,C]
 
@@ -13,21 +13,26 @@ Pickles are never loaded; of .pt files only the one tensor is read (`gsjax.perce
 """
 
 import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.lib import format as npy
 
 from gsjax.perception.torch_arrays import read_torch_array
 
 LANGSPLAT_LEVELS = ("default", "small", "medium", "large")
 _LAYOUTS = (
-    "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy (LERF), "
-    "NAME.npy, or NAME.npz with features, or with ids and codebook"
+    "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy or "
+    "one .npy of all pictures (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
 )
+# Masks are packed a thousand times, but are small; features are large, but are not packed so.
+_LARGE, _MOST_PACKED = 2**30, 100  # bytes; times
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,112 +59,183 @@ class PictureFeatures:
 
 
 def read_feature_folder(
-    folder: Path, names: Sequence[str], *, level: str = "default"
+    folder: Path, names: Sequence[str], *, which: Sequence[int] | None = None, level: str = "default"
 ) -> list[PictureFeatures]:
     """The features of pictures by their names, whatever the layout.
 
     Args:
         folder: has the files.
-        names: of the pictures; folders before them and what follows the last dot do not count.
+        names: of all pictures. What follows the last dot does not count, nor do folders before them where
+            only one picture has that name.
+        which: of them are wanted, and need to be there where each has its file; all unless given.
         level: of LangSplat's files, which size of objects: default, small, medium, large.
 
     Raises:
         FileNotFoundError: there is no such folder, or nothing in it for a picture.
-        ValueError: a file is not what its name says, is not finite, or has another dimension than the others.
+        ValueError: a file is not what its name says, is not finite, has another dimension than the others, or
+            would be that of several pictures.
     """
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise FileNotFoundError(f"{folder}: expected a folder of features ({_LAYOUTS}), found {found}")
     if level not in LANGSPLAT_LEVELS:
         raise ValueError(f"level: expected one of {', '.join(LANGSPLAT_LEVELS)}, found {level!r}")
-    stacked, found = _stacked(folder, len(names)), []
-    for i, name in enumerate(names):
-        one = _of_picture(folder, PurePosixPath(name), level) if stacked is None else stacked[i]
+    read: list[PictureFeatures] = []
+    for one in _pictures(folder, names, range(len(names)) if which is None else which, level):
         _check(one)
-        found.append(one)
-        if one.dimension != found[0].dimension:
+        read.append(one)
+        if one.dimension != read[0].dimension:
             raise ValueError(
-                f"{one.path}: expected features of {found[0].dimension} numbers as in {found[0].path.name}, "
+                f"{one.path}: expected features of {read[0].dimension} numbers as in {read[0].path.name}, "
                 f"found {one.dimension}; take files of one encoder"
             )
-    return found
+    return read
 
 
-def _of_picture(folder: Path, name: PurePosixPath, level: str) -> PictureFeatures:
+def _pictures(
+    folder: Path, names: Sequence[str], which: Sequence[int], level: str
+) -> Iterator[PictureFeatures]:
+    """One after the other, each as its file has it."""
+    stack = folder / "level_0.npy"  # LERF's finest, whose crops are the smallest
+    files = [] if stack.is_file() else [_file(folder, PurePosixPath(name), level) for name in names]
+    alone = list(folder.glob("*.npy"))
+    if stack.is_file():
+        yield from _stacked(stack, _mapped(stack), len(names), which)
+    elif not any(files) and len(alone) == 1 and (maps := _mapped(alone[0])).ndim == 4:
+        yield from _stacked(alone[0], maps, len(names), which)
+    else:
+        _check_apart(files, names)
+        for i in which:
+            name, file = names[i], files[i]
+            if file is None:
+                listed = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6]) or "nothing"
+                raise FileNotFoundError(
+                    f"{folder}: expected features of the picture {name} ({_LAYOUTS}), found {listed}"
+                )
+            yield file.read(file.path)
+
+
+class _File(NamedTuple):
+    """A picture's file, and what reads it."""
+
+    path: Path
+    read: Callable[[Path], PictureFeatures]
+
+
+def _file(folder: Path, name: PurePosixPath, level: str) -> _File | None:
     for stem in dict.fromkeys((str(name.with_suffix("")), name.stem, str(name), name.name)):
         base = folder / stem
-        rows, table = Path(f"{base}_s.npy"), Path(f"{base}_f.npy")
-        if rows.is_file() and table.is_file():
-            return _langsplat(rows, table, level)
-        for suffix in ("_fmap_CxHxW.npy", "_fmap_CxHxW.pt"):
+        if Path(f"{base}_s.npy").is_file() and Path(f"{base}_f.npy").is_file():
+            return _File(Path(f"{base}_s.npy"), partial(_langsplat, level=level))
+        for suffix, read in _READERS.items():
             if (path := Path(f"{base}{suffix}")).is_file():
-                array = _load(path)
-                _expect(path, array, 3, "[C,H,W]")
-                return PictureFeatures(path, map=np.moveaxis(array, 0, -1).astype(np.float32))
-        for suffix in (".npy", ".pt", ".pth"):
-            if (path := Path(f"{base}{suffix}")).is_file():
-                array = _load(path)
-                _expect(path, array, 3, "[h,w,C]")
-                return PictureFeatures(path, map=array.astype(np.float32))
-        if (path := Path(f"{base}.npz")).is_file():
-            return _archive(path)
-    listed = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6]) or "nothing"
-    raise FileNotFoundError(f"{folder}: expected features of the picture {name} ({_LAYOUTS}), found {listed}")
+                return _File(path, read)
+    return None
 
 
-def _langsplat(rows: Path, table: Path, level: str) -> PictureFeatures:
+def _check_apart(files: Sequence[_File | None], names: Sequence[str]) -> None:
+    """Folders before a name do not count, so one file might pass for those of several cameras."""
+    pictures: dict[Path, str] = {}
+    for file, name in zip(files, names, strict=True):
+        if file is not None and (other := pictures.setdefault(file.path, name)) != name:
+            raise ValueError(
+                f"{file.path}: expected features of one picture, found that {other} and {name} would both "
+                "have these; give each its own file, under its whole name: a folder per camera"
+            )
+
+
+def _langsplat(rows: Path, level: str) -> PictureFeatures:
+    table = rows.with_name(f"{rows.name.removesuffix('_s.npy')}_f.npy")
     ids, codebook = _load(rows), _load(table)
     _expect(rows, ids, 3, "[4,H,W]")
     _expect(table, codebook, 2, "[n,C]")
     place = LANGSPLAT_LEVELS.index(level)
     if len(ids) <= place:
         raise ValueError(f"{rows}: expected {len(LANGSPLAT_LEVELS)} sizes of objects, found {len(ids)}")
-    if not np.array_equal(ids, np.rint(ids)):
-        raise ValueError(f"{rows}: expected rows of {table.name}, whole numbers, found others")
-    return PictureFeatures(rows, ids[place].astype(np.int32), codebook.astype(np.float32))
+    return PictureFeatures(rows, _rows(rows, ids[place], len(codebook)), codebook.astype(np.float32))
+
+
+def _channels_first(path: Path) -> PictureFeatures:
+    array = _load(path)
+    _expect(path, array, 3, "[C,H,W]")
+    return PictureFeatures(path, map=np.moveaxis(array, 0, -1).astype(np.float32))
+
+
+def _channels_last(path: Path) -> PictureFeatures:
+    array = _load(path)
+    _expect(path, array, 3, "[h,w,C]")
+    return PictureFeatures(path, map=array.astype(np.float32))
 
 
 def _archive(path: Path) -> PictureFeatures:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = dict(stored)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"{path}: expected plain arrays, found a file that cannot be read ({error})"
-        ) from error
+    with _refusing(path, "plain arrays"), zipfile.ZipFile(path) as archive:
+        entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+        wanted = [entries[name] for name in ("features", "ids", "codebook") if name in entries]
+        size = sum(entry.file_size for entry in wanted)
+        if size > max(_LARGE, _MOST_PACKED * path.stat().st_size):
+            raise ValueError(f"it would unpack to {size} bytes, of {path.stat().st_size}")
+        arrays = {}
+        for entry in wanted:
+            with archive.open(entry) as part:
+                arrays[entry.filename.removesuffix(".npy")] = npy.read_array(part, allow_pickle=False)
     if "features" in arrays:
         _expect(path, arrays["features"], 3, "features of shape [h,w,C]")
         return PictureFeatures(path, map=arrays["features"].astype(np.float32))
     if {"ids", "codebook"} <= arrays.keys():
-        _expect(path, arrays["ids"], 2, "ids of shape [H,W]")
-        _expect(path, arrays["codebook"], 2, "a codebook of shape [n,C]")
-        return PictureFeatures(path, arrays["ids"].astype(np.int32), arrays["codebook"].astype(np.float32))
-    listed = ", ".join(arrays) or "nothing"
+        ids, codebook = arrays["ids"], arrays["codebook"]
+        _expect(path, ids, 2, "ids of shape [H,W]")
+        _expect(path, codebook, 2, "a codebook of shape [n,C]")
+        return PictureFeatures(path, _rows(path, ids, len(codebook)), codebook.astype(np.float32))
+    listed = ", ".join(entries) or "nothing"
     raise ValueError(f"{path}: expected features, or ids and codebook, found {listed}")
 
 
-def _stacked(folder: Path, count: int) -> list[PictureFeatures] | None:
-    """LERF's: all pictures in one file. Of several levels the finest, whose crops are the smallest."""
-    path = folder / "level_0.npy"
-    if not path.is_file():
-        return None
-    maps = _load(path)
+_READERS = {
+    "_fmap_CxHxW.npy": _channels_first,
+    "_fmap_CxHxW.pt": _channels_first,
+    ".npy": _channels_last,
+    ".pt": _channels_last,
+    ".pth": _channels_last,
+    ".npz": _archive,
+}
+
+
+def _stacked(path: Path, maps: np.ndarray, count: int, which: Sequence[int]) -> Iterator[PictureFeatures]:
+    """LERF's: all pictures in one file."""
     _expect(path, maps, 4, "[pictures,h,w,C]")
     if len(maps) != count:
         raise ValueError(
             f"{path}: expected features of {count} pictures, found {len(maps)}; it goes by order"
         )
-    return [PictureFeatures(path, map=one.astype(np.float32)) for one in maps]
+    for i in which:
+        yield PictureFeatures(path, map=np.array(maps[i], np.float32))
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """A stack, of which only those pictures are read that are wanted."""
+    with _refusing(path, "a plain array"):
+        return npy.open_memmap(path, mode="r")
 
 
 def _load(path: Path) -> np.ndarray:
     if path.suffix in (".pt", ".pth"):
         return read_torch_array(path)
+    if zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: expected a plain array, found an archive; name it {path.stem}.npz")
+    with _refusing(path, "a plain array"), path.open("rb") as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+@contextmanager
+def _refusing(path: Path, expected: str) -> Iterator[None]:
+    """Of a damaged file numpy, zipfile and the unpackers raise what they like."""
     try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        yield
+    except Exception as error:
+        told = str(error) or type(error).__name__
         raise ValueError(
-            f"{path}: expected a plain array, found a file that cannot be read ({error})"
+            f"{path}: expected {expected}, found a file that cannot be read ({told}); make it again, with "
+            f"{'numpy.savez' if path.suffix == '.npz' else 'numpy.save'}"
         ) from error
 
 
@@ -168,11 +244,18 @@ def _expect(path: Path, array: np.ndarray, axes: int, shape: str) -> None:
         raise ValueError(f"{path}: expected numbers {shape}, found {array.dtype} {list(array.shape)}")
 
 
+def _rows(path: Path, ids: np.ndarray, count: int) -> Int[np.ndarray, "H W"]:
+    """Rows of a codebook of so many, checked before they become int32, where large ones would wrap."""
+    if not np.array_equal(ids, np.rint(ids)):
+        raise ValueError(f"{path}: expected rows of the codebook, whole numbers, found others")
+    if not -1 <= ids.min() <= ids.max() < count:
+        found = f"{ids.min():.0f} to {ids.max():.0f}"
+        raise ValueError(f"{path}: expected rows -1 to {count - 1}, found {found}")
+    return ids.astype(np.int32)
+
+
 def _check(features: PictureFeatures) -> None:
     numbers = features.codebook if features.map is None else features.map
     if not np.isfinite(numbers).all():
         wrong = int((~np.isfinite(numbers)).sum())
         raise ValueError(f"{features.path}: expected numbers, found {wrong} that are NaN or infinite")
-    if features.ids is not None and not -1 <= features.ids.min() <= features.ids.max() < len(numbers):
-        found = f"{features.ids.min()} to {features.ids.max()}"
-        raise ValueError(f"{features.path}: expected rows -1 to {len(numbers) - 1}, found {found}")

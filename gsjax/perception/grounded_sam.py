@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from gsjax.perception.pictures import to_bytes
 from gsjax.perception.segmenters import name_by_size
-from gsjax.perception.weights import foundation_modules, weights_folder
+from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 _PROCESSOR = "preprocessor_config.json|processor_config.json"
 
@@ -139,21 +139,21 @@ def load_grounded_sam(
 
     Raises:
         FileNotFoundError: a folder or a file of it is missing.
+        ValueError: a folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
     files = (_PROCESSOR, "tokenizer.json|vocab.txt")
     boxes = weights_folder(detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny")
     masks = weights_folder(segmenter, "SAM's weights", (_PROCESSOR,), "facebook/sam-vit-base")
     torch, transformers = foundation_modules("Grounded SAM")
-    local = {"local_files_only": True}
     # Processors that need no torchvision.
     pictures = [
-        transformers.AutoImageProcessor.from_pretrained(folder, **local, backend="pil")
+        transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
         for folder in (boxes, masks)
     ]
-    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **local)
-    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **local)
-    sam = transformers.SamModel.from_pretrained(masks, **local)
+    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **LOCAL_FILES)
+    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **LOCAL_WEIGHTS)
+    sam = transformers.SamModel.from_pretrained(masks, **LOCAL_WEIGHTS)
     return GroundedSam(
         detector=dino.eval().to(device),
         detector_processor=transformers.GroundingDinoProcessor(pictures[0], tokenizer),

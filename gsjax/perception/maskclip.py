@@ -73,6 +73,7 @@ def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int 
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
+        ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
     return MaskClipEncoder(load_clip(path, device), resolution)

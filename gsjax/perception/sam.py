@@ -16,7 +16,7 @@ from PIL import Image
 from gsjax.perception.grounded_sam import Found, labels_of_masks
 from gsjax.perception.pictures import to_bytes
 from gsjax.perception.segmenters import name_by_size
-from gsjax.perception.weights import foundation_modules, weights_folder
+from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 
 @dataclass(frozen=True)
@@ -135,14 +135,15 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
+        ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
     files = ("preprocessor_config.json|processor_config.json",)
     folder = weights_folder(path, "SAM's weights", files, "facebook/sam-vit-base")
     torch, transformers = foundation_modules("SAM")
-    model = transformers.SamModel.from_pretrained(folder, local_files_only=True).eval()
+    model = transformers.SamModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval()
     # The processor that needs no torchvision.
-    pictures = transformers.AutoImageProcessor.from_pretrained(folder, local_files_only=True, backend="pil")
+    pictures = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
     pipeline = transformers.pipeline("mask-generation", model=model, image_processor=pictures, device=device)
     return SamSegmenter(pipeline, transformers.SamProcessor(pictures), torch)
 

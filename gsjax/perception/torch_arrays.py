@@ -6,9 +6,9 @@ anything when it is loaded. So it is not: its opcodes are listed (`pickletools.g
 and must be the few that rebuild one tensor.
 """
 
+import math
 import pickletools
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,6 +26,7 @@ _TYPES = {
     "BoolStorage": np.bool_,
 }
 _CALLS = {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
+_LONGEST_PICKLE = 4096  # bytes; that of a tensor has about 300
 _ADVICE = "Save it again as .npy: numpy.save('features.npy', tensor.cpu().numpy())."
 
 
@@ -41,25 +42,43 @@ def read_torch_array(path: Path) -> np.ndarray:
             described = [name for name in names if name.endswith("/data.pkl") or name == "data.pkl"]
             if len(described) != 1:
                 raise ValueError(f"{path}: expected a file of torch.save, found none of its parts. {_ADVICE}")
-            kind, key, offset, shape, strides = _tensor(path, archive.read(described[0]))
+            kind, key, offset, shape, strides = _tensor(path, _part(path, archive, described[0]))
             root = described[0].removesuffix("data.pkl")
             if f"{root}data/{key}" not in names:
                 raise ValueError(f"{path}: expected its numbers in data/{key}, found none. {_ADVICE}")
-            if f"{root}byteorder" in names and archive.read(f"{root}byteorder") != b"little":
+            if f"{root}byteorder" in names and _part(path, archive, f"{root}byteorder") != b"little":
                 raise ValueError(f"{path}: expected little-endian numbers, found others. {_ADVICE}")
-            stored = archive.read(f"{root}data/{key}")
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+            stored = _part(path, archive, f"{root}data/{key}")
+    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: expected a file of torch.save, found {error}. {_ADVICE}") from error
-    numbers = np.frombuffer(stored, _TYPES[kind])
+    dtype = np.dtype(_TYPES[kind])
+    if len(stored) % dtype.itemsize:
+        raise ValueError(
+            f"{path}: expected numbers of {dtype.itemsize} bytes, found {len(stored)} bytes. {_ADVICE}"
+        )
+    numbers = np.frombuffer(stored, dtype)
+    count = math.prod(shape)  # more than are stored only where some are repeated, perhaps without end
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-    if min([0, offset, *shape, *strides]) < 0 or (0 not in shape and last >= len(numbers)):
+    if min([0, offset, *shape, *strides]) < 0 or count > len(numbers) or (count and last >= len(numbers)):
         raise ValueError(
             f"{path}: expected numbers for the shape {list(shape)}, found {len(numbers)}. {_ADVICE}"
         )
-    if 0 in shape:
-        return np.zeros(shape, numbers.dtype)
-    bytes_apart = [stride * numbers.itemsize for stride in strides]
-    return np.lib.stride_tricks.as_strided(numbers[offset:], shape, bytes_apart).copy()
+    try:
+        if count == 0:
+            return np.zeros(shape, dtype)
+        bytes_apart = [stride * dtype.itemsize for stride in strides]
+        return np.lib.stride_tricks.as_strided(numbers[offset:], shape, bytes_apart).copy()
+    except (ValueError, OverflowError) as error:  # too many axes, or huge ones beside an axis of 0
+        raise ValueError(
+            f"{path}: expected a shape that numpy knows, found {list(shape)} ({error}). {_ADVICE}"
+        ) from error
+
+
+def _part(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+    """As torch.save stores it, not packed: so it is no larger than the file."""
+    if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{path}: expected {name} as torch.save stores it, found it packed. {_ADVICE}")
+    return archive.read(name)
 
 
 def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], tuple[int, ...]]:
@@ -80,6 +99,8 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
         del stack[place:]
         return items
 
+    if len(pickle) > _LONGEST_PICKLE:
+        raise refuse(f"{len(pickle)} bytes that say what it holds")
     try:
         for opcode, operand, _ in pickletools.genops(pickle):
             name, argument = opcode.name, cast(Any, operand)
@@ -112,8 +133,9 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
                 stack.append(("storage", stack.pop()))
             elif name == "REDUCE":
                 arguments, function = stack.pop(), stack.pop()
-                if function not in _CALLS:
-                    raise refuse(f"a call of {function!r}")
+                called = function if isinstance(function, str) else "no function"  # perhaps too deep to hash
+                if called not in _CALLS:
+                    raise refuse(f"a call of {called!r}")
                 stack.append((function, arguments))
             else:
                 raise refuse(f"the opcode {name}")
@@ -124,6 +146,8 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
         numbers = (offset, *shape, *strides)
         if not all(type(n) is int for n in numbers) or len(shape) != len(strides) or not isinstance(key, str):
             raise refuse("a tensor without a shape")
+        if not _is_storage(storage_type):
+            raise refuse(f"a storage {storage_type!r}")
         return storage_type.split()[1], key, offset, tuple(shape), tuple(strides)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         if str(path) in str(error):

@@ -1,12 +1,25 @@
-"""Where adapters of foundation models find their weights: in a folder on this machine, nowhere else."""
+"""Where adapters of foundation models find their weights: in a folder on this machine, nowhere else, and in
+files that cannot run anything when they are read.
+"""
 
 import importlib
+import json
 import os
+import shlex
 from pathlib import Path
 from types import ModuleType
 
 _CONFIG = "config.json"
-_WEIGHTS = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin")
+_WHOLE, _INDEX = "model.safetensors", "model.safetensors.index.json"
+_CONVERT = (
+    "import sys, torch; from safetensors.torch import save_file; "
+    "w = torch.load(sys.argv[1], map_location='cpu', weights_only=True); "
+    "save_file({k: v.clone().contiguous() for k, v in w.items()}, sys.argv[2], {'format': 'pt'})"
+)
+LOCAL_FILES = {"local_files_only": True, "trust_remote_code": False}
+"""How transformers is to load; left alone it would ask whether to run code that lies in the folder."""
+LOCAL_WEIGHTS = LOCAL_FILES | {"use_safetensors": True}
+"""How it is to load a model."""
 
 
 def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
@@ -20,9 +33,10 @@ def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...],
 
     Raises:
         FileNotFoundError: there is no such folder, or a file is missing.
+        ValueError: a file leads to weights that are a pickle, or is not JSON.
     """
     folder = Path(path)
-    wanted = (_CONFIG, "|".join(_WEIGHTS), *others)
+    wanted = (_CONFIG, f"{_WHOLE}|{_INDEX}", *others)
     listed = ", ".join(files.replace("|", " or ") for files in wanted)
     advice = f"One way to get them: hf download {example} --local-dir {folder}"
     if not folder.is_dir():
@@ -32,8 +46,50 @@ def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...],
     if missing:
         names = ", ".join(sorted(entry.name for entry in folder.iterdir())[:8]) or "an empty folder"
         lacking = ", ".join(files.replace("|", " or ") for files in missing)
+        pickles = sorted(folder.glob("*.bin"))
+        if pickles and _WHOLE in lacking:
+            advice = (
+                f"{pickles[0].name} is a pickle, which can run code when it is read, so none is read here. "
+                f'In an environment of your own that has torch and safetensors: python -c "{_CONVERT}" '
+                f"{shlex.quote(str(pickles[0]))} {shlex.quote(str(folder / _WHOLE))}"
+            )
         raise FileNotFoundError(f"{folder}: expected {model}; it lacks {lacking}, found {names}. {advice}")
+    _check_no_pickles(folder)
     return folder
+
+
+def _check_no_pickles(folder: Path) -> None:
+    """Files beside the weights in which transformers finds the names of others, pickles too."""
+    named = _read_json(folder / _CONFIG).get("transformers_weights")
+    if named is not None:
+        raise ValueError(
+            f"{folder / _CONFIG}: expected no transformers_weights, found {named!r}; delete the entry, "
+            f"weights are those of {_WHOLE}"
+        )
+    if (adapter := folder / "adapter_config.json").exists():
+        raise ValueError(
+            f"{adapter}: expected the weights of a whole model, found an adapter to one; merge it into the "
+            "model (merge_and_unload and save_pretrained of peft's)"
+        )
+    if not (folder / _WHOLE).is_file():
+        parts = _read_json(folder / _INDEX).get("weight_map")
+        if not isinstance(parts, dict) or not all(
+            str(part).endswith(".safetensors") for part in parts.values()
+        ):
+            raise ValueError(
+                f"{folder / _INDEX}: expected a weight_map to .safetensors files, found other files; save "
+                "the model again with save_pretrained"
+            )
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        read = json.loads(path.read_text("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected JSON, found {error}; fetch the file again") from error
+    if not isinstance(read, dict):
+        raise ValueError(f"{path}: expected a JSON object, found {type(read).__name__}; fetch the file again")
+    return read
 
 
 def foundation_modules(model: str) -> tuple[ModuleType, ModuleType]:

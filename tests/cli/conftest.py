@@ -6,14 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.cli import loop, main, track
-from gsjax.data import write_panoptic
+from gsjax.cli.field_file import StoredField, write_field
+from gsjax.cli.field_scene import SceneOptions
+from gsjax.cli.field_source import Source
+from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.run_records import digest
+from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
+from gsjax.methods.feature_field import FeatureField
 from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 
 @pytest.fixture(scope="session")
@@ -98,3 +107,36 @@ def gsjax(capfd):
         return code, " ".join(said.split())
 
     return call
+
+
+LABELS = {0: "background", 1: "robot", 2: "carton", 3: "can", 4: "ball", 5: "block"}
+"""Of the recording's masks."""
+
+
+def first_picture(pristine: Path) -> tuple[Gaussians, np.ndarray]:
+    """A Gaussian for every other pixel of all cameras' first pictures, and the label of each."""
+    sequence, points, colors, labels = open_sequence(str(pristine)), [], [], []
+    for c in range(sequence.num_cameras):
+        depth, pose = sequence.depth(0, c), (sequence.viewmats[0, c], sequence.Ks[0, c])
+        found = points_from_rgbd(sequence.image(0, c), depth, *pose, stride=2)
+        seen = cv2.imread(str(pristine / "seg" / str(c) / "000000.png"), cv2.IMREAD_UNCHANGED)
+        labels.append(seen[::2, ::2][depth[::2, ::2] > 0].astype(np.int32))
+        points.append(found[0])
+        colors.append(found[1])
+    return gaussians_from_points(np.concatenate(points), np.concatenate(colors)), np.concatenate(labels)
+
+
+def write_made_field(
+    folder: Path, scene: Path, images: Path | None, source: Source, labels: np.ndarray, vectors: np.ndarray
+) -> Path:
+    """A field that nobody had to distil: of each Gaussian the row `vectors[label]`. Without photographs it
+    has no config.yml either."""
+    if images is not None:
+        told = SceneOptions(scene, str(images), frames="0:1", test_every=0)
+        RunFolder(folder).write_config(told)
+    known, places = np.unique(labels, return_inverse=True)
+    field = FeatureField(jnp.eye(len(known))[places], jnp.asarray(vectors[known].T, jnp.float32))
+    about = {"file": str(scene), "sha256": digest(scene), "num_gaussians": len(labels)}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_field(folder / "field.npz", StoredField(field, None, source, about))
+    return folder

@@ -242,6 +242,11 @@ def test_mistakes_are_said_and_nothing_is_written(make, gsjax_compare, tmp_path)
             assert f"{name}: expected" in said
             (a / name).write_text(whole)
     assert gsjax_compare(a, b)[0] == gsjax_compare(b, a)[0] == 0  # an earlier comparison is replaced
+    (tmp_path / "comparison" / "pictures" / "holiday.png").write_bytes(b"mine")
+    code, said, _ = gsjax_compare(a, b)
+    assert code == 2
+    assert "found holiday.png; move it elsewhere" in said
+    assert list((tmp_path / "comparison" / "plots").glob("*.svg"))  # that is as it was too
 
 
 def test_labels_say_as_much_of_a_path_as_tells_it_from_others(tmp_path):

@@ -9,16 +9,17 @@ import pytest
 import yaml
 
 from gsjax.cli import main
+from gsjax.cli.field_source import Source
 from gsjax.cli.grasp import draw_grasp
 from gsjax.io.video import read_video_frames
 from gsjax.methods.grasping import Grasp, Gripper
+from gsjax.perception.codebook import ClassCodebook
+from tests.cli.conftest import LABELS, standing_still, unfitted, write_made_field
 
 
 @pytest.fixture(scope="module")
 def tracked(pristine, tmp_path_factory):
     """A run of four frames of a table on which nothing is moved, held out camera 2."""
-    from tests.cli.conftest import standing_still, unfitted
-
     out = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsjax.cli.track.start_scene", unfitted)
@@ -55,6 +56,39 @@ def test_query_says_which_object_and_shows_it_over_time(gsjax, run, pristine):
     assert (found & truth).sum() > 0.5 * (found | truth).sum()
     assert told["pixels"] == [int((mask > 0).sum()) for mask in masks]
     assert read_video_frames(folder / "video.mp4").shape == (4, 480, 640, 3)
+
+
+def test_a_tracked_run_answers_what_only_its_field_can(gsjax, run, pristine):
+    with np.load(run / "trajectory.npz") as whole:
+        labels = whole["labels"]
+    book = ClassCodebook({label + 1: name for label, name in LABELS.items()})
+    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
+    source = Source("classes", {label + 1: name for label, name in LABELS.items()})
+    write_made_field(run / "field", run / "scene.ply", pristine, source, labels, vectors)
+    assert gsjax("query", run, "can")[0] == 0
+    assert json.loads((run / "query" / "query.json").read_text())["name"] == "can"  # the object
+    code, said = gsjax("query", run, "can", "--threshold", 0.6, "--camera", 0)
+    assert code == 0, said
+    told = json.loads((run / "query" / "query.json").read_text())
+    assert (told["features"], told["threshold"], told["gaussians"]) == ("classes", 0.6, (labels == 3).sum())
+    assert not (run / "query" / "video.mp4").exists()
+
+
+@pytest.mark.parametrize(("option", "value"), [("--threshold", 0.5), ("--negatives", "x"), ("--scene", "x")])
+def test_a_tracked_run_without_a_field_says_so(gsjax, tracked, option, value):
+    code, said = gsjax("query", tracked, "can", option, value)
+    assert code == 2
+    assert f"{option}: {tracked} has no field that could be asked so; gsjax distill" in said
+
+
+@pytest.mark.parametrize("command", ["query", "grasp"])
+def test_what_somebody_else_left_there_is_kept(gsjax, run, command):
+    (run / command).mkdir()
+    (run / command / "precious.txt").write_text("mine")
+    code, said = gsjax(command, run, "can")
+    assert code == 2
+    assert "found precious.txt; move it elsewhere" in said
+    assert (run / command / "precious.txt").read_text() == "mine"
 
 
 def test_a_second_query_leaves_nothing_of_the_first(gsjax, run):

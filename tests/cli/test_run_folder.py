@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.run_folder import RunFolder, fresh_folder, replaced_folder
 
 
 class Mode(enum.Enum):
@@ -161,3 +161,74 @@ def test_a_config_of_another_program_makes_no_run(tmp_path):
         with pytest.raises(FileExistsError, match="found other files"):
             RunFolder(tmp_path, overwrite=overwrite)
     assert {name: (tmp_path / name).read_text() for name in mine} == mine
+
+
+OURS = ("answer.json", "masks", "picture_*.png")
+
+
+def listed(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+def test_what_gsjax_wrote_is_replaced_whole_and_late(tmp_path):
+    folder = tmp_path / "answer"
+    for number in (1, 2):
+        with replaced_folder(folder, OURS) as new:
+            (new / "answer.json").write_text(f"{number}")
+            (new / f"picture_{number}.png").touch()
+            assert not folder.exists() or listed(folder) == ["answer.json", "picture_1.png"]
+        assert listed(tmp_path) == ["answer", "answer/answer.json", f"answer/picture_{number}.png"]
+
+    def stopped():
+        with replaced_folder(folder, OURS) as new:
+            (new / "answer.json").write_text("3")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()
+    assert listed(tmp_path) == ["answer", "answer/answer.json", "answer/picture_2.png"]
+    assert (folder / "answer.json").read_text() == "2"
+
+
+def test_what_stood_there_comes_back_where_the_new_cannot_take_its_place(tmp_path, monkeypatch):
+    folder, rename = tmp_path / "answer", Path.rename
+    fresh_folder(folder, OURS)
+    (folder / "answer.json").write_text("1")
+
+    def not_the_new(self, target):
+        if self.name.endswith(".partial"):
+            raise OSError("no")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", not_the_new)
+    with pytest.raises(OSError, match="no"), replaced_folder(folder, OURS):
+        pass
+    assert listed(tmp_path) == ["answer", "answer/answer.json"]
+
+
+@pytest.mark.parametrize(
+    "there", [("answer.json", "notes.txt"), ("masks",), ("picture_1.png", "picture_2.png")]
+)
+def test_a_folder_with_something_else_is_not_replaced(tmp_path, there):
+    folder = tmp_path / "answer"
+    folder.mkdir()
+    for name in there:
+        (folder / name).touch()
+    for replace in (lambda: replaced_folder(folder, OURS).__enter__(), lambda: fresh_folder(folder, OURS)):
+        with pytest.raises(FileExistsError, match=r"answer: expected what gsjax writes there or nothing"):
+            replace()
+    assert listed(folder) == sorted(there)
+
+
+def test_a_link_stays_one_and_an_empty_folder_and_hidden_files_are_nobodys(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "answer").symlink_to(tmp_path / "elsewhere")
+    for _ in range(2):
+        with replaced_folder(tmp_path / "answer", OURS) as new:
+            (new / "answer.json").touch()
+        (tmp_path / "elsewhere" / ".hidden").touch()
+    assert (tmp_path / "answer").is_symlink()
+    assert listed(tmp_path / "elsewhere") == [".hidden", "answer.json"]
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError, match="found a file"):
+        fresh_folder(tmp_path / "file", OURS)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.io.atomic import atomic_write, write_json, write_npz
+from gsjax.io.atomic import atomic_write, write_json, write_new, write_npz
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -37,6 +37,23 @@ def test_errors_name_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(FileNotFoundError) as caught, atomic_write(tmp_path / "x.ply") as temporary:
         temporary.read_bytes()
     assert caught.value.filename == str(tmp_path / "x.ply")
+
+
+def test_a_new_file_takes_the_first_name_that_nothing_has(tmp_path):
+    (tmp_path / "1").write_text("mine")
+    names = [tmp_path / name for name in "123"]
+    assert write_new(names, lambda path: path.write_text("new")) == tmp_path / "2"
+    assert (tmp_path / "1").read_text() == "mine"
+
+    def full(path):
+        assert path.exists()  # nobody else can have it
+        raise OSError("no space")
+
+    with pytest.raises(OSError, match="no space"):
+        write_new(names, full)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
+    with pytest.raises(FileExistsError, match="found none"):
+        write_new(names[:2], full)
 
 
 def test_json_holds_arrays_and_no_nan(tmp_path):

@@ -121,6 +121,7 @@ def test_rows_that_cannot_be_drawn_are_culled_and_counted(tmp_path):
     loaded, report = read_ply(tmp_path / "scene.ply")
     assert (report.stored, report.culled) == (6, 3)
     np.testing.assert_array_equal(report.labels, [0, 2, 5])
+    np.testing.assert_array_equal(report.rows, [0, 2, 5])
     np.testing.assert_array_equal(loaded.means, gaussians.means[jnp.array([0, 2, 5])])
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from gsjax.losses.features import (
     contrastive_loss,
     cosine_error,
+    cycle_error,
     feature_error,
     likeness,
     likeness_to_map,
@@ -171,3 +172,24 @@ def test_strips_of_total_variation_add_up():
     inside = jnp.arange(7) < 5
     parts = total_variation(image[:4]) + total_variation(lower, image[3], inside)
     np.testing.assert_allclose(parts, by_hand, rtol=1e-6)
+
+
+@pytest.mark.usefixtures("x64")
+@given(st.integers(0, 1000))
+def test_the_cycle_is_both_ways_and_nothing_for_an_inverse(seed):
+    random = np.random.default_rng(seed)
+    low, weights = random.normal(size=(PIXELS, CHANNELS)), random.normal(size=(DIMENSION, CHANNELS))
+    inverse, high = random.normal(size=(CHANNELS, DIMENSION)), random.normal(size=(PIXELS, DIMENSION))
+    want = np.abs(high @ inverse.T - low).sum(1) + np.abs(low @ weights.T - high).sum(1)
+    given_ = [jnp.asarray(a) for a in (low, high, weights, inverse)]
+    np.testing.assert_allclose(cycle_error(*given_), want, rtol=1e-9)
+    back = jnp.asarray(np.linalg.pinv(weights))
+    np.testing.assert_allclose(cycle_error(given_[0], given_[0] @ given_[2].T, given_[2], back), 0, atol=1e-9)
+    along = jnp.asarray(random.normal(size=inverse.shape))
+
+    def loss(inverse):
+        return cycle_error(*given_[:3], inverse).mean()
+
+    step = 1e-7 * along
+    numeric = (loss(given_[3] + step) - loss(given_[3] - step)) / 2e-7
+    np.testing.assert_allclose((jax.grad(loss)(given_[3]) * along).sum(), numeric, rtol=1e-4, atol=1e-6)

@@ -60,10 +60,10 @@ def tensor(array: np.ndarray, kind: str, offset: int = 0, shape=None, strides=No
     return _Call(rebuild, _Storage(kind, array.size), offset, shape, strides, False, hooks)
 
 
-def write_torch(path, described, numbers: bytes) -> None:
+def write_torch(path, described, numbers: bytes, packed: int = zipfile.ZIP_STORED) -> None:
     stream = io.BytesIO()
     _Pickler(stream, protocol=2).dump(described)
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", packed) as archive:
         archive.writestr("archive/data.pkl", stream.getvalue())
         archive.writestr("archive/byteorder", "little")
         archive.writestr("archive/data/0", numbers)
@@ -113,6 +113,11 @@ def test_a_pickle_that_would_run_something_is_refused_and_not_run(tmp_path):
         tensor(np.ones(3, np.float32), "FloatStorage", offset=-1),
         tensor(np.ones(3, np.float32), "FloatStorage", strides=(10**9,)),
         tensor(np.ones(3, np.float32), "FloatStorage", shape=("x",)),
+        tensor(np.ones(3, np.float32), "FloatStorage", shape=(10**12,), strides=(0,)),
+        tensor(np.ones(3, np.float32), "FloatStorage", shape=(4,), strides=(0,)),
+        tensor(np.ones(3, np.float32), "FloatStorage", shape=(0, 10**12, 10**12), strides=(1, 1, 1)),
+        tensor(np.ones(3, np.float32), "FloatStorage", shape=(1,) * 80, strides=(1,) * 80),
+        tensor(np.ones(3, np.float32), "DoubleStorage"),  # 12 bytes are no whole number of these
         tensor(np.ones(3, np.float32), "BFloat16Storage"),
         _Call(_Global("collections", "OrderedDict")),
     ],
@@ -121,6 +126,30 @@ def test_anything_but_one_tensor_is_refused(tmp_path, described):
     write_torch(tmp_path / "a.pt", described, np.ones(3, np.float32).tobytes())
     with pytest.raises(ValueError, match=r"a\.pt: expected .* Save it again as \.npy"):
         read_torch_array(tmp_path / "a.pt")
+
+
+def test_a_kind_of_storage_that_is_only_a_text_is_refused(tmp_path):
+    described = tensor(np.ones(3, np.float32), "FloatStorage")
+    described.arguments[0].told = ("storage", "torch FooStorage", "0", "cpu", 3)
+    write_torch(tmp_path / "a.pt", described, np.ones(3, np.float32).tobytes())
+    with pytest.raises(ValueError, match=r"a\.pt: expected one tensor .* found a storage 'torch FooStorage'"):
+        read_torch_array(tmp_path / "a.pt")
+
+
+def test_what_could_unpack_or_print_without_end_is_refused(tmp_path):
+    zeros = np.zeros(10**6, np.float32)
+    write_torch(tmp_path / "packed.pt", tensor(zeros, "FloatStorage"), zeros.tobytes(), zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"packed\.pt: expected archive/data\.pkl as torch\.save stores it"):
+        read_torch_array(tmp_path / "packed.pt")
+    write_torch(tmp_path / "long.pt", tuple(range(5000)), b"")
+    with pytest.raises(ValueError, match=r"long\.pt: expected one tensor .* bytes that say what it holds"):
+        read_torch_array(tmp_path / "long.pt")
+    doubled = ("x",)
+    for _ in range(200):  # 2^200 words when it is printed
+        doubled = (doubled, doubled)
+    write_torch(tmp_path / "deep.pt", _Call(doubled), b"")
+    with pytest.raises(ValueError, match=r"deep\.pt: expected one tensor .* found a call of 'no function'"):
+        read_torch_array(tmp_path / "deep.pt")
 
 
 def test_files_that_are_none_are_refused(tmp_path):
@@ -169,6 +198,38 @@ def test_names_in_folders_are_found_too(tmp_path):
     assert found.path == tmp_path / "3/000000.npy"
 
 
+def test_a_file_that_several_pictures_would_share_is_refused(tmp_path):
+    np.save(tmp_path / "000000.npy", MAP)
+    (found,) = read_feature_folder(tmp_path, ["1/000000"])
+    assert found.path == tmp_path / "000000.npy"
+    with pytest.raises(
+        ValueError, match=r"000000\.npy: .* 0/000000 and 1/000000 would both have .* a folder per camera"
+    ):
+        read_feature_folder(tmp_path, ["0/000000", "1/000000", "2/000000"])
+    for camera in "01":
+        (tmp_path / camera).mkdir()
+        np.save(tmp_path / camera / "000000.npy", MAP)
+    found = read_feature_folder(tmp_path, ["0/000000", "1/000000", "2/000000"])
+    assert [one.path.parent.name for one in found] == ["0", "1", tmp_path.name]
+    np.save(tmp_path / "a.npy", MAP)
+    with pytest.raises(ValueError, match=r"a\.jpg and a\.png would both have"):
+        read_feature_folder(tmp_path, ["a.jpg", "a.png"])
+
+
+def test_the_only_file_of_a_folder_may_hold_all_pictures(tmp_path):
+    np.save(tmp_path / "dino.npy", np.stack([MAP, 2 * MAP]))
+    (tmp_path / "dino.info").write_text("{}")
+    found = read_feature_folder(tmp_path, ["0/a.jpg", "1/a.jpg"])
+    np.testing.assert_array_equal(found[1].map, 2 * MAP.astype(np.float32))
+    with pytest.raises(ValueError, match=r"dino\.npy: expected features of 3 pictures, found 2; .* order"):
+        read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
+    np.save(tmp_path / "other.npy", np.stack([MAP, MAP]))
+    with pytest.raises(
+        FileNotFoundError, match=r"of the picture 0/a\.jpg .* found dino\.info, dino\.npy, other"
+    ):
+        read_feature_folder(tmp_path, ["0/a.jpg", "1/a.jpg"])
+
+
 def bad_files(folder, kind):
     if kind == "object":
         np.save(folder / "a.npy", np.array([{"a": 1}], object), allow_pickle=True)
@@ -184,6 +245,33 @@ def bad_files(folder, kind):
         np.savez(folder / "a.npz", poses=MAP)
     elif kind == "broken":
         (folder / "a.npz").write_bytes(b"PK\x03\x04 not a zip")
+    elif kind == "misnamed":
+        np.savez(folder / "a.npz", features=MAP)
+        (folder / "a.npz").rename(folder / "a.npy")
+    elif kind == "cut off":
+        (folder / "a.npy").write_bytes(b"PK\x03\x04 not a zip")
+    elif kind == "huge":
+        header = {"descr": "<f4", "fortran_order": False, "shape": (2**70, 4, 5)}
+        with (folder / "a.npy").open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+    elif kind == "no archive":
+        np.save(folder / "a.npy", MAP)
+        (folder / "a.npy").rename(folder / "a.npz")
+    elif kind == "no array":
+        with zipfile.ZipFile(folder / "a.npz", "w") as archive:
+            archive.writestr("features.npy", "text")
+    elif kind == "object inside":
+        np.savez(folder / "a.npz", features=np.array([{"a": 1}], object))
+    elif kind == "secret":  # says that it is encrypted
+        np.savez(folder / "a.npz", features=MAP)
+        packed = bytearray((folder / "a.npz").read_bytes())
+        packed[6] |= 1
+        packed[packed.index(b"PK\x01\x02") + 8] |= 1
+        (folder / "a.npz").write_bytes(packed)
+    elif kind == "wrapped":
+        np.savez(folder / "a.npz", ids=np.full((3, 4), 2**32), codebook=MAP[0])
+    elif kind == "fractions":
+        np.savez(folder / "a.npz", ids=np.full((3, 4), 0.5), codebook=MAP[0])
     elif kind == "dimension":
         np.save(folder / "a.npy", MAP)
         np.save(folder / "b.npy", MAP[..., :3])
@@ -201,6 +289,15 @@ def bad_files(folder, kind):
         ("rows", r"a\.npz: expected rows -1 to 3, found 7 to 7"),
         ("other", r"a\.npz: expected features, or ids and codebook, found poses"),
         ("broken", r"a\.npz: expected plain arrays"),
+        ("misnamed", r"a\.npy: expected a plain array, found an archive; name it a\.npz"),
+        ("cut off", r"a\.npy: expected a plain array, found a file that cannot be read .* numpy\.save"),
+        ("huge", r"a\.npy: expected a plain array, found a file that cannot be read"),
+        ("no archive", r"a\.npz: expected plain arrays, found a file that cannot be read .* numpy\.savez"),
+        ("no array", r"a\.npz: expected plain arrays, found a file that cannot be read"),
+        ("object inside", r"a\.npz: expected plain arrays, found .* allow_pickle=False"),
+        ("secret", r"a\.npz: expected plain arrays, found .* encrypted"),
+        ("wrapped", r"a\.npz: expected rows -1 to 3, found 4294967296 to 4294967296"),
+        ("fractions", r"a\.npz: expected rows of the codebook, whole numbers, found others"),
         ("dimension", r"b\.npy: expected features of 5 numbers as in a\.npy, found 3"),
         ("stack", r"level_0\.npy: expected features of 2 pictures, found 3"),
     ],
@@ -209,6 +306,16 @@ def test_files_that_do_not_hold_what_they_should_are_refused(tmp_path, kind, say
     bad_files(tmp_path, kind)
     with pytest.raises(ValueError, match=says):
         read_feature_folder(tmp_path, ["a.jpg", "b.jpg"])
+
+
+def test_an_archive_that_would_unpack_to_much_is_refused_and_not_unpacked(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsjax.perception.feature_files._LARGE", 10**5)
+    np.savez_compressed(tmp_path / "a.npz", features=np.zeros((100, 100, 50), np.float32))
+    with pytest.raises(ValueError, match=r"a\.npz: .*it would unpack to 2000128 bytes, of \d+"):
+        read_feature_folder(tmp_path, ["a.jpg"])
+    np.savez_compressed(tmp_path / "a.npz", features=MAP, unread=np.zeros(10**6, np.float32))
+    (found,) = read_feature_folder(tmp_path, ["a.jpg"])
+    np.testing.assert_array_equal(found.map, MAP.astype(np.float32))
 
 
 def test_features_that_are_not_there_are_missed(tmp_path):

@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+from types import ModuleType
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
 from gsjax.perception.maskclip import load_maskclip
 from gsjax.perception.sam import load_sam
 from gsjax.perception.sam2 import load_sam2
+from gsjax.perception.weights import weights_folder
 
 there = all(importlib.util.find_spec(name) for name in ("torch", "transformers"))
 needs_foundation = pytest.mark.skipif(
@@ -294,10 +297,69 @@ def test_a_wrong_path_says_what_was_looked_for_and_how_to_get_it(load, tmp_path)
         load(tmp_path)
 
 
+def save_placeholders(folder, *names):
+    for name in ("config.json", "preprocessor_config.json", "tokenizer.json", *names):
+        (folder / name).write_text("{}")
+
+
+@pytest.mark.parametrize("load", LOADERS)
+def test_weights_that_are_a_pickle_are_refused_and_how_to_convert_them_is_said(load, tmp_path):
+    save_placeholders(tmp_path, "pytorch_model.bin")
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"it lacks model\.safetensors .* pytorch_model\.bin is a pickle.*weights_only=True.*save_file",
+    ):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "holds", "says"),
+    [
+        ("config.json", '{"transformers_weights": "adapter_model.bin"}', "expected no transformers_weights"),
+        ("config.json", "[]", "expected a JSON object, found list"),
+        ("config.json", "{", "expected JSON, found"),
+        ("adapter_config.json", "{}", "expected the weights of a whole model, found an adapter"),
+        (
+            "model.safetensors.index.json",
+            '{"weight_map": {"a": "a.bin"}}',
+            r"expected a weight_map to .* found other files",
+        ),
+        ("model.safetensors.index.json", "{}", r"expected a weight_map to .* found other files"),
+    ],
+)
+def test_files_that_lead_to_a_pickle_are_refused(tmp_path, name, holds, says):
+    save_placeholders(tmp_path, "model.safetensors.index.json")
+    (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": {"a": "a.safetensors"}}')
+    assert weights_folder(tmp_path, "CLIP's weights", (), "a/b") == tmp_path
+    (tmp_path / name).write_text(holds)
+    with pytest.raises(ValueError, match=rf"{name}: {says}"):
+        weights_folder(tmp_path, "CLIP's weights", (), "a/b")
+
+
+@pytest.mark.parametrize("load", LOADERS)
+def test_transformers_is_told_to_unpickle_nothing_and_to_run_nothing(load, tmp_path, monkeypatch):
+    save_placeholders(tmp_path, "model.safetensors")
+    modules = __import__("sys").modules
+    for name in ("torch", "transformers"):
+        module = ModuleType(name)
+        module.__getattr__ = MagicMock()  # PEP 562: whatever is asked of it
+        monkeypatch.setitem(modules, name, module)
+    load(tmp_path)
+    asked = modules["transformers"].__getattr__
+    loads = [call for call in asked.return_value.mock_calls if call[0] == "from_pretrained"]
+    assert all(told["local_files_only"] is True for _, _, told in loads)
+    models = [
+        call.args[0] for call in asked.call_args_list if "Model" in call.args[0] or "For" in call.args[0]
+    ]
+    safe = [told for _, _, told in loads if told.get("use_safetensors") is True]
+    assert len(safe) == len(models) > 0
+    autos = [call.args[0] for call in asked.call_args_list if call.args[0].startswith("Auto")]
+    assert sum(told.get("trust_remote_code") is False for _, _, told in loads) >= len(autos)
+
+
 @pytest.mark.parametrize("load", LOADERS)
 def test_without_the_extra_it_is_named(load, tmp_path, monkeypatch):
-    for name in ("config.json", "model.safetensors", "preprocessor_config.json", "tokenizer.json"):
-        (tmp_path / name).write_text("{}")
+    save_placeholders(tmp_path, "model.safetensors")
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     with pytest.raises(ImportError, match=r"torch is not installed: pip install 'gsjax\[foundation\]'"):
         load(tmp_path)

@@ -1,5 +1,7 @@
 """Questions on the page: typed, answered, shown as heat or in parts, kept. Who answers is made up here."""
 
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -101,6 +103,48 @@ def test_what_cannot_be_answered_is_said(scene, answers):
         folder._text.value = "spoon"
         until(lambda: "no class &lt;spoon&gt;" in folder._told.content)
         assert page._now.scene is scene
+
+
+def test_an_answer_that_comes_late_does_not_replace_a_newer_one(scene, answers):
+    begun, go_on = threading.Event(), threading.Event()
+    ask = answers.ask
+
+    def slow(text):
+        begun.set()
+        assert go_on.wait(30)
+        return ask(text)
+
+    answers.ask = slow
+    scene = replace(scene, asking=answers.asking())
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        folder = page._questions
+        late = threading.Thread(target=folder._answer, args=(lambda: slow("green"), ""))
+        wrong = threading.Thread(target=folder._answer, args=(lambda: slow("spoon"), ""))
+        for thread in (late, wrong):
+            begun.clear()
+            thread.start()
+            assert begun.wait(30)
+        folder._picked = lambda: 7
+        folder._like()
+        assert folder._found.what == "like 7"
+        go_on.set()
+        for thread in (late, wrong):
+            thread.join(30)
+        assert folder._found.what == "like 7"
+        assert "like 7" in folder._told.content
+
+
+def test_heat_is_shown_whatever_gaussians_were_coloured_by(scene, answers):
+    with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
+        page._coloring.value = "label"
+        page._questions._text.value = "green"
+        until(lambda: "150 of 300" in page._questions._count.content)
+        assert page._coloring.value == "colour"
+        # Who then wants labels has them, also of what was found alone.
+        page._coloring.value = "label"
+        page._questions._showing.value = ONLY
+        until(lambda: page._now.scene.gaussians.num == 150)
+        assert page._coloring.value == "label"
 
 
 def test_what_is_picked_is_asked_for_by_its_row_in_the_whole_scene(scene, answers):

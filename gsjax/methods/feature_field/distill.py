@@ -212,7 +212,7 @@ def _teacher_sums(
         cos += jnp.where(known, cosine_error(like), 0.0).sum()
         pixels += known.sum(dtype=zero.dtype)
     if batch.map is not None:
-        said = _stretched(batch.map, first_row, len(inside), batch.plan)
+        said = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
         weight = jnp.where(known, weight_of_maps, 0.0)

@@ -1,6 +1,7 @@
 """Questions on the page: what a text means, as heat on the Gaussians, and what is done with those found."""
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, get_args
@@ -9,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.selection import only
 from gsjax.viz.colors import heat
 from gsjax.viz.viewer import words
 from gsjax.viz.viewer.drawing import recolored
@@ -34,6 +36,7 @@ class AskFolder:
         asking: who answers.
         show: called with what is to be shown in place of the scene, or None: the scene itself.
         picked: which Gaussian of what is shown was clicked on last, or None.
+        in_colour: has Gaussians shown in their colours, which heat is one of.
     """
 
     def __init__(
@@ -43,8 +46,11 @@ class AskFolder:
         asking: Asking,
         show: Callable[[Viewable | None], None],
         picked: Callable[[], int | None],
+        in_colour: Callable[[], None],
     ):
         self._scene, self._asking, self._show, self._picked = scene, asking, show, picked
+        self._in_colour = in_colour
+        self._lock, self._asked = threading.Lock(), 0  # questions so far
         self._found: Found | None = None
         self._rows: Int[np.ndarray, "shown"] | None = None  # of the scene, that are shown; None: all
         with gui.add_folder("Ask"):
@@ -83,16 +89,28 @@ class AskFolder:
         self._answer(None if row is None else (lambda: self._asking.like(row)), _PICK_FIRST)
 
     def _answer(self, ask: Callable[[], Found] | None, otherwise: str) -> None:
-        """Ask, and show the heat of the answer; runs in a thread of its own or of viser's."""
+        """Ask, and show the heat of the answer, unless another question came meanwhile; runs in a thread of
+        its own or of viser's."""
         if ask is None:
             self._told.content = words.lines([otherwise], _RED)
             return
-        self._told.content = words.lines(["asking ..."])
+        with self._lock:
+            self._asked += 1
+            number = self._asked
+            self._told.content = words.lines(["asking ..."])
         try:
             found = ask()
         except Exception as error:  # nobody else would hear of it
-            self._told.content = words.lines([f"{error}"], _RED)
+            with self._lock:
+                if number == self._asked:
+                    self._told.content = words.lines([f"{error}"], _RED)
             return
+        with self._lock:
+            if number == self._asked:
+                self._take(found)
+
+    def _take(self, found: Found) -> None:
+        """An answer takes the place of the one before."""
         low, high = (
             float(np.floor(100 * found.scores.min()) / 100),
             float(np.ceil(100 * found.scores.max()) / 100),
@@ -105,6 +123,8 @@ class AskFolder:
         )
         if self._showing.value == _SCENE:
             self._showing.value = _HEAT
+        if self._showing.value == _HEAT:
+            self._in_colour()
         self._worker.ask()
 
     def _selected(self, found: Found) -> Bool[np.ndarray, "n"]:
@@ -126,14 +146,14 @@ class AskFolder:
                 colors = heat_of(self._scene.gaussians, found, selected)
                 self._show(replace(self._scene, gaussians=recolored(self._scene.gaussians, colors)))
             else:
-                rows = np.flatnonzero(selected if showing == _ONLY else ~selected)
-                if not len(rows):
+                kept = selected if showing == _ONLY else ~selected
+                if not kept.any():
                     self._count.content = words.lines(["nothing is left to be shown"], _RED)
                     return
-                labels = None if self._scene.labels is None else self._scene.labels[rows]
-                part = replace(self._scene, gaussians=take(self._scene.gaussians, rows), labels=labels)
-                self._rows = rows
-                self._show(part)
+                labels = None if self._scene.labels is None else self._scene.labels[kept]
+                self._rows = np.flatnonzero(kept)
+                part = only(self._scene.gaussians, kept)
+                self._show(replace(self._scene, gaussians=part, labels=labels))
         except Exception as error:  # in a thread of its own nobody else would hear of it
             self._count.content = words.lines([f"{error}"], _RED)
 

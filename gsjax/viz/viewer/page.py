@@ -25,7 +25,7 @@ from gsjax.viz.viewer.drawing import Drawer, Shown, picture_of, recolored
 from gsjax.viz.viewer.edit_folder import EditFolder
 from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.pick import Picked, pick
-from gsjax.viz.viewer.player import Player
+from gsjax.viz.viewer.player import Player, frame_pause
 from gsjax.viz.viewer.shot_nodes import ShotNodes, shrunk
 from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
 from gsjax.viz.viewer.splats import Palette, depth_range
@@ -38,7 +38,6 @@ WIDTHS = ("160", "240", "320", "480", "640", "960", "1280")
 _WIDTH = "320"
 _PHOTOGRAPH = 640  # pixels, the longer side of one that is shown beside the render
 _SETTLE_S, _PATIENCE_S = 0.12, 0.6  # of the render, while the camera moves
-_MOST_HZ = 12.0  # frames a second when playing
 _TIMEOUT_S = 30.0  # for the browser's own picture
 _NUMBERED = "A PNG with the next number; none is written over"
 _MARK = (255, 70, 160)
@@ -127,7 +126,8 @@ class Page:
             self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
         self._questions = None
         if scene.asking is not None and scene.num_frames == 1:
-            self._questions = AskFolder(gui, scene, scene.asking, self._show, self._picked_row)
+            touched = (self._show, self._picked_row, self._in_colour)
+            self._questions = AskFolder(gui, scene, scene.asking, *touched)
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)
@@ -213,6 +213,9 @@ class Page:
 
     def _picked_row(self) -> int | None:
         return None if self._picked is None else self._picked.index
+
+    def _in_colour(self) -> None:
+        self._coloring.value = "colour"
 
     def _step(self) -> None:
         """To the next frame; after the last, to the first."""
@@ -384,12 +387,6 @@ def unique(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) == len(names):
         return names
     return tuple(f"{number}: {name}" for number, name in enumerate(names))
-
-
-def frame_pause(times: np.ndarray | None) -> float:
-    """Seconds between frames when playing: as they were taken, but not faster than a browser follows."""
-    step = 0.0 if times is None or len(times) < 2 else float(np.median(np.diff(times)))
-    return float(np.clip(step, 1 / _MOST_HZ, 1.0))
 
 
 def over(

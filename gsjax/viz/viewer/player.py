@@ -3,6 +3,10 @@
 import threading
 from collections.abc import Callable
 
+import numpy as np
+
+_MOST_HZ = 12.0  # frames a second
+
 
 class Player:
     """Steps again and again, in a thread of its own.
@@ -44,3 +48,9 @@ class Player:
     def _run(self, stop: threading.Event) -> None:
         while not stop.wait(self._pause()):
             self._step()
+
+
+def frame_pause(times: np.ndarray | None) -> float:
+    """Seconds between frames when playing: as they were taken, but not faster than a browser follows."""
+    step = 0.0 if times is None or len(times) < 2 else float(np.median(np.diff(times)))
+    return float(np.clip(step, 1 / _MOST_HZ, 1.0))
