@@ -43,6 +43,7 @@ from gsjax.scene.gaussians import Gaussians
 TRUE_WITHIN = 0.015  # metres between a Gaussian's centre and the depth where its label is taken
 _OPAQUE = 0.5
 _LEAST_VOTES = 1
+NO_FLAWS = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
 
 
 def fitted(
@@ -81,7 +82,7 @@ def first_tracked(
 
 def codebook_of(photographs: Photographs) -> tuple[dict[int, str], Float[np.ndarray, "k d"]]:
     """Names of the labels 0 to K, the background among them, and their codes."""
-    there = {int(v) for i in range(photographs.num) for v in np.unique(_labels(photographs, i))}
+    there = {int(v) for i in range(photographs.num) for v in np.unique(labels_of(photographs, i))}
     known = {label: photographs.label_names.get(label, f"object {label}") for label in range(max(there) + 1)}
     names = known | {0: "background"}
     encoder = ClassCodebook({label + 1: name for label, name in names.items()})
@@ -99,7 +100,7 @@ def flawed_teacher(
     """What a segmenter and an encoder might have said of a scene's photographs, outlines put on edges within
     `snap` pixels, then made smaller by `scale`; and, for a vote of labels, which code each pixel's embedding
     is nearest to."""
-    said = flawed_masks([_labels(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
+    said = flawed_masks([labels_of(scene.photographs, i) for i in scene.taught], codes, seed, flaws)
     images = (scene.photographs.image(i) for i in scene.taught)
     said = said._replace(
         labels=[snap_outlines(one, image, snap) for one, image in zip(said.labels, images, strict=True)]
@@ -119,7 +120,7 @@ def flawed_teacher(
     return teacher_of_objects(said.labels, said.embeddings), ids
 
 
-def _labels(photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
+def labels_of(photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
     labels = photographs.labels(i)
     assert labels is not None
     return np.asarray(labels, np.int64)
@@ -206,7 +207,7 @@ def scored(
             share = np.asarray(paint(view[0], jax.nn.one_hot(of_gaussians, len(names)), view[1])[0])
             in_space = np.where(share.max(-1) > _OPAQUE, share.argmax(-1), -1)
             by_pixel = np.full_like(in_space, -1)
-        true, drawn = _labels(photographs, i), _drawn(scene, view)
+        true, drawn = labels_of(photographs, i), _drawn(scene, view)
         scores.add(by_pixel, in_space, true)
         inside.add(*(np.where(drawn, one, -1) for one in (by_pixel, in_space, true)))
         covered.append(drawn)
@@ -273,7 +274,7 @@ def _seen(
     inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
     close = inside & (depth[y, x] > 0) & (np.abs(depth[y, x] - z) < TRUE_WITHIN)
-    return _labels(photographs, i)[y, x], close
+    return labels_of(photographs, i)[y, x], close
 
 
 def _hidden(scene: FieldScene, truth: Int[np.ndarray, "n"]) -> dict[int, Bool[np.ndarray, "n"]]:

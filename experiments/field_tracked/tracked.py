@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import equinox as eqx
 import jax
 import numpy as np
-from fields import codebook_of, flawed_teacher, learned, of_field
+from fields import NO_FLAWS, codebook_of, flawed_teacher, learned, of_field
 from recordings import recorded
 
 from gsjax.cli import track as track_command
@@ -22,7 +22,6 @@ from gsjax.methods.object_tracker import place
 from gsjax.scene.gaussians import Gaussians
 
 CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, (2,), 6
-NONE = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
@@ -42,7 +41,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         )
     first, saved = scene_of_run(path), open_run(path)
     names, codes = codebook_of(first.photographs)
-    teacher, _ = flawed_teacher(first, codes, seed, NONE if options["masks"] == "true" else Flaws())
+    teacher, _ = flawed_teacher(first, codes, seed, NO_FLAWS if options["masks"] == "true" else Flaws())
     found = learned(first, first.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
     carried = FeatureField(
         features_of(found.field, found.located), found.field.lift

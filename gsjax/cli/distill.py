@@ -46,6 +46,9 @@ class Options(SceneOptions):
     """Whose masks: the recording's own, or a segmenter's that needs no weights. auto: files if there are."""
     sam: Path | None = None
     """Folder of SAM's weights: let it segment."""
+    snap: int = 0
+    """Put outlines of masks on the picture's edges, where there are any within so many pixels: for masks
+    whose outlines are off, as many segmenters' are."""
     weights: Path | None = None
     """Folder of CLIP's weights, in the layout of Hugging Face."""
     level: Literal["default", "small", "medium", "large"] = "default"
@@ -69,7 +72,13 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         asked = Asked(
-            options.features, options.masks, options.sam, options.weights, options.level, options.second
+            options.features,
+            options.masks,
+            options.sam,
+            options.weights,
+            options.level,
+            options.second,
+            options.snap,
         )
         asked.check()
         scene = open_scene(options)

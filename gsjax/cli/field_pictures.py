@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
@@ -105,9 +106,13 @@ def _shares(scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The scene in the colours that it has from one camera, the same from all sides."""
+    return _painted(gaussians, np.asarray(_colors(gaussians, camera)))
+
+
+@jax.jit
+def _colors(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
     toward = gaussians.means - camera_centers(camera.viewmat)[0]
-    colors = jnp.maximum(evaluate_sh(gaussians.sh_degree, gaussians.sh, toward), 0)
-    return _painted(gaussians, np.asarray(colors))
+    return jnp.maximum(evaluate_sh(gaussians.sh_degree, gaussians.sh, toward), 0)
 
 
 def _painted(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:

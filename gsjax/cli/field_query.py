@@ -78,9 +78,9 @@ class Changes:
     def of(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
         """Scenes with the selected ones changed, by the names of their files."""
         there = jnp.asarray(selected)
-        scenes = {"recolored": tinted(gaussians, there, jnp.asarray(self.color))}
+        scenes = {"recolored": jax.jit(tinted)(gaussians, there, jnp.asarray(self.color))}
         if self.move is not None:
-            scenes["moved"] = shifted(gaussians, there, jnp.asarray(self.move))
+            scenes["moved"] = jax.jit(shifted)(gaussians, there, jnp.asarray(self.move))
         return scenes
 
 

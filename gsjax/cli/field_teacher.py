@@ -20,6 +20,7 @@ from gsjax.methods.feature_field import Teacher, teacher_of_maps, teacher_of_obj
 from gsjax.methods.feature_field.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder, Segmenter
 from gsjax.perception.feature_files import PictureFeatures, read_feature_folder
+from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
 Masks = Literal["auto", "files", "segment"]
@@ -41,6 +42,7 @@ class Asked:
         weights: folder of CLIP's.
         level: of LangSplat's files.
         second: who teaches beside CLIP's vectors of masks.
+        snap: pixels within which outlines of masks are put on the picture's edges.
     """
 
     features: str = "auto"
@@ -49,6 +51,7 @@ class Asked:
     weights: Path | None = None
     level: str = "default"
     second: Second = "none"
+    snap: int = 0
 
     @property
     def of_files(self) -> bool:
@@ -76,6 +79,8 @@ class Asked:
             )
         if self.sam is not None and self.masks == "files":
             raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
+        if self.snap < 0:
+            raise ValueError(f"--snap: expected 0 or more pixels, found {self.snap}")
         if self.level != "default" and not self.of_files:
             raise ValueError(
                 f"--level {self.level}: expected --features FOLDER, with LangSplat's files, found "
@@ -244,6 +249,8 @@ class Teaching:
             labels = found["labels"].astype(np.int64)
             if self.masks == "sam" or depth is None:  # these have no background: 0 is what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
+        if self._asked.snap:
+            labels = snap_outlines(labels, photographs.image(i), self._asked.snap)
         if (counted := photographs.mask(i)) is not None:
             labels = np.where(counted, labels, UNKNOWN_ID)
         there, place = np.unique(np.maximum(labels, UNKNOWN_ID), return_inverse=True)

@@ -48,7 +48,7 @@ class Options:
     threshold: float | None = None
     """Of a field: score above which a Gaussian is meant. Unless given, 1/2 against negatives; of a text of
     the closed vocabulary its own; else where the scores part best into two kinds (Otsu)."""
-    color: tuple[float, float, float] | None = None
+    color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
     """Of a field: RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
     move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Of a field: by how much along each axis, in the scene's unit, what was found is moved in moved.ply; not

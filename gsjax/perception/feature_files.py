@@ -201,13 +201,14 @@ _READERS = {
 
 
 def _stacked(path: Path, maps: np.ndarray, count: int, which: Sequence[int]) -> Iterator[PictureFeatures]:
-    """LERF's: all pictures in one file."""
+    """LERF's: all pictures in one file, or all that are wanted, as it has those alone that it learns from."""
     _expect(path, maps, 4, "[pictures,h,w,C]")
-    if len(maps) != count:
+    if len(maps) not in (count, len(which)):
+        some = f", or of the {len(which)} that are wanted" if len(which) < count else ""
         raise ValueError(
-            f"{path}: expected features of {count} pictures, found {len(maps)}; it goes by order"
+            f"{path}: expected features of {count} pictures{some}, found {len(maps)}; it goes by order"
         )
-    for i in which:
+    for i in which if len(maps) == count else range(len(which)):
         yield PictureFeatures(path, map=np.array(maps[i], np.float32))
 
 

@@ -166,6 +166,27 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_pa
     assert one_more.of(1).dimension == one_more.teacher.dimension
 
 
+def test_outlines_can_be_put_on_edges(tmp_path):
+    true = np.zeros((12, 16), int)
+    true[3:9, 4:12] = 1
+    off = np.roll(true, 1, axis=1)  # by a pixel
+    shown = replace(
+        photographs([TWO]),
+        load_image=lambda i: np.uint8(200 * true[..., None] + 30).repeat(3, 2),
+        load_labels=lambda i: off,
+    )
+    as_they_are, snapped = (taught(shown, [0], Asked("classes", snap=n), tmp_path).teacher for n in (0, 2))
+    thing = {k: t.ids[0] == t.ids[0][6, 8] for k, t in (("off", as_they_are), ("on", snapped))}
+    np.testing.assert_array_equal(thing["off"], off == 1)
+    assert (
+        ((thing["on"] & true).sum() / (thing["on"] | true).sum())
+        > 0.9
+        > (off & true).sum() / (off | true).sum()
+    )
+    with pytest.raises(ValueError, match="--snap: expected 0 or more pixels, found -1"):
+        Asked(snap=-1).check()
+
+
 def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
     from gsjax.perception.codebook import ClassCodebook
 

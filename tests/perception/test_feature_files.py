@@ -221,6 +221,11 @@ def test_the_only_file_of_a_folder_may_hold_all_pictures(tmp_path):
     (tmp_path / "dino.info").write_text("{}")
     found = read_feature_folder(tmp_path, ["0/a.jpg", "1/a.jpg"])
     np.testing.assert_array_equal(found[1].map, 2 * MAP.astype(np.float32))
+    # Of three pictures the two that are to teach: LERF has no others.
+    of_two = read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], which=[0, 2])
+    np.testing.assert_array_equal(of_two[1].map, 2 * MAP.astype(np.float32))
+    with pytest.raises(ValueError, match=r"of 3 pictures, or of the 1 that are wanted, found 2; .* order"):
+        read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], which=[1])
     with pytest.raises(ValueError, match=r"dino\.npy: expected features of 3 pictures, found 2; .* order"):
         read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
     np.save(tmp_path / "other.npy", np.stack([MAP, MAP]))

@@ -57,8 +57,8 @@ def flawed_masks(
 
     A mask has the embedding of its label. Two things in one mask have the mean of theirs, by their pixels, as
     an encoder of crops would say; of one that is two, the smaller piece has one almost halfway to another
-    thing's, for half of a thing looks like something else. Nothing is overlooked in all pictures that show enough of
-    it.
+    thing's, for half of a thing looks like something else. Nothing is overlooked in all pictures that show
+    enough of it.
 
     Args:
         masks: labels of each picture, [H,W].

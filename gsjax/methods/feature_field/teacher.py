@@ -81,7 +81,7 @@ def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndar
     rows = np.where(known, np.cumsum(known) - 1, UNKNOWN_ID)[place.reshape(-1)]
     begins = np.cumsum([0, *(len(e) for e in embeddings)])
     ids = [
-        np.where(mask >= 0, rows[begin + np.maximum(mask, 0)], UNKNOWN_ID).astype(np.int32)
+        np.append(rows, UNKNOWN_ID)[np.where(mask >= 0, begin + mask, len(rows))].astype(np.int32)
         for mask, begin in zip(masks, begins[:-1], strict=True)
     ]
     _warn_of_silence(ids)
