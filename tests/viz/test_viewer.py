@@ -28,9 +28,8 @@ from gsjax.viz.viewer.cameras import (
 from gsjax.viz.viewer.drawing import Drawer, Drawn, picture_of, recolored
 from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.page import over, unique
-from gsjax.viz.viewer.player import frame_pause
 from gsjax.viz.viewer.pick import Picked
-from gsjax.viz.viewer.player import Player
+from gsjax.viz.viewer.player import Player, frame_pause
 from gsjax.viz.viewer.server import free_port, is_loopback
 from gsjax.viz.viewer.shot_nodes import shrunk
 from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
