@@ -7,6 +7,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 from fields import (
+    NO_FLAWS,
     by_majority,
     codebook_of,
     first_tracked,
@@ -18,10 +19,7 @@ from fields import (
 )
 
 from gsjax.cli.field_scene import FieldScene
-from gsjax.data.simulated.flawed_masks import Flaws
 from gsjax.methods.feature_field import FieldConfig
-
-NONE = Flaws(outline=0, merged=0.0, split=0.0, missing=0.0, smallest=0)
 
 
 def scene_of(name: str, folder: Path) -> FieldScene:
@@ -35,12 +33,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Masks of one seed, lifted by a vote and distilled into a field; and the best that a vote could do."""
     scene = scene_of(options["scene"], folder)
     names, codes = codebook_of(scene.photographs)
-    _, true = flawed_teacher(scene, codes, seed, NONE)
+    _, true = flawed_teacher(scene, codes, seed, NO_FLAWS)
     ceiling = scored(scene, by_majority(scene, scene.taught, true, len(names)), names)
-    flaws = Flaws(missing_label=0 if options["overlooked"] == "background" else -1)
-    _, ids = flawed_teacher(scene, codes, seed, flaws)
+    _, ids = flawed_teacher(scene, codes, seed)
     voted = scored(scene, by_majority(scene, scene.taught, ids, len(names)), names)
-    teacher, _ = flawed_teacher(scene, codes, seed, flaws, snap=options["snap"])
+    teacher, snapped = flawed_teacher(scene, codes, seed, snap=options["snap"])
+    of_snapped = scored(scene, by_majority(scene, scene.taught, snapped, len(names)), names)
     found = learned(scene, scene.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
     by_field = (found.field, found.located, codes)
     asked = scored(scene, of_field(found, codes), names, by_field)
@@ -51,6 +49,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "voted_mboundary_iou": voted["mboundary_iou_3d"],
         "voted_gaussian_iou": voted["gaussian_iou"],
         "voted_hidden_recall": voted["hidden_recall"],
+        "snapped_miou": of_snapped["miou_3d"],
+        "snapped_mboundary_iou": of_snapped["mboundary_iou_3d"],
         "true_miou": ceiling["miou_3d"],
         "true_inside_miou": ceiling["inside_miou_3d"],
         "gaussians": scene.gaussians.num,
