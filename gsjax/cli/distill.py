@@ -1,7 +1,7 @@
 """`gsjax distill`: meaning on the Gaussians of a scene that stands, to be asked by `gsjax query`."""
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Literal
@@ -18,7 +18,7 @@ from gsjax.cli.field_teacher import Asked, Masks, Second, Teaching
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
 from gsjax.cli.recording import located
-from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.run_folder import RunFolder, plain
 from gsjax.cli.run_records import digest
 from gsjax.methods.feature_field import FieldConfig, begin_field
 
@@ -117,6 +117,7 @@ def run(options: Options) -> int:
                 "sha256": sha256,
                 "num_gaussians": scene.gaussians.num,
                 "rasterize_mode": scene.rasterize_mode,
+                "photographs": plain({f.name: asdict(settings)[f.name] for f in fields(SceneOptions)}),
             },
         )
         write_field(folder.path / NAME, stored)

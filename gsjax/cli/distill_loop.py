@@ -98,7 +98,7 @@ def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console:
                 if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
                     bar.update(task, completed=step, description=_told(learning.rows[-1]))
                     shown = perf_counter()
-                if not console.is_terminal and _LINES * step // total > _LINES * (step - 1) // total:
+                if not console.is_terminal and _is_told(step, total):
                     told = f": {_told(learning.rows[-1])}" if learning.rows else ""
                     console.print(f"{step:,} of {total:,} steps{told}", soft_wrap=True)
                 save(learning.state, learning.metadata, last=False)
@@ -142,6 +142,12 @@ def _add_row(learning: Learning, folder: RunFolder) -> None:
         temporary.write_text("".join(json.dumps(one) + "\n" for one in learning.rows), encoding="utf-8")
 
 
+def _is_told(step: int, total: int) -> bool:
+    """Whether a log has a line of this step: about ten in all, each of which was measured just now."""
+    every = max(1, total // (_LINES * _LOGGED_EVERY)) * _LOGGED_EVERY
+    return step % every == 0 or step == total
+
+
 def _told(row: dict[str, Any]) -> str:
     """The means of a row in words."""
-    return "angles are off by " + ("–" if row["cos"] is None else f"{row['cos']:.3f} (1 - cosine)")
+    return "1 - cosine to the teacher " + ("–" if row["cos"] is None else f"{row['cos']:.3f}")

@@ -32,7 +32,8 @@ class StoredField:
         field: of a grid, the entries that were trained.
         rows: which entries of the grid those are; None for a vector a Gaussian.
         source: of its features.
-        scene: sha256 and number of Gaussians of the scene that it was distilled for, and its rasterize_mode.
+        scene: sha256 and number of Gaussians of the scene that it was distilled for, its rasterize_mode, and
+            which photographs of it there were, as `gsjax distill` was told.
     """
 
     field: FeatureField

@@ -93,12 +93,14 @@ class Selection:
         threshold: from which on they are meant.
         against: what the question was held against.
         seconds: that it took to score all Gaussians.
+        meant: the class that a point shows; None where it was not asked so, or is of no class.
     """
 
     scores: Float[np.ndarray, "n"]
     threshold: Threshold
     against: tuple[str, ...]
     seconds: float
+    meant: str | None = None
 
     @property
     def selected(self) -> Bool[np.ndarray, "n"]:
@@ -138,7 +140,7 @@ def answer(
         best = float(found.scores.max())
         raise ValueError(
             f"{question.words} means nothing of this scene: the best score is {best:.3f}, and "
-            f"{found.threshold.value:.3f} is asked for ({found.threshold.rule}); --threshold names another"
+            f"{found.threshold.value:.3f} is asked for ({found.threshold.rule}); try a lower --threshold"
         )
     if count == len(selected):
         notes.warn(
@@ -155,6 +157,7 @@ def answer(
             "image": None if question.image is None else str(question.image),
             "point": question.point,
             "camera": question.camera,
+            "meant": found.meant,
             "features": run.stored.source.kind,
             "scene": str(run.file),
             "against": found.against,
@@ -206,7 +209,7 @@ def select(run: FieldRun, question: Question) -> Selection:
     Raises:
         ValueError: the question cannot be understood.
     """
-    queries, against, least = _queries(run, question)
+    queries, against, least, meant = _queries(run, question)
     field, located = run.stored.at(run.gaussians.means)
     queries = jnp.asarray(queries, field.lift.dtype)
     if queries.shape[1] != field.dimension:
@@ -223,7 +226,7 @@ def select(run: FieldRun, question: Question) -> Selection:
         threshold = Threshold(float(least), "the encoder's own")
     else:
         threshold = threshold_for(scores, len(queries) > 1, given)
-    return Selection(scores, threshold, against, seconds)
+    return Selection(scores, threshold, against, seconds, meant)
 
 
 @jax.jit
@@ -231,9 +234,12 @@ def _scores(field, located, queries):
     return relevancy(gaussian_cosines(field, located, queries))
 
 
-def _queries(run: FieldRun, question: Question) -> tuple[np.ndarray, tuple[str, ...], float | None]:
-    """The vector that is asked for and those of negatives, their texts, and the encoder's own threshold."""
-    source, against, least = run.stored.source, question.negatives, None
+def _queries(
+    run: FieldRun, question: Question
+) -> tuple[np.ndarray, tuple[str, ...], float | None, str | None]:
+    """The vector that is asked for and those of negatives, their texts, the encoder's own threshold, and the
+    class that a point shows."""
+    source, against, least, meant = run.stored.source, question.negatives, None, None
     if question.point is not None:
         vector = _at_point(run, question)
         if source.kind == "classes":  # it means the class that it is nearest to
@@ -241,6 +247,7 @@ def _queries(run: FieldRun, question: Question) -> tuple[np.ndarray, tuple[str, 
             codes = np.stack([run.encoder.embed_text(name) for name in names])
             name = names[int((codes @ vector).argmax())]
             vector, against = run.encoder.embed_text(name), _against(against, source.negatives(name))
+            meant = name
     elif question.image is not None:
         if source.kind == "classes":
             raise ValueError("--image: classes are known by name, not by sight; ask by text or --point")
@@ -251,7 +258,7 @@ def _queries(run: FieldRun, question: Question) -> tuple[np.ndarray, tuple[str, 
         against = _against(against, source.negatives(question.text))
         least = run.encoder.min_score if source.kind == "closed" else None
     against = against or ()
-    return np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against, least
+    return np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against, least, meant
 
 
 def _against(given: tuple[str, ...] | None, otherwise: tuple[str, ...]) -> tuple[str, ...]:

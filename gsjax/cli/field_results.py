@@ -31,7 +31,8 @@ from gsjax.viz.colors import (
 )
 from gsjax.viz.plots import losses_over_steps, save
 
-_SHOWN = 6  # views in the report
+_SHOWN = 6  # views in the report, classes in a line
+_WEAK = 0.5  # IoU of a class that is not learned well
 _OF_PCA = 20_000  # Gaussians that the colours are made for
 _PANEL_HEIGHT = 240  # pixels, at least
 
@@ -165,7 +166,14 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     if test["cosine"] is not None:
         words.append(f"cosine {test['cosine']:.3f}")
     if words:
-        grid.add_row(f"[bold]{found['judged_by']}[/]", ", ".join(words))
+        views = "held out" if found["views"]["held_out"] else "that taught it (none is held out)"
+        grid.add_row("[bold]views[/]", f"{', '.join(words)}, of those {views}")
+    weak = sorted((row["iou_3d"], row["class"]) for row in found["classes"] if row["iou_3d"] < _WEAK)
+    if weak:
+        listed = ", ".join(f"{name} {iou:.2f}" for iou, name in weak[:_SHOWN])
+        grid.add_row(
+            "[bold]weak[/]", f"[yellow]{listed}{', ...' if len(weak) > _SHOWN else ''}[/] (IoU, 3D query)"
+        )
     grid.add_row("[bold]features[/]", f"{found['features_are']}; masks: {found['masks']}")
     if found["names"]:
         grid.add_row("[bold]names[/]", ", ".join(found["names"]))

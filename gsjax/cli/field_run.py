@@ -112,7 +112,7 @@ def open_field_run(
     """Read it.
 
     Args:
-        folder: that holds field.npz, beside the config.yml that says which photographs, if it is there.
+        folder: that holds field.npz.
         notes: told what is odd.
         now: where things are.
         photographs: whether they are wanted.
@@ -131,7 +131,7 @@ def open_field_run(
             f"{gaussians.num} in {file}; --scene names another, or distil it again"
         )
     gaussians = jax.tree.map(jnp.asarray, gaussians)
-    shown = _photographs(folder, file, gaussians, now.images, notes) if photographs else None
+    shown = _photographs(folder, stored, file, gaussians, now.images, notes) if photographs else None
     of_file = (report.rows, report.stored, report.labels)
     return FieldRun(folder, stored, file, gaussians, *of_file, shown, now.weights)
 
@@ -156,24 +156,24 @@ def _scene_file(folder: Path, stored: StoredField, given: Path | None, notes: No
 
 
 def _photographs(
-    folder: Path, file: Path, gaussians: Gaussians, images: str | None, notes: Notes
+    folder: Path, stored: StoredField, file: Path, gaussians: Gaussians, images: str | None, notes: Notes
 ) -> Photographs | None:
-    """Those that the field's config.yml tells of; None, and a warning, where they are not to be had.
+    """Those that the field tells of; None, and a warning, where they are not to be had.
 
     Raises:
         ValueError: they are not where `images` says.
     """
-    config = folder / "config.yml"
+    told = stored.scene.get("photographs")
     try:
-        if images is not None and not config.is_file():
-            return open_scene(SceneOptions(file, images=images), gaussians).photographs
-        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         try:
-            options = _options(settings, folder, file, images)
+            options = _options(told, folder, file, images)
         except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{config}: expected the settings of a field, found others ({error})") from error
+            raise ValueError(
+                f"{folder / NAME}: expected which photographs it learned from, found others ({error}); "
+                "distil it again with this version of gsjax"
+            ) from error
         return open_scene(options, gaussians).photographs
-    except (ValueError, OSError, yaml.YAMLError) as error:
+    except (ValueError, OSError) as error:
         if images is not None:
             raise ValueError(f"--images {images}: {describe(error)}") from error
         notes.warn(

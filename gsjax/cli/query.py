@@ -120,16 +120,18 @@ def _ask_field(options: Options, field: Path, console: Console) -> int:
             found = open_field_run(field, notes, Whereabouts(options.scene, options.images, options.weights))
         told = answer(found, question, changes, folder, notes, console)
     _print(question, found, told, perf_counter() - begun)
-    print(f"query     {folder}")
+    print(f"scene     {found.file}")
+    print(f"query     {folder}: selection.npz, object.ply{', overview.png' if told['pixels'] else ''}")
     return 0
 
 
 def _print(question: Question, run: FieldRun, told: dict[str, Any], seconds: float) -> None:
     """What was found, in a few lines."""
     unit = f" {run.unit}" if run.unit else ""
+    meant = f", {told['meant']!r}" if told["meant"] else ""
     against = f", against {', '.join(told['against'][:_LISTED])}" if told["against"] else ""
     rows = {
-        "found": f"{question.words}: {told['gaussians']:,} of {told['of']:,} Gaussians",
+        "found": f"{question.words}{meant}: {told['gaussians']:,} of {told['of']:,} Gaussians",
         "centre": ", ".join(f"{x:.3f}" for x in told["center"]) + unit,
         "size": " x ".join(f"{x:.3f}" for x in told["size"]) + unit,
         "score": f"above {told['threshold']:.2f} ({told['rule']}), {told['best_score']:.2f} at best{against}",

@@ -204,7 +204,7 @@ class RunFolder:
         Raises:
             TypeError: `config` is not a dataclass instance.
         """
-        text = yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
+        text = yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
         for name in (*_FILES, *_FOLDERS, *_PATTERNS) if self._stale else ():
             for entry in self.path.glob(name):
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -220,7 +220,7 @@ class RunFolder:
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
         """Raises ValueError where config.yml says something else than `config`, the settings `but` apart."""
         stored = _flat(yaml.safe_load(self.config.read_text(encoding="utf-8")))
-        given = _flat(_plain(dataclasses.asdict(config)))
+        given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
         others = [name for name in names if stored.get(name) != given.get(name)]
         if others:
@@ -310,14 +310,14 @@ def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
     return flat
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` in the types that YAML has words for: paths as text, enums as their values, tuples as lists."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):  # numpy and JAX arrays and scalars
         return value.tolist()
     if isinstance(value, enum.Enum):
-        return _plain(value.value)
+        return plain(value.value)
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

@@ -65,7 +65,9 @@ class ClassCodebook:
         """
         name = _plain(text)
         if name not in self.names:
-            raise ValueError(f"no class {text!r}; there are: {', '.join(self.names)}")
+            raise ValueError(
+                f"no class {text!r}; these features know names alone, and there are: {', '.join(self.names)}"
+            )
         return self._vector(name)
 
     def others(self, text: str) -> tuple[str, ...]:

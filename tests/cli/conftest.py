@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,7 @@ from gsjax.cli import loop, main, track
 from gsjax.cli.field_file import StoredField, write_field
 from gsjax.cli.field_scene import SceneOptions
 from gsjax.cli.field_source import Source
-from gsjax.cli.run_folder import RunFolder
+from gsjax.cli.run_folder import RunFolder, plain
 from gsjax.cli.run_records import digest
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
@@ -129,14 +129,16 @@ def first_picture(pristine: Path) -> tuple[Gaussians, np.ndarray]:
 def write_made_field(
     folder: Path, scene: Path, images: Path | None, source: Source, labels: np.ndarray, vectors: np.ndarray
 ) -> Path:
-    """A field that nobody had to distil: of each Gaussian the row `vectors[label]`. Without photographs it
-    has no config.yml either."""
+    """A field that nobody had to distil: of each Gaussian the row `vectors[label]`."""
+    photographs = None
     if images is not None:
         told = SceneOptions(scene, str(images), frames="0:1", test_every=0)
+        photographs = plain(asdict(told))
         RunFolder(folder).write_config(told)
     known, places = np.unique(labels, return_inverse=True)
     field = FeatureField(jnp.eye(len(known))[places], jnp.asarray(vectors[known].T, jnp.float32))
     about = {"file": str(scene), "sha256": digest(scene), "num_gaussians": len(labels)}
+    about["photographs"] = photographs
     folder.mkdir(parents=True, exist_ok=True)
     write_field(folder / "field.npz", StoredField(field, None, source, about))
     return folder

@@ -29,7 +29,9 @@ def test_a_name_has_the_same_vector_wherever_it_occurs():
 
 
 def test_what_has_no_name_is_told():
-    with pytest.raises(ValueError, match="no class 'fridge'; there are: drawer, laptop lid, faucet handle"):
+    with pytest.raises(
+        ValueError, match=r"no class 'fridge'; .* there are: drawer, laptop lid, faucet handle"
+    ):
         ClassCodebook(NAMES).embed_text("fridge")
     with pytest.raises(ValueError, match="want each of them once"):
         ClassCodebook({1: "Box", 2: "box"})

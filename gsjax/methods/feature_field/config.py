@@ -13,8 +13,8 @@ POOLS = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class FieldRatesConfig:
-    """Rates of Adam, which fall to a tenth over the iterations. The paper names none: at 0.4 times these small
-    things are learned later, at three times these it diverges."""
+    """Rates of Adam, which fall to a tenth over the iterations. The paper names none: at 0.4 times these
+    small things are learned later, at three times these it diverges."""
 
     table: float = 2.5e-2
     """Of the entries of the hash grid, or of the Gaussians' own vectors."""
