@@ -24,7 +24,14 @@ def test_it_fits_one_screen_and_its_picture_is_there():
         assert 0 < (ROOT / picture).stat().st_size < 400_000
 
 
-@pytest.mark.parametrize("page", [pytest.param("rasterizer.md", marks=pytest.mark.slow), "data.md", "fit.md"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        *(pytest.param(page, marks=pytest.mark.slow) for page in ("rasterizer.md", "fields.md")),
+        "data.md",
+        "fit.md",
+    ],
+)
 def test_the_programs_of_a_page_run_one_after_another(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict = {}
