@@ -40,15 +40,11 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     teacher, _ = flawed_teacher(whole, codes, seed, scale=SCALE)
     scene = scaled(whole, SCALE)
     variant = options["variant"]
-    squeezed = variant in SQUEEZED
+    squeezed, aside, more = variant in SQUEEZED, 0.0, 0
     if squeezed:
         found, aside, more = _squeezed(scene, teacher, SQUEEZED[variant], seed)
     else:
-        found, aside, more = (
-            learned(scene, scene.taught, teacher, replace(VARIANTS[variant], seed=seed)),
-            0.0,
-            0,
-        )
+        found = learned(scene, scene.taught, teacher, replace(VARIANTS[variant], seed=seed))
     by_pixel = None if squeezed else (found.field, found.located, codes)
     asked = scored(whole, of_field(found, codes), names, by_pixel)
     return {
@@ -79,11 +75,8 @@ def _squeezed(scene: FieldScene, teacher: Teacher, size: int, seed: int) -> tupl
     features = model.decode(low)
     features /= jnp.linalg.norm(features, axis=-1, keepdims=True)
     decoded = FeatureField(features, jnp.eye(features.shape[1]))
-    return (
-        replace(found, field=decoded),
-        aside,
-        sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array))),
-    )
+    weights = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)))
+    return replace(found, field=decoded), aside, weights
 
 
 PANELS = (

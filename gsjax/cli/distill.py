@@ -108,6 +108,7 @@ def run(options: Options) -> int:
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
         learning = learn(problem, learning, folder, console)
+        told = asdict(settings)
         stored = StoredField(
             learning.state.field,
             problem.rows,
@@ -117,7 +118,7 @@ def run(options: Options) -> int:
                 "sha256": sha256,
                 "num_gaussians": scene.gaussians.num,
                 "rasterize_mode": scene.rasterize_mode,
-                "photographs": plain({f.name: asdict(settings)[f.name] for f in fields(SceneOptions)}),
+                "photographs": plain({f.name: told[f.name] for f in fields(SceneOptions)}),
             },
         )
         write_field(folder.path / NAME, stored)

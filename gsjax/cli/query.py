@@ -76,9 +76,8 @@ def run(options: Options) -> int:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
-    tracked = (
-        options.run / "trajectory.npz"
-    ).is_file()  # which answers over time, but to what only fields can
+    # A tracked run answers over time, but not to what only fields can.
+    tracked = (options.run / "trajectory.npz").is_file()
     if field is not None and not (tracked and _for_fields(options) is None):
         return _ask_field(options, field, console)
     if field is None and not tracked:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.feature_field import (
     FieldConfig,
     FieldState,
@@ -41,6 +41,7 @@ from gsjax.methods.feature_field import (
 from gsjax.rasterize.frozen import paint, paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import gaussians_from_activated
+from tests.methods.around import cameras_around
 
 WIDTH, HEIGHT, DIMENSION = 48, 36, 24
 GRID = FeatureGridConfig(
@@ -52,9 +53,7 @@ BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 3)))[0].T.a
 
 def cameras(count: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    K = jnp.asarray(intrinsics(50.0, WIDTH, HEIGHT), jnp.float32)
-    eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.2]) for a in angles]
-    return [Camera(jnp.asarray(look_at(eye, np.zeros(3)), jnp.float32), K, WIDTH, HEIGHT) for eye in eyes]
+    return cameras_around(angles, WIDTH, HEIGHT)
 
 
 @pytest.fixture(scope="module")

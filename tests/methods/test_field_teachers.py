@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.feature_field import (
     FieldConfig,
     FieldWeightsConfig,
     begin_field,
     distill,
     field_loss,
+    frozen_views,
     gaussian_cosines,
     init_field,
     teacher_of_maps,
@@ -23,8 +24,10 @@ from gsjax.methods.feature_field import (
 )
 from gsjax.methods.feature_field.distill import _stretched, strip_rows
 from gsjax.methods.feature_field.teacher import most_rows, of_view
+from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.gaussians import gaussians_from_activated
+from tests.methods.around import cameras_around
 
 WIDTH, HEIGHT, DIMENSION = 48, 36, 24
 GRID = FeatureGridConfig(
@@ -35,9 +38,7 @@ BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 6)))[0].T.a
 
 
 def cameras(count: int) -> list[Camera]:
-    K = jnp.asarray(intrinsics(50.0, WIDTH, HEIGHT), jnp.float32)
-    eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.2]) for a in np.linspace(0, 2, count)]
-    return [Camera(jnp.asarray(look_at(eye, np.zeros(3)), jnp.float32), K, WIDTH, HEIGHT) for eye in eyes]
+    return cameras_around(np.linspace(0, 2, count), WIDTH, HEIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -153,9 +154,6 @@ def test_how_long_an_encoders_vectors_are_does_not_matter(scene):
 def test_maps_teach(scene):
     """A feature a pixel, of three stripes that lie on the scene itself."""
     labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
-    from gsjax.methods.feature_field import frozen_views
-    from gsjax.rasterize.frozen import paint
-
     said = []
     for view, plan in frozen_views(scene, cameras(3)):
         shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
@@ -201,9 +199,7 @@ def test_a_few_gaussians_far_out_do_not_make_cells_coarse():
 @pytest.mark.parametrize("megabytes", [256.0, 0.1])
 def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megabytes):
     def wide(tree):
-        return jax.tree.map(
-            lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree, is_leaf=eqx_is_array
-        )
+        return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
 
     config = replace(QUICK, contrast_after=0.0, strip_megabytes=megabytes)
     told, state = begin_field(wide(scene), cameras(3), with_maps(objects(), maps()), config)
@@ -218,7 +214,3 @@ def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megaby
         loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
     )
     np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
-
-
-def eqx_is_array(leaf):
-    return isinstance(leaf, (jax.Array, np.ndarray))

@@ -165,16 +165,7 @@ def _strip(
     alphas = alphas.ravel()
     rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
     inside = number * high + jnp.arange(high) < plan.height
-    sums = _teacher_sums(
-        field,
-        parts,
-        batch,
-        rendered,
-        alphas,
-        number * high,
-        inside,
-        1.0 if batch.codebook is None else weights.map,
-    )
+    sums = _teacher_sums(field, parts, batch, rendered, alphas, number * high, inside, weights.map)
     if not weights.tv and not weights.contrast:
         return above, (sums, None)
     channels = parts.channels_of(rendered).reshape(high, plan.width, -1)
@@ -199,9 +190,10 @@ def _teacher_sums(
     alphas,
     first_row,
     inside,
-    weight_of_maps: float,
+    beside_masks: float,
 ) -> _Sums:
-    """By how much a strip's pixels, in one row, differ from what the teacher says of them."""
+    """By how much a strip's pixels, in one row, differ from what the teacher says of them. A pixel of a map
+    counts `beside_masks` where there are masks too."""
     lifted = parts.lifted(field.lift)
     zero = jnp.zeros((), rendered.dtype)
     rec, cos, pixels = zero, zero, zero
@@ -215,7 +207,7 @@ def _teacher_sums(
         said = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
         like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
-        weight = jnp.where(known, weight_of_maps, 0.0)
+        weight = jnp.where(known, 1.0 if batch.codebook is None else beside_masks, 0.0)
         rec += (weight * feature_error(like, alphas, field.dimension)).sum()
         cos += (weight * cosine_error(like)).sum()
         pixels += weight.sum()
