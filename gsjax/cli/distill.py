@@ -23,8 +23,9 @@ from gsjax.cli.run_records import digest
 from gsjax.methods.feature_field import FieldConfig, begin_field
 
 HELP = (
-    " What encoders and segmenters say of photographs is kept by what they were shown, in "
-    f"{cache_folder()}; delete that folder to have it said anew, or for its space."
+    " As in `gsjax distill RUN`, or, of what others made, `gsjax distill scene.ply --images PHOTOGRAPHS "
+    "--features FILES --out FIELD`. What encoders and segmenters say of photographs is kept by what they "
+    f"were shown, in {cache_folder()}; delete that folder to have it said anew, or for its space."
 )
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 

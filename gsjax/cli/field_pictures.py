@@ -24,7 +24,7 @@ from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.selection import hidden
-from gsjax.viz.colors import heat, highlight, in_rows, to_uint8
+from gsjax.viz.colors import enlarged, heat, highlight, in_rows, to_uint8, with_heat_scale
 from gsjax.viz.viewer.drawing import Drawer, recolored
 
 _MARK = (255, 70, 160)
@@ -39,6 +39,7 @@ def draw(
     which: Sequence[int],
     selected: Bool[np.ndarray, "n"],
     scores: Float[np.ndarray, "n"],
+    threshold: float,
     scenes: Mapping[str, Gaussians],
     notes: Notes,
     console: Console,
@@ -51,6 +52,7 @@ def draw(
         which: of its photographs.
         selected: what was found: a pixel shows it that has more than half of its light from there.
         scores: of all.
+        threshold: of the scores, which is marked on their scale.
         scenes: with it changed, by name.
         notes: told which photograph cannot be read.
         console: shows how far it is.
@@ -62,7 +64,9 @@ def draw(
     drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
     assert photographs is not None
     names, pixels = short_names(photographs.names), {}
-    painted = np.stack([selected, _shares(scores), np.zeros(len(scores))], axis=1).astype(np.float32)
+    low, high = _ends(scores)
+    shares = np.clip((np.nan_to_num(scores) - low) / max(high - low, 1e-6), 0, 1)
+    painted = np.stack([selected, shares, np.zeros(len(scores))], axis=1).astype(np.float32)
     values = _painted(run.gaussians, painted)
     best: tuple[float, int, np.ndarray] | None = None
     for v in track(which, "drawing", console=console, transient=True):
@@ -75,20 +79,26 @@ def draw(
     assert best is not None
     _, v, drawn = best
     camera, there = _one(photographs.camera(v)), jnp.asarray(selected)
-    shown = {
-        "the object alone": hidden(run.gaussians, ~there),
-        "without it": hidden(run.gaussians, there),
-        **{_SAID[name]: scene for name, scene in scenes.items()},
-    }
+    shown = {"the object alone": hidden(run.gaussians, ~there)}
+    if not selected.all():
+        shown["without it"] = hidden(run.gaussians, there)
+    shown |= {_SAID[name]: scene for name, scene in scenes.items()}
+    behind_is = "photograph"
     try:
         behind = photographs.image(v)
     except (ValueError, OSError) as error:
         notes.warn(f"overview.png shows a render in place of a photograph: {describe(error)}")
-        behind = to_uint8(drawer(_seen_from(run.gaussians, camera), camera).colors)
-    panels = {"found": highlight(behind, drawn[..., 0] > _MOST, _MARK), "scores": heat(drawn[..., 1])}
+        behind_is, behind = "scene", to_uint8(drawer(_seen_from(run.gaussians, camera), camera).colors)
+    scale = enlarged(heat(drawn[..., 1]), _PANEL_HEIGHT)
+    panels = {
+        f"found in view {names[v]}": highlight(behind, drawn[..., 0] > _MOST, _MARK),
+        f"scores; found above {threshold:.2f}": with_heat_scale(scale, low, high, threshold),
+    }
     for words, scene in shown.items():
         panels[words] = to_uint8(drawer(_seen_from(scene, camera), camera).colors)
-    write_png(folder / "overview.png", in_rows(panels, 3, _PANEL_HEIGHT))
+    if len(panels) % 2:  # two rows, and no place in them is empty
+        panels = {behind_is: behind, **panels}
+    write_png(folder / "overview.png", in_rows(panels, len(panels) // 2, _PANEL_HEIGHT))
     return pixels
 
 
@@ -97,11 +107,10 @@ def _one(camera: Camera) -> Camera:
     return Camera(camera.viewmat[None], camera.K[None], camera.width, camera.height, camera.near)
 
 
-def _shares(scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Scores between the least and the largest, but for a few outliers at the lower end, as 0 to 1."""
+def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
+    """The least score and the largest, but for a few outliers at the lower end."""
     scores = np.nan_to_num(scores)
-    low = np.percentile(scores, 1)
-    return np.clip((scores - low) / max(scores.max() - low, 1e-6), 0, 1)
+    return float(np.percentile(scores, 1)), float(scores.max())
 
 
 def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:

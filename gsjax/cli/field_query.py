@@ -29,6 +29,7 @@ from gsjax.methods.feature_field import (
     relevancy,
     threshold_for,
 )
+from gsjax.rasterize.frozen import strip_of
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.selection import only, shifted, tinted
 
@@ -119,7 +120,7 @@ def answer(
           object.ply          what was found; without.ply the scene without it, recolored.ply with it in
                               another colour, moved.ply with it elsewhere
           masks/CAMERA.png    255 where it shows
-          overview.png        it in a photograph, the scores, and these scenes
+          overview.png        it in a photograph, the scores with their scale, and these scenes
 
     Args:
         run: the field.
@@ -150,7 +151,10 @@ def answer(
     with replaced_folder(folder, OF_QUERY) as new:
         _write_selection(new / "selection.npz", run, found)
         _write_scenes(new, run, selected, scenes)
-        pixels = draw(new, run, chosen, selected, found.scores, scenes, notes, console) if chosen else {}
+        pixels: dict[str, int] = {}
+        if chosen:
+            at = found.threshold.value
+            pixels = draw(new, run, chosen, selected, found.scores, at, scenes, notes, console)
         means = np.asarray(run.gaussians.means)[selected]
         told = {
             "text": question.text,
@@ -250,7 +254,10 @@ def _queries(
             meant = name
     elif question.image is not None:
         if source.kind == "classes":
-            raise ValueError("--image: classes are known by name, not by sight; ask by text or --point")
+            raise ValueError(
+                "--image: classes are known by name, not by sight; ask by text or --point, or distil "
+                "with --features closed or clip"
+            )
         vector = _of_image(run, question.image)
     else:
         assert question.text is not None
@@ -295,8 +302,10 @@ def _at_point(run: FieldRun, question: Question) -> np.ndarray:
         raise ValueError(f"--point: expected one in {width}x{height} pixels, found {x:g},{y:g}")
     field, located = run.stored.at(run.gaussians.means)
     view, plan = frozen_views(run.gaussians, [photographs.camera(v)], run.rasterize_mode)[0]
-    pixel = jnp.array([[int(x), int(y)]])
-    features, alphas = jax.jit(pixel_features)(field, located, view, plan, pixel)
+    row, below = divmod(int(y), plan.tile_size)
+    strip, strip_plan = strip_of(view, plan, row, 1)  # all that has to be drawn for one pixel
+    pixel = jnp.array([[int(x), below]])
+    features, alphas = jax.jit(pixel_features)(field, located, strip, strip_plan, pixel)
     if float(alphas[0]) < _LITTLE:
         raise ValueError(f"--point {x:g},{y:g}: expected something of the scene, found nothing there")
     return np.asarray(features[0])

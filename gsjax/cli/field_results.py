@@ -72,7 +72,7 @@ def judge(
         if shown:
             panels["features"] = draw_features(colors, view, pca)
         if codes is not None and of_gaussians is not None:
-            found = class_maps(field, located, view, codes, of_gaussians)
+            found = class_maps(field, located, view, codes, of_gaussians, config.strip_megabytes)
             by_pixel, in_space = (np.where(one < 0, -1, order[np.maximum(one, 0)]) for one in found)
             panels["classes, by Gaussians"] = colorize_labels(np.maximum(in_space, 0))
             if true is not None:

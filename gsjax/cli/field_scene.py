@@ -36,8 +36,8 @@ class SceneOptions:
     """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`. Of a run: where
     they are now."""
     scale: float = 1.0
-    """Width and height that photographs are to have, as a share of what they have: 0.5 is half of each. Time
-    goes with the number of pixels."""
+    """Learn from photographs at this fraction of their size (width and height), as in 0.5; time goes with the
+    number of pixels."""
     frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
     """Of --images: which photographs, or which frame of a recording, as Python slices them."""
     cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()

@@ -16,15 +16,16 @@ from gsjax.methods.feature_field import (
     FieldBatch,
     FieldConfig,
     Teacher,
+    carried,
     field_loss,
     frozen_views,
     gaussian_cosines,
-    pixel_cosines,
+    painted_cosines,
 )
 from gsjax.methods.feature_field.teacher import most_rows, of_view
 from gsjax.metrics.segmentation import MaskOverlap
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.frozen import FrozenView, paint
+from gsjax.rasterize.frozen import FrozenView, filled_up, paint_shown, rows_within, strip_of
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.feature_grid import Located
 from gsjax.scene.gaussians import Gaussians
@@ -86,6 +87,7 @@ def class_maps(
     frozen: Frozen,
     codes: Float[np.ndarray, "k d"],
     of_gaussians: Int[np.ndarray, "n"],
+    strip_megabytes: float = 256.0,
 ) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
     """Which class each pixel of a view is, by either query; -1 where little of the scene shows.
 
@@ -94,15 +96,12 @@ def class_maps(
         frozen: the view.
         codes: of the classes.
         of_gaussians: which class each Gaussian is (`classes_of`).
+        strip_megabytes: memory of a strip; larger pictures are drawn strip by strip, to the same result.
     """
     view, plan = frozen
-    nearest, share, alphas = _maps(
-        field, located, view, jnp.asarray(codes), jnp.asarray(of_gaussians), plan, len(codes)
-    )
-    opaque = np.asarray(alphas) > _OPAQUE
-    most = np.asarray(share)
-    in_space = np.where(most.max(-1) > _OPAQUE, most.argmax(-1), -1)
-    return np.where(opaque, np.asarray(nearest), -1), in_space
+    of_classes = (jnp.asarray(codes), jnp.asarray(of_gaussians))
+    by_pixel, in_space = _maps(field, located, view, *of_classes, plan, strip_megabytes)
+    return np.asarray(by_pixel), np.asarray(in_space)
 
 
 def classes_of(
@@ -140,13 +139,8 @@ def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: 
         needed = (plan.capacity, rung(len(view.rows)), rung(len(view.ids)))
         before = largest.get((plan.width, plan.height), needed)
         capacity, seen, pairs = largest[plan.width, plan.height] = tuple(map(max, needed, before))
-        lengths = {"rows": seen, "means2d": seen, "conics": seen, "opacities": seen, "ids": pairs}
-        filled = {name: _filled_up(getattr(view, name), length) for name, length in lengths.items()}
-        yield view._replace(**filled), replace(plan, capacity=capacity)
-
-
-def _filled_up(a: Array, length: int) -> Array:
-    return jnp.pad(a, ((0, length - len(a)), *[(0, 0)] * (a.ndim - 1)))
+        view = jax.tree.map(jnp.asarray, filled_up(view, seen, pairs))
+        yield view, replace(plan, capacity=capacity)
 
 
 @partial(jax.jit, static_argnums=(5, 6))
@@ -157,8 +151,18 @@ def _maps(
     codes: Array,
     of_gaussians: Array,
     plan: Plan,
-    count: int,
+    strip_megabytes: float,
 ):
-    cosines, alphas = pixel_cosines(field, located, view, plan, codes)
-    share, _ = paint(view, jax.nn.one_hot(of_gaussians, count), plan)
-    return cosines.argmax(axis=-1), share, alphas
+    parts = carried(field, located, view.rows)
+    kinds = jax.nn.one_hot(of_gaussians[view.rows], len(codes))
+    rows = rows_within(strip_megabytes, 2 * (parts.values.shape[1] + len(codes)), plan)
+
+    def of_strip(first):
+        strip, strip_plan = strip_of(view, plan, first, rows)
+        cosines, alphas = painted_cosines(field, parts, strip, strip_plan, codes)
+        shares, _ = paint_shown(strip, kinds, strip_plan)
+        by_pixel = jnp.where(alphas > _OPAQUE, cosines.argmax(axis=-1), -1)
+        return by_pixel, jnp.where(shares.max(axis=-1) > _OPAQUE, shares.argmax(axis=-1), -1)
+
+    strips = jax.lax.map(of_strip, jnp.arange(0, plan.tiles_y, rows))
+    return tuple(one.reshape(-1, plan.width)[: plan.height] for one in strips)

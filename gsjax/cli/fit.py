@@ -66,7 +66,8 @@ class Options:
     eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
     """Ids of cameras of a recording that are held out, instead of every N-th photograph."""
     scale: float = 1.0
-    """Fit photographs this many times smaller, as in 0.25; time goes with the number of pixels."""
+    """Fit photographs at this fraction of their size (width and height), as in 0.25; time goes with the
+    number of pixels."""
     test_every: int = 8
     """Hold out every N-th photograph, to judge by, where the data has no split; 0 holds out none."""
     minutes: float | None = None

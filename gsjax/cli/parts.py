@@ -59,7 +59,8 @@ class Options:
     frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
     """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
     scale: float = 1.0
-    """Look at pictures this many times smaller, as in 0.5; all of them, the held-out ones too."""
+    """Look at pictures at this fraction of their size (width and height), as in 0.5; all of them, the
+    held-out ones too."""
     anchor: int | None = None
     """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
     masks: Literal["segment", "files"] = "segment"

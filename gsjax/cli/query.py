@@ -2,7 +2,7 @@
 field (`gsjax distill`), Gaussians."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
@@ -12,18 +12,55 @@ from rich.console import Console
 
 from gsjax.cli.field_query import Changes, Question, answer
 from gsjax.cli.field_run import FieldRun, Whereabouts, field_of, open_field_run, unfinished_field_of
-from gsjax.cli.messages import Notes, stage
+from gsjax.cli.messages import USER_ERRORS, Notes, describe, stage
 from gsjax.cli.object_query import Asked, ask_for_object
 from gsjax.cli.run_folder import is_run
 from gsjax.cli.run_records import read_record
 
 HELP = (
-    " Of a run of `gsjax track` a text means an object, of whatever has a field Gaussians; of a tracked run "
-    "that has a field too RUN/field asks that by text."
+    ' Of a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; of whatever has '
+    "a field (`gsjax distill`) Gaussians, as in `gsjax query RUN/field can`. Where a tracked run has "
+    "a field too, RUN/field asks that by text."
 )
 _COLOR = (1.0, 0.25, 0.6)
-_OF_FIELDS = ("image", "point", "negatives", "threshold", "color", "move", "scene", "images")
+_HIGHEST = 1.0  # of a score: a cosine is within -1 and 1, a share against negatives within 0 and 1
 _LISTED = 6  # photographs, at most
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """What only a field has a use for."""
+
+    image: Path | None = None
+    """A picture of what is looked for; of one with an alpha channel what is opaque."""
+    point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
+    """A pixel of --camera that shows what is looked for."""
+    negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
+    """What it is held against. A text is, of classes, against all others, of CLIP against "object", "things",
+    "stuff", "texture", unless given."""
+    threshold: float | None = None
+    """Score above which a Gaussian is meant: a cosine (-1 to 1), or against negatives a share (0 to 1).
+    Unless given, 1/2 against negatives; of a text of the closed vocabulary its own; else where the scores
+    part best into two kinds (Otsu)."""
+    color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
+    """RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
+    move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """By how much along each axis, in the scene's unit, what was found is moved in moved.ply; not written
+    unless given."""
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
+    """The file of its scene, where it is now. Found where it was, or beside the field, unless given."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """The photographs, where they are now."""
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """What only a run of `gsjax track` has a use for."""
+
+    encoder: Literal["closed", "clip"] = "closed"
+    """Who understands the text, a closed vocabulary without weights, or CLIP."""
+    min_score: float | None = None
+    """Cosine below which the text means none of the objects. The encoder's own unless given."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +75,14 @@ class Options:
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
     """Camera (or photograph) to show it from, and in which a --point is. Of a tracked run the first held out
     one, else the first; of a field all, unless given."""
-    image: Path | None = None
-    """Of a field: a picture of what is looked for; of one with an alpha channel what is opaque."""
-    point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
-    """Of a field: a pixel of --camera that shows what is looked for."""
-    negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
-    """Of a field: what it is held against. A text is, of classes, against all others, of CLIP against
-    "object", "things", "stuff", "texture", unless given."""
-    threshold: float | None = None
-    """Of a field: score above which a Gaussian is meant. Unless given, 1/2 against negatives; of a text of
-    the closed vocabulary its own; else where the scores part best into two kinds (Otsu)."""
-    color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
-    """Of a field: RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
-    move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Of a field: by how much along each axis, in the scene's unit, what was found is moved in moved.ply; not
-    written unless given."""
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
-    """Of a field: the file of its scene, where it is now. Found where it was, or beside the field, unless
-    given."""
-    images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Of a field: the photographs, where they are now."""
-    encoder: Literal["closed", "clip"] = "closed"
-    """Of a tracked run: who understands the text, a closed vocabulary without weights, or CLIP."""
     weights: Path | None = None
     """Folder of CLIP's weights, in the layout of Hugging Face; of a field, where they are now."""
-    min_score: float | None = None
-    """Of a tracked run: cosine below which the text means none of the objects. The encoder's own unless
-    given."""
     debug: bool = False
     """Show Python's traceback when something fails."""
+    field: Annotated[FieldOptions, tyro.conf.OmitArgPrefixes] = FieldOptions()
+    """Of a field alone."""
+    track: Annotated[TrackOptions, tyro.conf.OmitArgPrefixes] = TrackOptions()
+    """Of a run of `gsjax track` alone, where its objects are asked for and not its field."""
 
 
 def run(options: Options) -> int:
@@ -78,17 +94,24 @@ def run(options: Options) -> int:
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
     # A tracked run answers over time, but not to what only fields can.
     tracked = (options.run / "trajectory.npz").is_file()
-    if field is not None and not (tracked and _for_fields(options) is None):
-        return _ask_field(options, field, console)
-    if field is None and not tracked:
-        _expect_track(options.run)
-    ask_for_object(_asked(options), console)
+    try:
+        if field is not None and not (tracked and _for_fields(options) is None):
+            return _ask_field(options, field, console)
+        if field is None and not tracked:
+            _expect_track(options.run)
+        ask_for_object(_asked(options), console)
+    except USER_ERRORS as error:
+        folder = options.run / "query"
+        if not (folder / "query.json").is_file():
+            raise
+        raise ValueError(f"{describe(error)} ({folder} still has an earlier answer)") from error
     return 0
 
 
 def _for_fields(options: Options) -> str | None:
     """An option that only a field has a use for, if one is given."""
-    return next((name for name in _OF_FIELDS if getattr(options, name) is not None), None)
+    given = options.field
+    return next((field.name for field in fields(given) if getattr(given, field.name) is not None), None)
 
 
 def _expect_track(path: Path) -> None:
@@ -112,11 +135,12 @@ def _expect_track(path: Path) -> None:
 def _ask_field(options: Options, field: Path, console: Console) -> int:
     """Answer by a field."""
     begun = perf_counter()
-    question, changes = _question(options), Changes(options.color or _COLOR, options.move)
+    question, changes = _question(options), Changes(options.field.color or _COLOR, options.field.move)
     folder = options.run / "query"
     with Notes(console) as notes:
         with stage(console, "reading the field"):
-            found = open_field_run(field, notes, Whereabouts(options.scene, options.images, options.weights))
+            now = Whereabouts(options.field.scene, options.field.images, options.weights)
+            found = open_field_run(field, notes, now)
         told = answer(found, question, changes, folder, notes, console)
     _print(question, found, told, perf_counter() - begun)
     print(f"scene     {found.file}")
@@ -152,32 +176,36 @@ def _question(options: Options) -> Question:
     Raises:
         ValueError: not one of text, --image and --point, or options that a field has no use for.
     """
-    ways = [options.text is not None, options.image is not None, options.point is not None]
+    asked = options.field
+    ways = [options.text is not None, asked.image is not None, asked.point is not None]
     if sum(ways) != 1:
         raise ValueError(
             f"expected one of TEXT, --image and --point, found {sum(ways) or 'none'}; "
-            f'gsjax query {options.run} "red can"'
+            f"gsjax query {options.run} can"
         )
-    if options.encoder != "closed" or options.min_score is not None:
+    if options.track != TrackOptions():
         raise ValueError(
             "--encoder, --min-score: a field knows who made its features; leave them out (--threshold)"
         )
     point = None
-    if options.point is not None:
+    if asked.point is not None:
         try:
-            x, y = (float(part) for part in options.point.split(","))
+            x, y = (float(part) for part in asked.point.split(","))
         except ValueError:
-            raise ValueError(f"--point: expected X,Y in pixels, found {options.point!r}") from None
+            raise ValueError(f"--point: expected X,Y in pixels, found {asked.point!r}") from None
         point = (x, y)
         if options.camera is None:
             raise ValueError("--point: expected --camera too, the photograph that it is in, found none")
-    if options.color is not None and any(not 0 <= value <= 1 for value in options.color):
-        raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(options.color)}")
-    if options.move is not None and not all(map(math.isfinite, options.move)):
-        raise ValueError(f"--move: expected three finite numbers, found {_spaced(options.move)}")
-    if options.threshold is not None and not math.isfinite(options.threshold):
-        raise ValueError(f"--threshold: expected a finite number, found {options.threshold}")
-    return Question(options.text, options.image, point, options.camera, options.negatives, options.threshold)
+    if asked.color is not None and any(not 0 <= value <= 1 for value in asked.color):
+        raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(asked.color)}")
+    if asked.move is not None and not all(map(math.isfinite, asked.move)):
+        raise ValueError(f"--move: expected three finite numbers, found {_spaced(asked.move)}")
+    if asked.threshold is not None and not -math.inf < asked.threshold < _HIGHEST:
+        raise ValueError(
+            f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
+            f"{asked.threshold:g}"
+        )
+    return Question(options.text, asked.image, point, options.camera, asked.negatives, asked.threshold)
 
 
 def _spaced(numbers: tuple[float, ...]) -> str:
@@ -204,5 +232,7 @@ def _asked(options: Options) -> Asked:
         if not options.camera.lstrip("-").isdigit():
             raise ValueError(f"--camera: expected the id of a camera, a number, found {options.camera!r}")
         camera = int(options.camera)
-    shared = (options.encoder, options.weights, options.min_score, options.debug)
-    return Asked(options.run, options.text, camera, *shared)
+    told = options.track
+    return Asked(
+        options.run, options.text, camera, told.encoder, options.weights, told.min_score, options.debug
+    )

@@ -23,13 +23,14 @@ from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import plan as _plan
 
+_OF_ROWS = ("rows", "means2d", "conics", "opacities")  # of a view, one for each Gaussian that it shows
+
 
 class FrozenView(NamedTuple):
     """What a camera sees of N Gaussians, whatever they are painted with; or a strip of it.
 
     Attributes:
-        rows: which of the N are shown, in the order in which tiles list them; views are filled up to one
-            length by the first of the N, which these lists do not have.
+        rows: which of the N are shown, in the order in which tiles list them.
         means2d, conics, opacities: of these, as projected, in pixels of the image or of the strip.
         ids: places in `rows`, of all tiles' lists, front to back, no further than they are read.
         starts, counts: of each tile's list in `ids`.
@@ -70,13 +71,26 @@ def freeze_views(
         raise RuntimeError("a plan that was made for these views did not hold them; please report this")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]
     seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
+    views = [filled_up(view, seen, pairs) for view in shown]
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *views), plan
 
-    def filled_up(name: str, a: np.ndarray) -> np.ndarray:
-        most = {"ids": pairs, "starts": len(a), "counts": len(a)}.get(name, seen)
-        return np.concatenate([a, np.zeros((most - len(a), *a.shape[1:]), a.dtype)])
 
-    stacked = {n: np.stack([filled_up(n, getattr(view, n)) for view in shown]) for n in FrozenView._fields}
-    return jax.tree.map(jnp.asarray, FrozenView(**stacked)), plan
+def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
+    """One view with so many `rows` and `ids`, at least as many as it has: by the first of the N Gaussians,
+    which no tile lists for it. On the host."""
+
+    def more(a: np.ndarray, length: int) -> np.ndarray:
+        return np.concatenate([a, np.zeros((length - len(a), *a.shape[1:]), a.dtype)])
+
+    view = jax.device_get(view)
+    of_rows = {name: more(getattr(view, name), seen) for name in _OF_ROWS}
+    return view._replace(**of_rows, ids=more(view.ids, pairs))
+
+
+def rows_within(megabytes: float, numbers: int, plan: Plan) -> int:
+    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least."""
+    a_row = 4 * numbers * plan.tile_size * plan.width
+    return int(max(1, min(plan.tiles_y, megabytes * 2**20 // a_row)))
 
 
 def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
@@ -134,7 +148,7 @@ def _shown(view: FrozenView) -> FrozenView:
     rows = there[order]
     return FrozenView(
         rows.astype(np.int32),
-        *(getattr(view, name)[rows] for name in ("means2d", "conics", "opacities")),
+        *(getattr(view, name)[rows] for name in _OF_ROWS[1:]),
         rank[place].astype(np.int32),
         starts.astype(np.int32),
         counts,

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Integer, Num, UInt8
 
 BACKGROUND = (158, 160, 164)  # label 0
 INVALID = (38, 40, 44)  # no depth there
+_INK = (245, 245, 245)
 
 # Okabe and Ito's colours, then darker ones of Tol's muted scheme: any two neighbours differ for colour-blind
 # eyes, and each is dark enough to read as a line on white (so their yellow comes late and is deepened).
@@ -116,6 +117,34 @@ def heat(values: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     return _apply_colormap("inferno", np.clip(np.nan_to_num(values), 0, 1))
 
 
+def with_heat_scale(
+    picture: UInt8[np.ndarray, "h w 3"], low: float, high: float, marked: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture of `heat` with its scale along the right side: what is dark and what is bright, and one value
+    between these, which is marked.
+
+    Args:
+        picture: of shares of the way from `low` to `high`.
+        low, high: the values that 0 and 1 stand for.
+        marked: the value to be marked, where it is on the scale.
+    """
+    height, width = picture.shape[:2]
+    thick, top = max(4, height // 30), height // 5
+    bottom, left = height - top, width - 2 * thick
+    picture = picture.copy()
+    shares = np.linspace(1, 0, bottom - top)[:, None].repeat(thick, axis=1)
+    picture[top:bottom, left : left + thick] = heat(shares)
+    cv2.rectangle(picture, (left - 1, top - 1), (left + thick, bottom), _INK, 1)
+    rows = {top: high, bottom: low}
+    if low <= marked <= high:
+        row = round(bottom - (marked - low) / max(high - low, 1e-9) * (bottom - top))
+        cv2.line(picture, (left - thick // 2, row), (left + thick, row), _INK, 1 + height // 400)
+        rows = {at: value for at, value in rows.items() if abs(at - row) > height // 10} | {row: marked}
+    for row, value in rows.items():
+        _write(picture, f"{value:.2f}", (left - thick, row))
+    return picture
+
+
 def error_heatmap(
     a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"], limit: float = 0.3
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -157,20 +186,23 @@ def side_by_side(
     return in_rows(dict(zip(captions, pictures, strict=False)), columns)
 
 
+def enlarged(picture: Num[np.ndarray, "h w 3"], least_height: int) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture that is smaller than so many rows, by a whole factor."""
+    times = max(1, -(-least_height // len(picture)))
+    return to_uint8(picture).repeat(times, 0).repeat(times, 1)
+
+
 def in_rows(
     pictures: Mapping[str, Num[np.ndarray, "h w 3"]], columns: int, least_height: int = 0
 ) -> UInt8[np.ndarray, "rows cols 3"]:
-    """Pictures of one size by their captions, row by row; even-sized, as video codecs want.
+    """Pictures of one size, once enlarged, by their captions, row by row; even-sized, as video codecs want.
 
     Args:
         pictures: colours.
         columns: how many are beside each other.
         least_height: of a picture, in pixels; smaller ones are enlarged by a whole factor.
     """
-    framed = []
-    for text, picture in pictures.items():
-        times = max(1, -(-least_height // len(picture)))
-        framed.append(captioned(to_uint8(picture).repeat(times, 0).repeat(times, 1), text))
+    framed = [captioned(enlarged(picture, least_height), text) for text, picture in pictures.items()]
     framed += [np.zeros_like(framed[0])] * (-len(framed) % columns)
     rows = [np.concatenate(framed[i : i + columns], axis=1) for i in range(0, len(framed), columns)]
     panel = np.concatenate(rows, axis=0)
@@ -197,13 +229,19 @@ def _apply_colormap(name: str, values: np.ndarray) -> np.ndarray:
 
 def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with its caption on a dark chip in the upper left corner, sized by the picture's height."""
-    height, width = picture.shape[:2]
-    scale = max(height / 650, 0.42)
+    picture = picture.copy()
+    _write(picture, text)
+    return picture
+
+
+def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, beside: tuple[int, int] | None = None) -> None:
+    """Text on a dark chip, in place: in the upper left corner, or to the left of a place (column, row)."""
+    scale = max(len(picture) / 650, 0.42)
     (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     pad = round(5 * scale) + 2
-    picture = picture.copy()
-    chip = picture[: text_height + baseline + 2 * pad, : min(text_width + 2 * pad, width)]
+    wide, high = text_width + 2 * pad, text_height + baseline + 2 * pad
+    left, top = (0, 0) if beside is None else (max(beside[0] - wide, 0), max(beside[1] - high // 2, 0))
+    chip = picture[top : top + high, left : left + wide]
     chip[:] = (0.25 * chip + 0.75 * np.array([22, 24, 28])).astype(np.uint8)
-    origin = (pad, pad + text_height)
-    cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (245, 245, 245), 1, cv2.LINE_AA)
-    return picture
+    origin = (left + pad, top + pad + text_height)
+    cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +15,11 @@ import pytest
 import yaml
 from rich.console import Console
 
-from gsjax.cli import distill, distill_loop, field_teacher
+from gsjax.cli import distill, distill_loop, field_scores, field_teacher
 from gsjax.cli.distill import Options
 from gsjax.cli.feature_cache import FeatureCache
 from gsjax.cli.field_results import draw_features, feature_colors
-from gsjax.cli.field_scores import one_by_one
+from gsjax.cli.field_scores import class_maps, classes_of, one_by_one
 from gsjax.cli.field_teacher import Asked, Teaching
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
@@ -29,8 +30,9 @@ from gsjax.methods.feature_field import (
     carried,
     frozen_views,
     init_field,
+    pixel_cosines,
 )
-from gsjax.rasterize.frozen import paint
+from gsjax.rasterize.frozen import paint, strip_of
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.viz.colors import colorize_features, fit_pca_colors
 from tests.cli.conftest import first_picture
@@ -275,6 +277,30 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
         assert np.abs(found - colorize_features(mean, known)).max() <= 1
         kinds.add((frozen[1], *(len(a) for a in frozen[0])))
     assert len(kinds) == 1  # one program for both
+
+
+def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a[::20]), read_ply(scene)[0])
+    grid = FeatureGridConfig(levels=2, most_resolution=32, log2_entries=8, hidden=8)
+    field, located = init_field(jax.random.key(0), FieldConfig(channels=6, grid=grid), gaussians.means, 4)
+    field = eqx.tree_at(lambda f: f.encoding.table, field, 1e5 * field.encoding.table)
+    codes, rows = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32), []
+    K = jnp.array([[40.0, 0, 20], [0, 40.0, 30], [0, 0, 1]])
+    frozen = frozen_views(gaussians, [Camera(jnp.eye(4).at[2, 3].set(3.0), K, 40, 60)])[0]
+
+    def told(view, plan, first, count):
+        rows.append(count)
+        return strip_of(view, plan, first, count)
+
+    monkeypatch.setattr(field_scores, "strip_of", told)
+    asked = (field, located, frozen, codes, classes_of(field, located, codes))
+    whole, strips = class_maps(*asked), class_maps(*asked, strip_megabytes=0.1)
+    assert rows == [frozen[1].tiles_y, 3] == [8, 3]
+    cosines, alphas = jax.jit(lambda: pixel_cosines(field, located, *frozen, jnp.asarray(codes)))()
+    np.testing.assert_array_equal(whole[0], np.where(alphas > 0.5, cosines.argmax(-1), -1))
+    for one, other in zip(whole, strips, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert len(np.unique(one)) > 3
 
 
 def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(

@@ -92,6 +92,15 @@ def found_of(field):
         return dict(found)
 
 
+def panels(folder):
+    """Those of overview.png, without what is written in the upper corners."""
+    picture = cv2.imread(str(folder / "overview.png"))
+    high, wide = 240, 320
+    assert picture.shape[0] == 2 * high
+    places = [(y, x) for y in (0, high) for x in range(0, picture.shape[1], wide)]
+    return [picture[y + 40 : y + high, x : x + wide] for y, x in places]
+
+
 # what it finds
 
 
@@ -120,7 +129,9 @@ def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
     assert (mask & truth).sum() > 0.6 * (mask | truth).sum()
     assert told["pixels"] == {camera: told["pixels"][camera] for camera in ("0", "1", "2")}
     assert told["pixels"]["0"] == mask.sum()
-    assert cv2.imread(str(folder / "overview.png")) is not None
+    places = panels(folder)
+    assert len(places) == 6
+    assert all(place.any() for place in places)
     # And in a few words.
     center = ", ".join(f"{x:.3f}" for x in found["means"].mean(0))
     assert f"found 'can': {len(rows):,} of {whole.num:,} Gaussians centre {center} m size" in said
@@ -209,6 +220,7 @@ def test_everything_is_an_answer_with_a_warning(gsjax, field):
     assert code == 0
     assert "means all" in said
     assert not (field / "query" / "without.ply").exists()
+    assert len(panels(field / "query")) == 4  # nor is there a picture of it
 
 
 # what it refuses
@@ -220,8 +232,10 @@ def test_everything_is_an_answer_with_a_warning(gsjax, field):
         ((), ("one of TEXT, --image and --point",)),
         (("can", "--point", "1,1"), ("found 2",)),
         (("cannon",), ("'cannon'", "carton")),
-        (("can", "--threshold", 2), ("best score", "--threshold")),
-        (("can", "--threshold", "nan"), ("--threshold: expected a finite number",)),
+        (("can", "--threshold", 0.99999), ("best score", "--threshold")),
+        (("can", "--threshold", 1), ("--threshold: expected a finite number below 1", "found 1")),
+        (("can", "--threshold", "nan"), ("--threshold: expected a finite number", "found nan")),
+        (("can", "--threshold", "-inf"), ("--threshold: expected a finite number", "found -inf")),
         (("--point", "1,1"), ("--camera",)),
         (("--point", "x", "--camera", "0"), ("X,Y", "'x'")),
         (("--point", "999,1", "--camera", "0"), ("80x60", "999")),
@@ -243,6 +257,7 @@ def test_a_question_that_cannot_be_answered_leaves_the_last_answer(gsjax, field,
     assert code == 2
     for word in words:
         assert word in said, said
+    assert said.endswith(f"({field / 'query'} still has an earlier answer)")
     assert (field / "query" / "query.json").read_text() == "{}"
 
 

@@ -1,5 +1,6 @@
 """The front door: help, unknown words, info, and how errors and warnings are said."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -46,6 +47,8 @@ def test_every_option_is_explained(say, capfd, command):
     out = capfd.readouterr().out
     opens = {"track": "DATASET", "info": "DATASET", "query": "RUN TEXT", "grasp": "RUN TEXT"}
     assert opens.get(command, "") in out
+    # What it takes, two spaces or a new line, and at once its default.
+    assert not re.findall(r"│ --[\w.-]+(?: \S+)*(?:  +|\s*│\n│\s+)\((?:default|required)", out)
     if command == "track":
         assert "--tracker.refine.iterations" in out
 

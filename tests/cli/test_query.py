@@ -1,6 +1,7 @@
 """`gsjax query` and `gsjax grasp` on a run of the built-in scene, tracked by standing still."""
 
 import json
+import re
 import shutil
 
 import cv2
@@ -121,7 +122,19 @@ def test_what_cannot_be_answered(gsjax, tracked, command, options, says):
     code, said = gsjax(command, tracked, *options)
     assert code == 2
     assert says in said
+    assert "earlier answer" not in said
     assert not (tracked / command).exists()
+
+
+def test_help_tells_options_of_fields_from_those_of_tracked_runs(capfd):
+    with pytest.raises(SystemExit):
+        main(["query", "--help"])
+    both, field, track = re.split("─ (?:field|track) options ─", capfd.readouterr().out)
+    assert "--camera" in both
+    assert "--threshold" in field
+    assert "--min-score" in track
+    assert "--min-score" not in both + field
+    assert "--threshold" not in both + track
 
 
 def test_what_fits_two_alike_is_said(gsjax, run):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.rasterize.frozen import freeze_views, paint, strip_of
+from gsjax.rasterize.frozen import filled_up, freeze_views, paint, strip_of
 from gsjax.rasterize.rasterization import rasterization
 
 
@@ -33,6 +33,18 @@ def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
         image, opacity = paint(jax.tree.map(lambda a, c=c: a[c], views), values, plan)
         np.testing.assert_allclose(image, colors[c], atol=2e-5)
         np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
+
+
+def test_what_a_view_is_filled_up_with_is_not_seen(frozen):
+    scene, views, plan = frozen
+    view = jax.tree.map(lambda a: a[1], views)
+    seen, pairs = len(view.rows) + 7, len(view.ids) + 50
+    longer = jax.tree.map(jnp.asarray, filled_up(view, seen, pairs))
+    assert {len(a) for a in (longer.rows, longer.means2d, longer.conics, longer.opacities)} == {seen}
+    assert len(longer.ids) == pairs
+    values = jnp.asarray(np.random.default_rng(4).normal(size=(len(scene["means"]), 3)), jnp.float32)
+    for one, other in zip(paint(longer, values, plan), paint(view, values, plan), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 5])

@@ -97,6 +97,22 @@ def test_features_of_few_dimensions_are_drawn(size):
         colors.fit_pca_colors(np.full((2, size), np.nan))
 
 
+def test_heat_has_a_scale_on_which_a_value_is_marked():
+    dark = np.zeros((240, 320, 3), np.uint8)
+    bar = slice(50, 190), slice(-14, -10)
+    pictures = [colors.with_heat_scale(dark, -0.5, 1.5, value) for value in (0.0, 1.0, 7.0)]
+    assert not dark.any()
+    for picture in pictures:
+        assert not picture[:, :200].any()
+    marked = [np.flatnonzero((picture[bar] == 245).all(axis=(1, 2))) + 50 for picture in pictures]
+    np.testing.assert_array_equal(marked[0], 156)  # a quarter of the way up from row 192 to row 48
+    np.testing.assert_array_equal(marked[1], 84)
+    assert len(marked[2]) == 0
+    brightness = pictures[2][bar].sum(axis=-1)[:, 0]
+    expected = colors.heat((144 - 1 - np.arange(2, 142))[:, None] / 143)[:, 0].sum(axis=-1)
+    np.testing.assert_array_equal(brightness, expected)
+
+
 def test_what_is_highlighted_keeps_its_colours_and_the_rest_loses_them():
     image = np.full((40, 60, 3), (200, 40, 40), np.uint8)
     mask = np.zeros((40, 60), bool)

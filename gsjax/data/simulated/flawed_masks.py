@@ -21,8 +21,6 @@ class Flaws:
         split: share of the pictures in which one thing is two.
         missing: share of the pictures in which a thing that is there is overlooked.
         smallest: a thing with fewer pixels is always overlooked, as segmenters drop specks.
-        missing_label: what is then said of its pixels: -1 nothing, as of what lies in no mask; or 0, that
-            they are background.
     """
 
     outline: int = 3
@@ -30,7 +28,6 @@ class Flaws:
     split: float = 0.2
     missing: float = 1 / 3
     smallest: int = 40
-    missing_label: int = -1
 
 
 class FlawedMasks(NamedTuple):
@@ -105,7 +102,7 @@ def flawed_masks(
 
 def _outlined(mask, missing: Bool[np.ndarray, "k"], flaws: Flaws, random) -> Int[np.ndarray, "h w"]:
     """Each thing eroded or grown by some pixels, small ones over large ones; what is missing is left out."""
-    most, found = flaws.outline, np.where(missing[mask], flaws.missing_label, 0).astype(np.int64)
+    most, found = flaws.outline, np.where(missing[mask], -1, 0).astype(np.int64)
     sizes = np.bincount(mask.ravel(), minlength=len(missing))
     for k in np.argsort(-sizes):
         pixels = int(random.integers(-most, most + 1))

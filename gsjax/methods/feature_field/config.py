@@ -67,7 +67,7 @@ class FieldConfig:
     contrast_pool: int = 4
     """Edge of the windows whose largest values it compares, pixels: 1, 2, 4 or 8."""
     contrast_patch: int = 32
-    """Edge of the patch of such windows that a step looks at."""
+    """Edge of the patch of such windows that a step looks at, 64 at most: each is held against each."""
     strip_megabytes: float = 256.0
     """Memory of a strip of features; larger images are drawn strip by strip, to the same result, and once
     more on the way back."""

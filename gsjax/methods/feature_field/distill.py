@@ -21,7 +21,7 @@ from gsjax.losses.regularization import total_variation
 from gsjax.methods.feature_field.config import FieldConfig
 from gsjax.methods.feature_field.field import Carried, FeatureField, carried
 from gsjax.optim.step import Step, gradient_step
-from gsjax.rasterize.frozen import FrozenView, paint_shown, strip_of
+from gsjax.rasterize.frozen import FrozenView, paint_shown, rows_within, strip_of
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 
@@ -109,11 +109,10 @@ def field_loss(config: FieldConfig) -> Callable:
 
 def strip_rows(config: FieldConfig, hidden: int, batch: FieldBatch) -> int:
     """Rows of tiles in a strip whose pixels' numbers take no more memory than they may."""
-    plan, numbers = batch.plan, hidden + config.channels
+    numbers = hidden + config.channels
     numbers += 0 if batch.codebook is None else len(batch.codebook)
     numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # what it says, and what the field does
-    a_row = 4 * numbers * plan.tile_size * plan.width
-    return int(max(1, min(plan.tiles_y, config.strip_megabytes * 2**20 // a_row)))
+    return rows_within(config.strip_megabytes, numbers, batch.plan)
 
 
 def _drawn(

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from skimage.filters import threshold_otsu
 
-from gsjax.methods.feature_field.field import FeatureField, carried
-from gsjax.rasterize.frozen import FrozenView, paint
+from gsjax.methods.feature_field.field import Carried, FeatureField, carried
+from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
 
@@ -54,8 +54,14 @@ def pixel_cosines(
     queries: Float[Array, "q d"],
 ) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
     """cos(W F', q) of each pixel and query, and the alphas of the view."""
-    parts = carried(field, located)
-    image, alphas = paint(view, parts.values, plan)
+    return painted_cosines(field, carried(field, located, view.rows), view, plan, queries)
+
+
+def painted_cosines(
+    field: FeatureField, parts: Carried, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
+) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
+    """`pixel_cosines` where it is known what the view's Gaussians carry: of several strips of it, say."""
+    image, alphas = paint_shown(view, parts.values, plan)
     rendered = parts.joined(image.reshape(alphas.size, -1), alphas.ravel())
     cosines = _cosines(rendered, parts.lifted(field.lift), queries)
     return cosines.reshape(*alphas.shape, len(queries)), alphas

@@ -132,6 +132,7 @@ class PartsConfig:
     headroom: float = 1.6
     """How many times as much as it needs a plan holds at first."""
     seed: int = 0
+    """Of all that is random."""
 
     def __post_init__(self):
         expect(self, headroom=(1, np.inf), seed=(0, np.inf))

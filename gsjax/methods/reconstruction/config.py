@@ -33,10 +33,15 @@ class RatesConfig:
     means: float = 1.6e-4
     """Of places, in radii of the scene; it falls to a hundredth by the end."""
     quats: float = 1e-3
+    """Of orientations."""
     log_scales: float = 5e-3
+    """Of logarithms of sizes."""
     logit_opacities: float = 5e-2
+    """Of logits of opacities."""
     sh0: float = 2.5e-3
+    """Of colours, as far as they are the same from all sides."""
     shN: float = 1.25e-4
+    """Of the rest of colours."""
     exposures: float = 1e-3
     """Of each photograph's map of colours, where exposure is learned."""
     twists: float = 2e-4
@@ -128,6 +133,7 @@ class FitConfig:
     refine_poses: bool = False
     """Learn how far each camera stands from where the data says."""
     seed: int = 0
+    """Of all that is random."""
     start: StartConfig = field(default_factory=StartConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
