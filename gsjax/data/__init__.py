@@ -1,6 +1,9 @@
 """Recordings, real and simulated: every reader gives the same sequence type."""
 
+from gsjax.data.clip import read_clip
 from gsjax.data.colmap import read_colmap
+from gsjax.data.endonerf import read_endonerf
+from gsjax.data.endovis import read_endovis
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import ReadOptions, open_photographs, open_sequence
 from gsjax.data.open3d_rgbd import read_open3d
@@ -27,8 +30,11 @@ __all__ = [
     "open_photographs",
     "open_sequence",
     "photographs_of",
+    "read_clip",
     "read_colmap",
     "read_dynerf",
+    "read_endonerf",
+    "read_endovis",
     "read_llff",
     "read_open3d",
     "read_panoptic",

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.errors import DataError
+from gsjax.geometry.cameras import intrinsics
 
 _SAME_SHAPE = 0.02  # how far two aspect ratios may differ by rounding a size
 _WIDEST = np.deg2rad(70)  # off axis: beyond it a pinhole view is mostly stretched edge
@@ -29,6 +30,22 @@ class Lens(NamedTuple):
     K: Float[np.ndarray, "3 3"]
     coeffs: tuple[float, ...] = ()
     fisheye: bool = False
+
+
+def matrix_of(K: Float[np.ndarray, "..."] | tuple[float, ...]) -> Float[np.ndarray, "3 3"]:
+    """Intrinsics that were given as a matrix or as fx, fy, cx, cy.
+
+    Raises:
+        ValueError: they are neither.
+    """
+    given = np.asarray(K, np.float64)
+    if given.shape == (4,):
+        matrix = intrinsics(given[0], 0, 0, (given[2], given[3]))
+        matrix[1, 1] = given[1]
+        return matrix
+    if given.shape != (3, 3):
+        raise ValueError(f"K must be 3x3 or fx, fy, cx, cy; got shape {given.shape}")
+    return given
 
 
 def shrunk(

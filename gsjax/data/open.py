@@ -8,7 +8,9 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from gsjax.data import colmap, poses_bounds, transforms
+from gsjax.data import clip, colmap, poses_bounds, transforms
+from gsjax.data.endonerf import is_endonerf, read_endonerf, surely_endonerf
+from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import DataError
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
 from gsjax.data.panoptic import read_panoptic
@@ -16,13 +18,20 @@ from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.push_t import read_push_t
 from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
-from gsjax.data.simulated import articulated, bar, hard_parts, tabletop
+from gsjax.data.simulated import articulated, bar, hard_parts, tabletop, tissue
 from gsjax.data.structure_from_motion import SUFFIXES
+from gsjax.data.tool_masks import Tool
 from gsjax.data.tum import read_tum
 from gsjax.geometry.cameras import NEAR
 
 SIMULATED_PREFIX = "simulated:"
-SIMULATED_SCENES = {"tabletop": tabletop, "articulated": articulated, "bar": bar, "hard_parts": hard_parts}
+SIMULATED_SCENES = {
+    "tabletop": tabletop,
+    "articulated": articulated,
+    "bar": bar,
+    "hard_parts": hard_parts,
+    "tissue": tissue,
+}
 
 # What only a folder of that layout has (* stands for anything), and its reader.
 _LAYOUTS = {
@@ -33,6 +42,7 @@ _LAYOUTS = {
     "frame-*.color.*": ("7-Scenes", read_seven_scenes),
     "seq-*": ("7-Scenes", read_seven_scenes),
 }
+_RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
 
 
 @dataclass(frozen=True)
@@ -40,14 +50,25 @@ class ReadOptions:
     """What some layouts leave open."""
 
     K: tuple[float, float, float, float] | None = None
-    """fx fy cx cy of folders without intrinsics (Open3D), in pixels, centres at +0.5."""
+    """fx fy cx cy of what comes without intrinsics (Open3D, videos), in pixels, centres at +0.5."""
     axes: poses_bounds.Axes | None = None
     """What the columns of poses_bounds.npy are: llff (down, right, back; DyNeRF too) or endonerf (right, up,
-    back)."""
+    back). A folder with masks and depth beside its images is EndoNeRF's unless this says otherwise."""
     images: str = "images"
-    """Folder of the photographs, in COLMAP's and LLFF's layouts."""
+    """Folder of the photographs or frames, in COLMAP's, LLFF's and EndoNeRF's layouts."""
+    masks: str | None = None
+    """Folder of the masks of tools, beside a video or in a folder of frames without poses."""
+    tool: Tool = "white"
+    """What the tool is in black and white masks (EndoNeRF, videos): white or black."""
     depth_unit_m: float | None = None
-    """Lengths of one step of a depth image (Open3D, nerfstudio); 0.001 unless given."""
+    """Lengths of one step of a depth image (Open3D, nerfstudio, EndoNeRF); 0.001 unless the data say it."""
+    depth_percentiles: tuple[float, float] | None = None
+    """Lowest and highest percentile of each frame's depth that is kept (EndoNeRF), as in 3 99.8 for depth by
+    stereo matching; all is kept unless given."""
+    pose_unit_m: float = 1.0
+    """Metres of one unit of the poses (EndoNeRF), where the camera moves."""
+    baseline_m: float | None = None
+    """Metres from the left eye to the right one (EndoNeRF, EndoVis without a calibration)."""
     near: float = NEAR
     """What is nearer to a camera than this is not drawn: the rig, where cameras see each other. In the unit
     of the poses."""
@@ -58,9 +79,10 @@ class ReadOptions:
 
 
 def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
-    """The sequence in a folder, whose layout is recognised, or a built-in scene.
+    """The sequence in a folder, whose layout is recognised, of a video, or of a built-in scene.
 
-    A built-in scene is "simulated:NAME" with the arguments of its function behind it, as in
+    A video, and frames with masks but without poses, are of one camera that stands still. A built-in scene is
+    "simulated:NAME" with the arguments of its function behind it, as in
     "simulated:tabletop?seed=3&frames=20&hide=true".
 
     Raises:
@@ -74,6 +96,9 @@ def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Seque
 def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
     if str(path).startswith(SIMULATED_PREFIX):
         return _simulate(str(path))
+    root = Path(path)
+    if root.is_file() and clip.is_clip(root):
+        return _clip(root, options)
     root = _folder(path)
     for mark, (_, read) in _LAYOUTS.items():
         if next(root.glob(mark), None):
@@ -82,11 +107,17 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
         return _open3d(root, options)
     if poses_bounds.find(root) and next(root.glob("cam*.mp4"), None):
         return poses_bounds.read_dynerf(root, options.axes or "llff")
+    if is_endonerf(root, options.images):
+        return _endonerf(root, options)
+    if is_endovis(root):
+        return read_endovis(root, K=options.K, baseline_m=options.baseline_m)
     photographs = _photograph_layout(root)
     if photographs:
         found = f"photographs ({photographs} layout), which have no order in time"
         raise DataError(root, "a recording over time", found, "gsjax fit takes them.")
-    raise _unknown(root, {mark: layout for mark, (layout, _) in _LAYOUTS.items()}, options)
+    if clip.is_clip(root, options.images, options.masks):
+        return _clip(root, options)
+    raise _unknown(root, _RECORDINGS, options)
 
 
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
@@ -113,27 +144,23 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
     if layout == "COLMAP":
         return colmap.read_colmap(root, options.images)
     if layout == "LLFF":
-        if options.axes is None:
-            raise ValueError(
-                f"{root}: poses_bounds.npy does not say how its columns are meant; give axes (--read.axes), "
-                "llff (down, right, back) or endonerf (right, up, back)"
-            )
-        return poses_bounds.read_llff(root, options.axes, options.images)
+        return poses_bounds.read_llff(root, _axes(root, options), options.images)
     if is_recording(root):
         return photographs_of(open_sequence(root, options))
-    marks = {mark: layout for mark, (layout, _) in _LAYOUTS.items()}
-    raise _unknown(root, _PHOTOGRAPHS | marks, options)
+    raise _unknown(root, _PHOTOGRAPHS | _RECORDINGS, options)
 
 
 def is_recording(path: str | Path) -> bool:
     """Whether there is a recording over time, by what lies there."""
     root = Path(path)
-    known = any(next(root.glob(mark), None) for mark in _LAYOUTS) or is_open3d(root)
+    known = any(next(root.glob(mark), None) for mark in _LAYOUTS)
+    known = known or any(layout(root) for layout in (is_open3d, is_endonerf, is_endovis))
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
 def is_of_photographs(path: str | Path) -> bool:
-    """Whether there are photographs of what stands still, rather than a recording over time."""
+    """Whether there are photographs of what stands still, rather than a recording over time. EndoNeRF's
+    folders are both: `open_photographs` takes the left eye's frames, `open_sequence` all there is."""
     if str(path).startswith(SIMULATED_PREFIX):
         return False
     root = Path(path)
@@ -142,7 +169,6 @@ def is_of_photographs(path: str | Path) -> bool:
     )
 
 
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 _PHOTOGRAPHS = {"transforms.json": "nerfstudio", "sparse/0/cameras.bin": "COLMAP", "poses_bounds.npy": "LLFF"}
 
 
@@ -166,6 +192,34 @@ def _open3d(root: Path, options: ReadOptions) -> Sequence:
     return read_open3d(root, options.K, **_unit(options))
 
 
+def _endonerf(root: Path, options: ReadOptions) -> Sequence:
+    return read_endonerf(
+        root,
+        axes=_axes(root, options),
+        images=options.images,
+        tool=options.tool,
+        depth_unit_m=options.depth_unit_m,
+        pose_unit_m=options.pose_unit_m,
+        depth_percentiles=options.depth_percentiles,
+        baseline_m=options.baseline_m,
+    )
+
+
+def _clip(path: Path, options: ReadOptions) -> Sequence:
+    return clip.read_clip(path, K=options.K, images=options.images, masks=options.masks, tool=options.tool)
+
+
+def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
+    if options.axes is None and surely_endonerf(root, options.images):
+        return "endonerf"
+    if options.axes is None:
+        raise ValueError(
+            f"{root}: poses_bounds.npy does not say how its columns are meant; give axes (--read.axes), "
+            "llff (down, right, back) or endonerf (right, up, back)"
+        )
+    return options.axes
+
+
 def _unit(options: ReadOptions) -> dict[str, float]:
     return {} if options.depth_unit_m is None else {"depth_unit_m": options.depth_unit_m}
 
@@ -176,7 +230,7 @@ def _folder(path: str | Path) -> Path:
         known = ", ".join(SIMULATED_PREFIX + name for name in SIMULATED_SCENES)
         found = "a file" if root.exists() else "nothing there"
         advice = f"Give its folder, or a built-in scene: {known}."
-        if root.suffix.lower() in _VIDEOS and root.is_file():
+        if clip.is_clip(root):
             found, advice = "a video, which has no poses", _find_poses(root)
         raise DataError(root, "a folder with a recording", found, advice)
     return root

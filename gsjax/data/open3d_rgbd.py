@@ -18,9 +18,9 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.lens import matrix_of
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
-from gsjax.geometry.cameras import intrinsics
 
 DEPTH_UNIT_M = 0.001
 _RATE_HZ = 30.0
@@ -64,12 +64,7 @@ def read_open3d(
         ValueError: `K` is none, or a pose no rigid motion.
     """
     root = Path(path)
-    matrix = np.asarray(K, np.float64)
-    if matrix.shape == (4,):
-        matrix = intrinsics(matrix[0], 0, 0, (matrix[2], matrix[3]))
-        matrix[1, 1] = K[1]
-    if matrix.shape != (3, 3):
-        raise ValueError(f"K must be 3x3 or fx, fy, cx, cy; got shape {matrix.shape}")
+    matrix = matrix_of(K)
     folder, log = _first(root, _IMAGES), root / trajectory if trajectory else _first(root, _TRAJECTORIES)
     if folder is None or log is None:
         missing = (

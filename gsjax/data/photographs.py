@@ -211,7 +211,7 @@ class Photographs:
 
 def _names_of_labels(sequence: Sequence) -> dict[int, str]:
     """The name of each mask value of a recording that has one."""
-    names = {model.label: model.name for model in sequence.models if model.label}
+    names = dict(sequence.label_names) | {m.label: m.name for m in sequence.models if m.label}
     truth = sequence.truth
     if truth is not None:
         names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}

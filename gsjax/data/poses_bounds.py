@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from gsjax.data.errors import DataError
 from gsjax.data.files import picture_size, read_arrays, read_image
+from gsjax.data.frame_folders import pictures
 from gsjax.data.lens import shrunk
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
@@ -24,7 +25,6 @@ Axes = Literal["llff", "endonerf"]
 NAMES = ("poses_bounds.npy", "pose_bounds.npy")
 """What the file is called; some releases leave out an s."""
 
-_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Columns of R that are right, down and forward, up to sign.
 _TO_OPENCV = {
     "llff": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
@@ -47,7 +47,7 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
     root = Path(path)
     file, viewmats, sizes, focals = _read_rows(root, axes)
     folder = root / images
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    paths = pictures(folder)
     if len(paths) != len(viewmats):
         expected, found = f"{len(viewmats)} photographs in {folder}, one a row", f"{len(paths)}"
         raise DataError(file, expected, found, "Name their folder, or fetch them again.")

@@ -1,7 +1,7 @@
 """The one sequence type that every reader gives and every method takes."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, field, replace
 
@@ -129,6 +129,7 @@ class Sequence:
         load_flow: (t, u, c) -> pixels [H,W,2] that each pixel of frame t moves until frame u; NaN = unknown.
         truth: what is known of the objects, for scoring.
         models: shapes known beforehand.
+        label_names: of mask values whose names are known; `truth` and `models` name theirs.
         float_images: `load_image` gives floats. Its pixels that are not finite are reported, turn black, and
             count as invalid in `depth`.
         near: what is nearer to a camera is not to be drawn, metres.
@@ -152,6 +153,7 @@ class Sequence:
     load_flow: Callable[[int, int, int], np.ndarray | None] | None = field(default=None, repr=False)
     truth: Truth | None = None
     models: tuple[PointModel, ...] = ()
+    label_names: Mapping[int, str] = field(default_factory=dict)
     float_images: bool = False
     near: float = NEAR
     locate: Callable[[str, int, int], str] | None = field(default=None, repr=False)

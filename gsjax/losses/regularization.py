@@ -22,3 +22,17 @@ def total_variation(
     before = jnp.concatenate([image[:1] if above is None else above[None], image[:-1]])
     rows = jnp.abs(jnp.diff(image, axis=1)).sum(axis=(1, 2)) + jnp.abs(image - before).sum(axis=(1, 2))
     return rows.sum() if inside is None else jnp.where(inside, rows, 0.0).sum()
+
+
+def plane_variation(planes: Float[Array, "p h w c"]) -> Float[Array, ""]:
+    """Mean squared difference between neighbours on planes, of both axes (4DGS, Wu et al. 2023; K-Planes,
+    Fridovich-Keil et al. 2023, eq. 4)."""
+    return jnp.square(jnp.diff(planes, axis=1)).mean() + jnp.square(jnp.diff(planes, axis=2)).mean()
+
+
+def second_differences(planes: Float[Array, "p t w c"]) -> Float[Array, ""]:
+    """Mean squared second difference along the first axis of planes, the time: what moves evenly costs
+    nothing (K-Planes, eq. 5). 0 of fewer than three times."""
+    if planes.shape[1] < 3:
+        return jnp.zeros((), planes.dtype)
+    return jnp.square(jnp.diff(planes, n=2, axis=1)).mean()

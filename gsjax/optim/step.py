@@ -8,6 +8,7 @@ carries along. `info` has the losses by name.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -69,6 +70,7 @@ def per_field_adam(
     rates: dict[str, Any],
     default: float = 0.0,
     others: Mapping[str, optax.GradientTransformation] = MappingProxyType({}),
+    decay: float = 0.0,
 ) -> optax.GradientTransformation:
     """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module, or of the modules within it; the
     others stand still.
@@ -77,11 +79,13 @@ def per_field_adam(
         rates: by the names of fields.
         default: rate of fields that are not named.
         others: what is done with fields that Adam does not change.
+        decay: what AdamW takes of each number a step, times the rate.
 
     Raises:
         ValueError: from the optimizer's init, where a rate is for a field that the module lacks.
     """
-    transforms = {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()} | dict(others)
+    adam = partial(optax.adamw, weight_decay=decay) if decay else optax.adam
+    transforms = {name: adam(rate, eps=1e-15) for name, rate in rates.items()} | dict(others)
 
     def label(params):
         fields = _fields(params)

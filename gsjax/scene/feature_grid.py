@@ -39,6 +39,7 @@ class FeatureGridConfig:
     """Sizes of a grid and of its network; the defaults are those of FD-3DGS (papers/002, section 4)."""
 
     levels: int = 16
+    """Resolutions, from the coarsest to the finest; a place has features of each."""
     least_resolution: int = 16
     """Of the coarsest level."""
     most_resolution: int = 128
@@ -146,7 +147,7 @@ class FeatureGrid(eqx.Module):
 
     def encode(self, located: Located) -> Float[Array, "N features"]:
         """What the network is given: the interpolated features of all levels; 0 where a position is NaN."""
-        found = _interpolated(self.table, located.weights, located.indices)
+        found = interpolated(self.table, located.weights, located.indices)
         return found.reshape(len(found), -1)
 
 
@@ -204,12 +205,15 @@ def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
 
 
 @jax.custom_jvp
-def _interpolated(
-    table: Float[Array, "entries F"], weights: Float[Array, "N L 8"], indices: Int[Array, "N L 8"]
+def interpolated(
+    table: Float[Array, "entries F"], weights: Float[Array, "N L C"], indices: Int[Array, "N L C"]
 ) -> Float[Array, "N L F"]:
-    """Features between the vertices. One vertex after another, and positions along the last axis, XLA:CPU
-    fuses gather, product and sum, a sixth of the time of a gather that is written out; but not on the way
-    back, for which the derivative has the other form."""
+    """Sums of C rows of a table under weights, for each of L levels or planes: features between vertices.
+
+    One vertex after another, and positions along the last axis, XLA:CPU fuses gather, product and sum, a
+    sixth of the time of a gather that is written out; but not on the way back, for which the derivative has
+    the other form.
+    """
     columns, found = table.T, jnp.zeros((), table.dtype)
     for weight, rows in zip(
         jnp.moveaxis(weights, (2, 1), (0, 1)), jnp.moveaxis(indices, (2, 1), (0, 1)), strict=True
@@ -218,11 +222,11 @@ def _interpolated(
     return found.transpose(2, 1, 0)
 
 
-@partial(_interpolated.defjvp, symbolic_zeros=True)
+@partial(interpolated.defjvp, symbolic_zeros=True)
 def _interpolated_jvp(primals, tangents):
     table, weights, indices = primals
     d_table, d_weights, _ = tangents
-    found = _interpolated(*primals)
+    found = interpolated(*primals)
     turned = jnp.zeros_like(found)
     if type(d_table) is not SymbolicZero:
         turned += jnp.einsum("nlc,nlcf->nlf", weights, d_table[indices], precision="highest")

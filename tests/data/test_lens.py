@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError
-from gsjax.data.lens import Lens, shrunk, straighten
+from gsjax.data.lens import Lens, matrix_of, shrunk, straighten
 from tests.data.dots import draw, inside, offset
 
 WIDTH, HEIGHT = 240, 180
@@ -124,3 +124,11 @@ def test_dots_know_where_they_are():
     assert offset(picture, (100, 100)) == np.inf
     assert inside((7, 7), WIDTH, HEIGHT)
     assert not inside((7, HEIGHT - 5), WIDTH, HEIGHT)
+
+
+def test_intrinsics_as_a_matrix_or_as_four_numbers():
+    K = [[60.0, 0, 32], [0, 61, 24], [0, 0, 1]]
+    np.testing.assert_array_equal(matrix_of((60, 61, 32, 24)), K)
+    np.testing.assert_array_equal(matrix_of(np.array(K)), K)
+    with pytest.raises(ValueError, match=r"K must be 3x3 or fx, fy, cx, cy; got shape \(2,\)"):
+        matrix_of(np.zeros(2))

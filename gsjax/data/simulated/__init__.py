@@ -11,6 +11,7 @@ from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.simulation import simulated_sequence
 from gsjax.data.simulated.tabletop import tabletop
 from gsjax.data.simulated.textures import Texture
+from gsjax.data.simulated.tissue import tissue
 
 __all__ = [
     "Light",
@@ -22,4 +23,5 @@ __all__ = [
     "hard_parts",
     "simulated_sequence",
     "tabletop",
+    "tissue",
 ]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data.simulated.bent_box import BentBox
+from gsjax.data.simulated.sheet import Sheet
 from gsjax.data.simulated.textures import Texture
 
 _TINY = 1e-300
@@ -24,14 +25,15 @@ class Primitive:
     """One solid of a body.
 
     Attributes:
-        shape: "box", "sphere", "cylinder" (about z), "plane" (z = 0, seen from above) or "bent box".
-        size: metres: three half edges; a radius; a radius and half a length; nothing; what `BentBox` has.
+        shape: "box", "sphere", "cylinder" (about z), "plane" (z = 0, seen from above), "bent box" or "sheet".
+        size: metres: three half edges; a radius; a radius and half a length; nothing; what `BentBox` has; the
+            bumps of a `Sheet`.
         texture: its colours, in coordinates of the primitive at rest, so that they turn and bend with it.
         body: index of the body that it moves with.
         pose: primitive to body, [4,4].
     """
 
-    shape: Literal["box", "sphere", "cylinder", "plane", "bent box"]
+    shape: Literal["box", "sphere", "cylinder", "plane", "bent box", "sheet"]
     size: tuple[float, ...]
     texture: Texture
     body: int = 0
@@ -39,7 +41,7 @@ class Primitive:
 
     @property
     def half_extents(self) -> Float[np.ndarray, "3"]:
-        """Half the edges of the box around it; infinite for a plane."""
+        """Half the edges of the box around it; infinite for a plane and a sheet."""
         match self.shape:
             case "box":
                 return np.array(self.size)
@@ -49,6 +51,8 @@ class Primitive:
                 return np.array([self.size[0], self.size[0], self.size[1]])
             case "bent box":
                 return BentBox(*self.size).half_extents
+            case "sheet":
+                return np.full(3, np.inf)
         return np.array([np.inf, np.inf, 0.0])
 
 
@@ -72,6 +76,8 @@ def intersect(
         case "bent box":
             within = _slabs(primitive.half_extents, origin, directions, axes=(0, 1, 2))
             near = far = _march(BentBox(*primitive.size), origin, directions, *within)
+        case "sheet":
+            near = far = Sheet(primitive.size).enter(origin, directions)
     return np.where((near <= far) & (near > 0) & np.isfinite(near), near, np.inf)
 
 
@@ -84,6 +90,9 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
             box = BentBox(*primitive.size)
             rest = box.undo(points)
             return box.carry_normals(rest, _box_normals(primitive.size[:3], rest))
+        case "sheet":
+            sheet = Sheet(primitive.size)
+            return sheet.normals(sheet.undo(points))
         case "sphere":
             return points / primitive.size[0]
         case "cylinder":
@@ -97,12 +106,22 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
 
 def at_rest(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
     """Where points of the primitive, in its frame, are while it is not deformed."""
-    return BentBox(*primitive.size).undo(points) if primitive.shape == "bent box" else points
+    match primitive.shape:
+        case "bent box":
+            return BentBox(*primitive.size).undo(points)
+        case "sheet":
+            return Sheet(primitive.size).undo(points)
+    return points
 
 
 def deformed(primitive: Primitive, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
     """Where points of the primitive at rest are in its frame: the inverse of `at_rest`."""
-    return BentBox(*primitive.size).deform(rest) if primitive.shape == "bent box" else rest
+    match primitive.shape:
+        case "bent box":
+            return BentBox(*primitive.size).deform(rest)
+        case "sheet":
+            return Sheet(primitive.size).deform(rest)
+    return rest
 
 
 def _box_normals(half, points):

@@ -36,7 +36,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Solids on bodies that move rigidly, a light, and cameras. Bent boxes may deform besides.
+    """Solids on bodies that move rigidly, a light, and cameras. Bent boxes and sheets may deform besides.
 
     Attributes:
         primitives: the solids; those of one body never move relative to each other.
@@ -181,7 +181,7 @@ def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, poin
     unit = rays / lengths
     dark = np.zeros(len(lengths), bool)
     for primitive, pose in solids:
-        if primitive.shape == "plane":  # nothing is below it
+        if primitive.shape in ("plane", "sheet"):  # nothing is below it
             continue
         # Only points in the cone of the solid's bounding sphere can lie in its shadow.
         center, radius = pose[:3, 3] - lamp, np.linalg.norm(primitive.half_extents)

@@ -17,15 +17,17 @@ class Texture:
     """Two colours and the pattern in which they change.
 
     Attributes:
-        kind: "noise" (clouds), "checker", "stripes" (wavering bands along x, as of wood), or "label" (a
-            printed band around z).
+        kind: "noise" (clouds), "checker", "stripes" (wavering bands along x, as of wood), "label" (a
+            printed band around z), or "vessels" (winding lines of the second colour, from thick to thin, on
+            clouds of both).
         colors: two RGB colours, 0 to 1.
-        scale: metres of one period: of the coarsest clouds, of a square, of a stripe, of the label's height.
+        scale: metres of one period: of the coarsest clouds, of a square, of a stripe, of the label's height,
+            of the thickest vessels.
         seed: moves the pattern.
         grain: how much fine noise lies over it, 0 to 1.
     """
 
-    kind: Literal["noise", "checker", "stripes", "label"]
+    kind: Literal["noise", "checker", "stripes", "label", "vessels"]
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
     scale: float
     seed: int = 0
@@ -52,8 +54,19 @@ def albedo(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarr
             mix = np.where(np.abs(points[2]) < 0.5 * texture.scale, print_, 0.0)
             edge = np.abs(np.abs(points[2]) - 0.5 * texture.scale) < 0.06 * texture.scale
             mix = np.where(edge, 1.0, mix)
+        case "vessels":
+            mix = _vessels(points + offset, texture.scale)
     fine = 1.0 + texture.grain * (2 * _noise(points + offset, 0.35 * texture.scale + 0.01) - 1)
     return np.clip((first + (second - first) * mix) * fine, 0.0, 1.0)
+
+
+def _vessels(points, scale):
+    """Lines along which clouds are even, of three sizes."""
+    mix = 0.5 * _smooth(_noise(points, 2 * scale))
+    for share, half_width, darkness in ((1.0, 0.028, 0.7), (0.4, 0.05, 0.5), (0.16, 0.09, 0.35)):
+        away = np.abs(_noise(points + share * scale, share * scale) - 0.5) / half_width
+        mix = mix + (1 - mix) * darkness * _smooth(1.5 - away)
+    return mix
 
 
 def _smooth(x):

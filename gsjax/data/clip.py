@@ -1,0 +1,145 @@
+"""A video, or its frames in a folder, by one camera that stands still: no poses and no depth.
+
+CLIP.mp4          or images/NAME.png in a folder, or pictures in the folder itself, in order of their names
+masks/NAME.png    the tool in white, or in black, one a frame, optional; or gt_masks/
+"""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.files import read_image, read_mask
+from gsjax.data.frame_folders import (
+    expect_one_size,
+    frame_numbers,
+    pictures,
+    pictures_beside,
+    warn_of_single_frame,
+)
+from gsjax.data.lens import matrix_of
+from gsjax.data.sequence import Sequence
+from gsjax.data.tool_masks import LABEL_NAMES, Tool, check_tool, find_masks, tool_labels
+from gsjax.data.video import Video, describe_video
+from gsjax.geometry.cameras import intrinsics
+
+DEFAULT_RATE_HZ = 30.0
+"""Of frames in a folder, which do not say it."""
+
+FIELD_OF_VIEW_DEGREES = 60.0
+"""From left to right, of a camera of which nothing is known: about that of a da Vinci robot's endoscope."""
+
+SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+"""Of videos."""
+
+
+def read_clip(
+    path: str | Path,
+    *,
+    K: Float[np.ndarray, "3 3"] | tuple[float, float, float, float] | None = None,
+    images: str = "images",
+    masks: str | None = None,
+    tool: Tool = "white",
+) -> Sequence:
+    """Frames of one camera, 0, that stands still in the origin. Times are a video's own; 30 Hz of a folder.
+
+    Without `K` the camera is taken to see 60 degrees from left to right, its axis in the picture's middle.
+
+    Args:
+        path: the video, or the folder of the frames.
+        K: intrinsics, or (fx, fy, cx, cy), in pixels, pixel centres at +0.5.
+        images: the folder of the frames in it; where there is none, they lie in the folder itself.
+        masks: the folder of masks, in the folder or beside the video; None: masks/ or gt_masks/ of a folder,
+            and none of a video.
+        tool: what the tool is in masks: "white" or "black".
+
+    Raises:
+        DataError: there are no frames, or they differ in size; the video is none; there are not as many masks
+            as frames; the tool covers everything in all of them; there is depth, which needs poses.
+        ValueError: an option is none.
+
+    Warns with DataWarning where `K` is not given, masks look inverted, or there is only one frame.
+    """
+    source = Path(path)
+    frames = _of_folder(source, images) if source.is_dir() else _of_video(source)
+    width, height, count = frames.width, frames.height, len(frames.times)
+    home = source if source.is_dir() else source.parent
+    folder = home / masks if masks else find_masks(source)
+    files = pictures_beside(folder, count, source.name) if folder else []
+
+    def load_mask(t: int) -> np.ndarray:
+        return tool_labels(read_mask(files[t], width, height), tool)
+
+    if files:
+        check_tool(load_mask, count, tool, files[0].parent)
+    if K is None:
+        assumed = f"{FIELD_OF_VIEW_DEGREES:g} degrees from left to right are assumed"
+        message = f"{source}: no intrinsics: {assumed}; give K (--read.K), fx fy cx cy in pixels"
+        warnings.warn(message, DataWarning, stacklevel=2)
+        K = intrinsics(0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW_DEGREES)), width, height)
+    return Sequence(
+        name=source.resolve().stem if source.is_file() else source.resolve().name,
+        camera_ids=(0,),
+        width=width,
+        height=height,
+        times=frames.times,
+        frame_ids=frames.numbers,
+        Ks=np.broadcast_to(matrix_of(K), (count, 1, 3, 3)),
+        viewmats=np.broadcast_to(np.eye(4), (count, 1, 4, 4)),
+        load_image=lambda t, c: frames.load(t),
+        load_mask=(lambda t, c: load_mask(t)) if files else None,
+        label_names=LABEL_NAMES if files else {},
+        locate=lambda kind, t, c: str(files[t]) if kind == "mask" and files else frames.where(t),
+    )
+
+
+def is_clip(root: Path, images: str = "images", masks: str | None = None) -> bool:
+    """Whether it is a video, or a folder of frames with masks."""
+    if root.suffix.lower() in SUFFIXES and root.is_file():
+        return True
+    return (find_masks(root) is not None or masks is not None) and bool(_frames_in(root, images))
+
+
+class _Frames(NamedTuple):
+    width: int
+    height: int
+    times: Float[np.ndarray, "t"]
+    numbers: tuple[int, ...]
+    load: Callable[[int], np.ndarray]
+    where: Callable[[int], str]
+
+
+def _of_video(path: Path) -> _Frames:
+    described = describe_video(path)
+    width, height, count, rate_hz = described
+    video = Video(path, width, height, count)
+    times, numbers = np.arange(count) / rate_hz, tuple(range(count))
+    return _Frames(width, height, times, numbers, video.frame, lambda t: f"{path}, frame {t}")
+
+
+def _of_folder(root: Path, images: str) -> _Frames:
+    frames = _frames_in(root, images)
+    if not frames:
+        raise DataError(root, f"frames, in {images}/ or right here", "none", "Name their folder.")
+    if (root / "depth").is_dir():
+        advice = "Add it (rows of one pose do for a camera that stands still), or take depth/ out."
+        raise DataError(root, "poses_bounds.npy, where there is depth/", "no such file", advice)
+    width, height = expect_one_size(frames)
+    warn_of_single_frame(frames)
+    times = np.arange(len(frames)) / DEFAULT_RATE_HZ
+    return _Frames(
+        width,
+        height,
+        times,
+        frame_numbers(frames),
+        lambda t: read_image(frames[t], width, height),
+        lambda t: str(frames[t]),
+    )
+
+
+def _frames_in(root: Path, images: str) -> list[Path]:
+    return pictures(root / images) or pictures(root)

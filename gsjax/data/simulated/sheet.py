@@ -1,0 +1,103 @@
+"""An endless sheet that bumps lift and shift: its map from rest, the way back, and rays that meet it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+_CLOSE_ENOUGH_M = 1e-10
+_MOST_STEPS = 30
+_NUMBERS = 6  # of a bump
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The plane z = 0, whose points are moved by smooth bumps, most at their centres.
+
+        X(p) = p + sum_b d_b exp(-((x - x_b)^2 + (y - y_b)^2) / (2 s_b^2)),      p = (x, y, z) at rest
+
+    What is above or below the plane moves with it. The map has an inverse where no bump shifts points by more
+    than its width or so; and a ray meets the surface once where that is nowhere as steep as the ray. Both are
+    for the scene to see to.
+
+    Attributes:
+        bumps: x, y, the width s and the shift d of each, one after the other, metres.
+
+    Raises:
+        ValueError: they are not six numbers a bump, or a width is not above 0.
+    """
+
+    bumps: tuple[float, ...]
+
+    def __post_init__(self):
+        if len(self.bumps) % _NUMBERS or min(self.bumps[2::_NUMBERS], default=1) <= 0:
+            found = f"{len(self.bumps)} numbers with widths {self.bumps[2::_NUMBERS]}"
+            raise ValueError(f"bumps must be x, y, a width above 0 and a shift each, got {found}")
+
+    def deform(self, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        """Where points are that are at `rest` when there is no bump."""
+        return self._moved(rest)[0]
+
+    def undo(self, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        """The inverse of `deform`, by Newton's method on x and y."""
+        rest = points.copy()
+        for _ in range(_MOST_STEPS):
+            moved, along_x, along_y = self._moved(rest)
+            error = points - moved
+            rest[:2] += _in_the_plane(along_x, along_y, error)
+            rest[2] += error[2]
+            if np.abs(error).max(initial=0) < _CLOSE_ENOUGH_M:
+                break
+        return rest
+
+    def normals(self, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        """Unit normals of the upper side, at points at rest."""
+        _, along_x, along_y = self._moved(rest)
+        normal = np.cross(along_x, along_y, axis=0)
+        return normal / np.linalg.norm(normal, axis=0)
+
+    def enter(
+        self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
+    ) -> Float[np.ndarray, "n"]:
+        """The s at which rays origin + s directions meet the sheet, by Newton's method on s and the point at
+        rest; infinity for rays that do not go down."""
+        entry = np.full(directions.shape[1], np.inf)
+        falls = np.flatnonzero(directions[2] < 0)
+        rays = directions[:, falls]
+        s = -origin[2] / rays[2]
+        rest = origin[:, None] + s * rays
+        rest[2] = 0.0
+        for _ in range(_MOST_STEPS):
+            moved, along_x, along_y = self._moved(rest)
+            error = origin[:, None] + s * rays - moved
+            normal = np.cross(along_x, along_y, axis=0)
+            step = -np.sum(normal * error, axis=0) / np.sum(normal * rays, axis=0)
+            rest[:2] += _in_the_plane(along_x, along_y, error + step * rays)
+            s = s + step
+            if np.abs(error).max(initial=0) < _CLOSE_ENOUGH_M:
+                break
+        entry[falls] = np.where(np.abs(error).max(0) < _CLOSE_ENOUGH_M, s, np.inf)
+        return entry
+
+    def _moved(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """X, dX/dx and dX/dy."""
+        moved, along_x, along_y = rest.copy(), np.zeros_like(rest), np.zeros_like(rest)
+        along_x[0], along_y[1] = 1.0, 1.0
+        for x, y, width, *shift in np.reshape(self.bumps, (-1, _NUMBERS)):
+            to_x, to_y = (rest[0] - x) / width, (rest[1] - y) / width
+            weight = np.exp(-0.5 * (to_x * to_x + to_y * to_y))
+            for axis in np.flatnonzero(shift):
+                pull = shift[axis] * weight
+                moved[axis] += pull
+                along_x[axis] -= pull * to_x / width
+                along_y[axis] -= pull * to_y / width
+        return moved, along_x, along_y
+
+
+def _in_the_plane(along_x: np.ndarray, along_y: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """The steps in x and y at rest that make up for the first two coordinates of an error, [2,n]."""
+    determinant = along_x[0] * along_y[1] - along_y[0] * along_x[1]
+    steps = np.stack(
+        [along_y[1] * error[0] - along_y[0] * error[1], along_x[0] * error[1] - along_x[1] * error[0]]
+    )
+    return steps / determinant

@@ -1,0 +1,47 @@
+"""Deforming scenes with meaning, from an endoscope say: SurstSplat (papers/003), GaussianClin (papers/004).
+
+config      what can be set; the two papers' recipes
+start       the first Gaussians, of depth over time
+nodes       which places the deformation is asked about
+step        deform, draw colours and features, compare, descend
+train       the host loop
+"""
+
+from gsjax.methods.surgical.config import (
+    PRESETS,
+    SurgicalConfig,
+    SurgicalRatesConfig,
+    SurgicalWeightsConfig,
+)
+from gsjax.methods.surgical.start import Look, start_gaussians
+from gsjax.methods.surgical.step import Batch, DeformingScene, feature_loss, surgical_loss, surgical_step
+from gsjax.methods.surgical.train import (
+    Advanced,
+    SurgicalProblem,
+    SurgicalState,
+    begin_surgical,
+    compiled_step,
+    reconstruct,
+    with_field,
+)
+
+__all__ = [
+    "PRESETS",
+    "Advanced",
+    "Batch",
+    "DeformingScene",
+    "Look",
+    "SurgicalConfig",
+    "SurgicalProblem",
+    "SurgicalRatesConfig",
+    "SurgicalState",
+    "SurgicalWeightsConfig",
+    "begin_surgical",
+    "compiled_step",
+    "feature_loss",
+    "reconstruct",
+    "start_gaussians",
+    "surgical_loss",
+    "surgical_step",
+    "with_field",
+]

@@ -1,0 +1,40 @@
+"""Which places a deformation field is asked about. On the host."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsjax.losses.graph import farthest_points
+from gsjax.scene.deformation import Nodes
+from gsjax.scene.gaussians import Gaussians
+
+_BLENDED = 4
+
+
+def nodes_of(gaussians: Gaussians, count: int) -> Nodes:
+    """Nodes on Gaussians that lie far from each other, of which each Gaussian blends the four nearest.
+
+    Their weights fall like a Gaussian of the distance, as wide as the distance to the second nearest, less
+    what the farthest of the four would have: so a node's pull ends where it is no longer among the four.
+
+    Args:
+        gaussians: canonical.
+        count: how many nodes, at most; there are no more than Gaussians.
+    """
+    means = np.asarray(gaussians.means)
+    sample = jax.jit(farthest_points, static_argnums=1)(jnp.asarray(means), min(count, len(means)))
+    chosen = np.asarray(sample.indices)[np.asarray(sample.valid)]
+    nearest = min(_BLENDED, len(chosen))
+    distances, indices = cKDTree(means[chosen]).query(means, k=[*range(1, nearest + 1)])
+    width = np.maximum(distances[:, min(1, nearest - 1)], 1e-12)[:, None]
+    weights = np.exp(-np.square(distances / width))
+    weights = np.maximum(weights - np.where(nearest > 1, weights[:, -1:], 0.0), 1e-6)
+    weights /= weights.sum(axis=1, keepdims=True)
+    features = None if gaussians.features is None else gaussians.features[chosen]
+    return Nodes(
+        gaussians.means[chosen],
+        features,
+        jnp.asarray(indices, jnp.int32),
+        jnp.asarray(weights, gaussians.means.dtype),
+    )

@@ -1,0 +1,161 @@
+"""One step of a deforming scene: deform, draw colours and features in one pass, compare, descend."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from gsjax.geometry.cameras import Camera
+from gsjax.losses.photometric import photometric_loss, weighted_mean
+from gsjax.losses.regularization import plane_variation, second_differences
+from gsjax.methods.surgical.config import SurgicalConfig, SurgicalWeightsConfig
+from gsjax.optim.step import Step, gradient_step, per_field_adam
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import render
+from gsjax.scene.time_encodings import HexPlane
+
+_FINAL_RATE = 0.1
+_DECAY = 1e-5  # of AdamW (papers/003, section 3)
+
+
+class DeformingScene(eqx.Module):
+    """What trains.
+
+    Attributes:
+        gaussians: canonical; features are semantic.
+        field: what moves them; None in the warm-up, and of a static scene.
+    """
+
+    gaussians: Gaussians
+    field: DeformationField | None = None
+
+    def at(self, time: Float[Array, ""], moving: "Moving" = None) -> Gaussians:
+        """The scene at a time, 0 to 1.
+
+        Args:
+            time: 0 to 1.
+            moving: nodes, as for `deform_by_nodes`, or rows, as for `deform_rows`.
+        """
+        if self.field is None:
+            return self.gaussians
+        if isinstance(moving, Nodes):
+            return deform_by_nodes(self.gaussians, self.field, time, moving)
+        return deform_rows(self.gaussians, self.field, time, moving)
+
+
+Moving = Nodes | Int[Array, "M"] | None
+"""What the field is asked about: nodes, some Gaussians, or all of them."""
+
+
+class Batch(NamedTuple):
+    """What a step is given.
+
+    Attributes:
+        image: RGB, 0 to 255.
+        counts: which pixels count.
+        depth: metres, 0 = unknown; None without.
+        camera: one, viewmat [1,4,4] and K [1,3,3].
+        time: 0 to 1.
+        ids: which row of the codebook each of the teacher's pixels has, -1 for none; None without teacher.
+        codebook: what the teacher says, in the scene's channels.
+        moving: what the field is asked about.
+        plan: to draw with.
+    """
+
+    image: UInt8[Array, "1 height width 3"]
+    counts: Bool[Array, "1 height width"]
+    depth: Float[Array, "1 height width"] | None
+    camera: Camera
+    time: Float[Array, ""]
+    ids: Int[Array, "h w"] | None
+    codebook: Float[Array, "k channels"] | None
+    moving: Moving
+    plan: Plan
+
+
+def surgical_loss(weights: SurgicalWeightsConfig, radius: float) -> Callable:
+    """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of pixels that count (papers/003, eq. 13), depth,
+    features against the teacher's (papers/004, eq. 10), and smoothness of the field's planes (4DGS)."""
+
+    def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
+        there = scene.at(batch.time, batch.moving)
+        drawn = render(there, batch.camera, batch.plan)
+        target = batch.image.astype(drawn.colors.dtype) / 255
+        # What does not count is as it was photographed: no slope, no edge.
+        image = jnp.where(batch.counts[..., None], drawn.colors, target)
+        counts = batch.counts.astype(image.dtype)
+        area = jnp.maximum(counts.mean(), 1e-6)
+        terms = {"rgb": photometric_loss(image, target, weights.dssim) / area}
+        if weights.depth and batch.depth is not None:
+            known = counts * (batch.depth > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
+            off = jnp.abs(drawn.depths - batch.depth)
+            terms["depth"] = weights.depth * weighted_mean(off, known) / radius
+        if weights.feature and batch.ids is not None and batch.codebook is not None:
+            terms["feature"] = weights.feature * feature_loss(drawn.features[0], batch.codebook, batch.ids)
+        if scene.field is not None and isinstance(scene.field.encoding, HexPlane):
+            space, time = scene.field.encoding.space, scene.field.encoding.time
+            terms["planes"] = (
+                weights.plane_tv * sum(plane_variation(planes) for planes in space)
+                + weights.time_smoothness * sum(second_differences(planes) for planes in time)
+                + weights.time_sparsity * sum(jnp.abs(planes - 1).mean() for planes in time)
+            )
+        mse = jnp.square(image - target).mean() / area
+        meta = drawn.meta
+        told = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
+        return sum(terms.values()), terms | told
+
+    return loss
+
+
+def feature_loss(
+    drawn: Float[Array, "height width c"], codebook: Float[Array, "k c"], ids: Int[Array, "h w"]
+) -> Float[Array, ""]:
+    """|F_t - F_s|_1, a mean over channels and the teacher's pixels, to whose grid F_s is brought bilinearly
+    (papers/004, eq. 10)."""
+    resized = jax.image.resize(drawn, (*ids.shape, drawn.shape[2]), "linear", antialias=False)
+    known = (ids >= 0).astype(drawn.dtype)
+    return weighted_mean(jnp.abs(resized - codebook[jnp.maximum(ids, 0)]).mean(axis=-1), known)
+
+
+def surgical_step(config: SurgicalConfig, radius: float) -> Step:
+    """Adam or AdamW on a `DeformingScene`. `batch` is a `Batch`, `step` counts from 0.
+
+    Args:
+        config: of the reconstruction.
+        radius: of the scene, the unit in which means move.
+    """
+    total = max(1, config.warmup + config.iterations)
+    if config.schedule == "cosine":
+        fall = optax.cosine_decay_schedule(1.0, total)
+    else:
+        fall = optax.exponential_decay(1.0, total, _FINAL_RATE)
+    told = vars(config.rates)
+    loss = surgical_loss(config.weights, radius)
+
+    def of(scene: DeformingScene) -> Step:
+        rates = {name: told[name] for name in ("quats", "log_scales", "logit_opacities", "sh0")}
+        rates["means"] = told["means"] * radius
+        if scene.gaussians.features is not None:
+            rates["features"] = told["features"]
+        if scene.field is not None:
+            inner = {"hexplane": ("space", "time"), "mlp": (), "voxels": ("grid",)}
+            rates |= dict.fromkeys(inner[scene.field.config.kind], told["planes"])
+            rates["layers"] = told["layers"]
+        falling = {name: _falling(rate, fall) for name, rate in rates.items()}
+        decay = _DECAY if config.optimizer == "adamw" else 0.0
+        return gradient_step(loss, per_field_adam(falling, decay=decay))
+
+    def update(params: DeformingScene, state, batch: Batch, *, step, key):
+        return of(params).update(params, state, batch, step=step, key=key)
+
+    return Step(lambda params: of(params).init(params), update)
+
+
+def _falling(rate: float, fall: Callable) -> Callable:
+    return lambda count: rate * fall(count)

@@ -1,0 +1,217 @@
+"""The host loop of a deforming scene: which frame is next, in the warm-up or with the deformation."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.surgical.config import SurgicalConfig
+from gsjax.methods.surgical.nodes import nodes_of
+from gsjax.methods.surgical.start import Look, start_gaussians
+from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.deformation import init_deformation
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render
+
+_HEADROOM = 1.3
+_MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
+
+
+class SurgicalProblem(NamedTuple):
+    """What does not change during a reconstruction.
+
+    Attributes:
+        batches: one a look, without their plan.
+        first: the look that the canonical scene is like.
+        config: how.
+        radius: of the scene, metres; the unit of rates.
+    """
+
+    batches: list[Batch]
+    first: int
+    config: SurgicalConfig
+    radius: float
+
+
+class SurgicalState(eqx.Module):
+    """What a reconstruction goes on from, to the same bits.
+
+    Attributes:
+        scene: what trains.
+        optimizer: what the step carries along.
+        moving: what the field is asked about.
+        step: how many steps were made.
+        plan: that views are drawn with.
+    """
+
+    scene: DeformingScene
+    optimizer: Any
+    moving: Moving
+    step: int
+    plan: Plan = eqx.field(static=True)
+
+
+class Advanced(NamedTuple):
+    """A reconstruction after one more step.
+
+    Attributes:
+        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
+        info: losses of this step, on the device.
+        seconds: that it took, without what compiled.
+        compile_seconds: that compiling took in it.
+    """
+
+    state: SurgicalState
+    info: dict[str, Array]
+    seconds: float
+    compile_seconds: float
+
+
+def begin_surgical(
+    looks: Sequence[Look],
+    config: SurgicalConfig,
+    codebook: Float[np.ndarray, "k channels"] | None = None,
+    first: int = 0,
+    gaussians: Gaussians | None = None,
+) -> tuple[SurgicalProblem, SurgicalState]:
+    """A reconstruction before its first step.
+
+    Args:
+        looks: what a camera saw over time, all of one size.
+        config: how.
+        codebook: what the teacher says of the rows that looks name, in `config.channels` numbers.
+        first: the look that the canonical scene is like.
+        gaussians: canonical scene to begin with; made of depth unless given.
+
+    Raises:
+        ValueError: looks differ in size, no pixel counts, there is no depth, or the codebook has another
+            size.
+    """
+    _check(looks, config, codebook)
+    if gaussians is None:
+        gaussians = start_gaussians(looks, first, config.start_pixels)
+    if codebook is not None:
+        features = jnp.zeros((gaussians.num, config.channels))
+        gaussians = eqx.tree_at(lambda g: g.features, gaussians, features, is_leaf=lambda leaf: leaf is None)
+    means = np.asarray(gaussians.means)
+    middle = np.median(means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
+    batches = [_batch(look, codebook) for look in looks]
+    plan = _plan_of(gaussians, batches)
+    scene = DeformingScene(gaussians)
+    problem = SurgicalProblem(batches, first, config, radius)
+    state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, 0, plan)
+    return problem, state
+
+
+def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Advanced]:
+    """Step by step, until all is done: the canonical scene alone, then with its deformation. The same state
+    and problem give the same bits, wherever the reconstruction was begun or resumed."""
+    config = problem.config
+    advance = compiled_step(config, problem.radius)
+    key = jax.random.key(config.seed)
+    scene, optimizer, moving, plan = state.scene, state.optimizer, state.moving, state.plan
+    for i in range(state.step, config.warmup + config.iterations):
+        if i == config.warmup and scene.field is None:
+            scene, optimizer, moving = with_field(problem, scene)
+        begun, programs = perf_counter(), advance._cache_size()
+        while True:
+            batch = problem.batches[_turn(problem, i)]._replace(moving=moving, plan=plan)
+            scene, optimizer, info = advance(
+                scene, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i)
+            )
+            if not bool(info["overflow"]):
+                break
+            plan = plan.grown(int(info["needed"]), _HEADROOM)
+        seconds, new = perf_counter() - begun, advance._cache_size() > programs
+        now = SurgicalState(scene, optimizer, moving, i + 1, plan)
+        yield Advanced(now, info, 0.0 if new else seconds, seconds if new else 0.0)
+
+
+def with_field(problem: SurgicalProblem, scene: DeformingScene) -> tuple[DeformingScene, Any, Moving]:
+    """The scene with a field that moves nothing yet, an optimizer that knows nothing yet, and what the field
+    is asked about."""
+    config, gaussians = problem.config, scene.gaussians
+    means = np.asarray(gaussians.means, np.float64)
+    low, high = np.quantile(means, (0.005, 0.995), axis=0)
+    margin = _MARGIN * np.maximum(high - low, 1e-3 * problem.radius)
+    size = 0 if gaussians.features is None else gaussians.features.shape[1]
+    key = jax.random.fold_in(jax.random.key(config.seed), config.warmup)
+    field = init_deformation(key, config.deformation, np.stack([low - margin, high + margin]), size)
+    scene = DeformingScene(gaussians, field)
+    moving = nodes_of(gaussians, config.nodes) if config.nodes else None
+    return scene, surgical_step(config, problem.radius).init(scene), moving
+
+
+@lru_cache(maxsize=4)
+def compiled_step(config: SurgicalConfig, radius: float) -> Callable:
+    """The jitted step: scene, optimizer, batch, number, key. Buffers that it replaces are given away."""
+    step = surgical_step(config, radius)
+
+    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
+    def advance(scene, optimizer, batch, i, key):
+        return step.update(scene, optimizer, batch, step=i, key=key)
+
+    return advance
+
+
+def _turn(problem: SurgicalProblem, step: int) -> int:
+    """Which look a step has: all of them in a random order, and then in another."""
+    if step < problem.config.warmup and problem.config.warmup_frames == "first":
+        return problem.first
+    count = len(problem.batches)
+    epoch, place = divmod(step, count)
+    return int(np.random.default_rng((problem.config.seed, epoch)).permutation(count)[place])
+
+
+def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
+    """A look on the device."""
+    dtype = jnp.result_type(float)
+    height, width = look.image.shape[:2]
+    viewmat, K = (jnp.asarray(a, dtype)[None] for a in (look.viewmat, look.K))
+    counts = np.ones((height, width), bool) if look.counts is None else look.counts
+    ids: Int[np.ndarray, "h w"] | None = look.ids
+    taught = codebook is not None and ids is not None
+    return Batch(
+        jnp.asarray(look.image)[None],
+        jnp.asarray(counts)[None],
+        None if look.depth is None else jnp.asarray(look.depth, dtype)[None],
+        Camera(viewmat, K, width, height, look.near),
+        jnp.asarray(look.time, dtype),
+        jnp.asarray(ids, jnp.int32) if taught else None,
+        jnp.asarray(codebook, dtype) if taught else None,
+        None,
+        Plan(width, height, 0),
+    )
+
+
+def _plan_of(gaussians: Gaussians, batches: list[Batch]) -> Plan:
+    """A plan for the scene in all cameras."""
+    cameras = [batch.camera for batch in batches]
+    viewmats, Ks = (jnp.concatenate([getattr(c, name) for c in cameras]) for name in ("viewmat", "K"))
+    together = Camera(viewmats, Ks, cameras[0].width, cameras[0].height, cameras[0].near)
+    return plan_render(gaussians, together, headroom=_HEADROOM)
+
+
+def _check(looks: Sequence[Look], config: SurgicalConfig, codebook: np.ndarray | None) -> None:
+    if not looks:
+        raise ValueError("looks: expected at least one, found none")
+    shape = looks[0].image.shape
+    for i, look in enumerate(looks):
+        if look.image.shape != shape:
+            raise ValueError(
+                f"looks: expected pictures {shape} as the first, found {look.image.shape} in {i}"
+            )
+    if not any(look.counts is None or look.counts.any() for look in looks):
+        raise ValueError("masks: in no look does any pixel count; are they inverted?")
+    if codebook is not None and codebook.shape[1] != config.channels:
+        raise ValueError(f"codebook: expected rows of {config.channels} numbers, found {codebook.shape[1]}")

@@ -1,0 +1,266 @@
+"""Scenes that deform: what a field says of each Gaussian at a time, and the Gaussians there.
+
+    mean' = mean + dmean,    scale' = exp(log s + ds)
+    q' = Exp(dw) q                    SurstSplat (papers/003, eq. 4): dw an axis times an angle
+    q' = normalize(q + dq)            GaussianClin (papers/004, eq. 3), with q of length 1
+
+A field has an encoding of place and time, a small network on it, and a last layer that begins at zero, so
+that nothing moves before it was trained. Encodings are in `gsjax.scene.time_encodings`.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from gsjax.geometry.rotations import multiply_quats, normalize_quats
+from gsjax.scene.feature_grid import interpolated
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.time_encodings import HexPlane, Sinusoids, Voxels, init_hexplane, init_voxels, within
+
+
+@dataclass(frozen=True)
+class DeformationConfig:
+    """Sizes of a deformation field, and what it changes beside where Gaussians are, turned and sized."""
+
+    kind: Literal["hexplane", "mlp", "voxels"] = "hexplane"
+    """Encoding of place and time: six planes a level, of each pair of axes (Cao and Johnson 2023); sines of
+    both; or a dense grid of voxels in space and sines of the time (papers/003, section 2.1)."""
+    rotation: Literal["exp", "add"] = "exp"
+    """An axis and angle before the rotation, as in SurstSplat, or a difference of quaternions, as in
+    GaussianClin."""
+    resolution: int = 64
+    """Vertices an axis of the coarsest planes, or of the voxels."""
+    time_resolution: int = 30
+    """Vertices along the time of all planes: about half of the frames, so that those between are learned."""
+    levels: int = 2
+    """Of planes, each twice as fine in space as the one before."""
+    channels: int = 16
+    """Numbers at a vertex."""
+    frequencies: int = 6
+    """Of sines: 1, 2, 4, ... half periods over the box or the whole time."""
+    hidden: int = 64
+    """Width of the network."""
+    depth: int = 1
+    """Hidden layers of the network."""
+    semantic: bool = False
+    """Show the network the Gaussians' features."""
+    color: bool = False
+    """Change colours over time."""
+    opacity: bool = False
+    """Change opacities over time."""
+    feature: bool = False
+    """Change features over time."""
+
+    def __post_init__(self):
+        least = {"resolution": 2, "time_resolution": 2, "levels": 1, "channels": 1, "hidden": 1}
+        least |= {"frequencies": 0, "depth": 0}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise ValueError(f"{name}: expected at least {low}, found {getattr(self, name)}")
+
+
+class Offsets(NamedTuple):
+    """What changes of N Gaussians; None of what does not.
+
+    Attributes:
+        means: metres.
+        turns: axis times angle, radians; or, with four columns, differences of unit quaternions.
+        log_scales: of logarithms of the standard deviations.
+        logit_opacities, sh0, features: of these raw values.
+    """
+
+    means: Float[Array, "N 3"]
+    turns: Float[Array, "N turn"]
+    log_scales: Float[Array, "N 3"]
+    logit_opacities: Float[Array, "N"] | None = None
+    sh0: Float[Array, "N 1 3"] | None = None
+    features: Float[Array, "N D"] | None = None
+
+
+class DeformationField(eqx.Module):
+    """(place, time) -> `Offsets`. All leaves are floats, so `jax.grad` takes the whole.
+
+    Attributes:
+        encoding: of place and time.
+        layers: of the network, with a ReLU between them.
+        config: sizes.
+        bounds: least and largest coordinates of the scene's box, metres; its longest edge is the unit of
+            `means`.
+    """
+
+    encoding: HexPlane | Sinusoids | Voxels
+    layers: tuple[eqx.nn.Linear, ...]
+    config: DeformationConfig = eqx.field(static=True)
+    bounds: tuple[tuple[float, ...], tuple[float, ...]] = eqx.field(static=True)
+
+    def __call__(
+        self, means: Float[Array, "N 3"], time: Float[Array, ""], features: Float[Array, "N D"] | None = None
+    ) -> Offsets:
+        """What changes of Gaussians at a time.
+
+        Args:
+            means: canonical, metres; those outside the box count as on its surface.
+            time: 0 to 1 over the whole recording; beyond, as at its ends.
+            features: of the Gaussians, where the field is shown them or changes them.
+
+        Raises:
+            ValueError: the field needs features and there are none.
+        """
+        config = self.config
+        if features is None and (config.semantic or config.feature):
+            raise ValueError("features: this field is shown features or changes them, found None")
+        values = self.encoding(within(means, self.bounds), time)
+        if config.semantic:
+            values = jnp.concatenate([values, features], axis=-1)
+        for layer in self.layers[:-1]:
+            values = jax.nn.relu(jax.vmap(layer)(values))
+        values = jax.vmap(self.layers[-1])(values)
+        widths = _widths(config, 0 if features is None else features.shape[1])
+        split = jnp.split(values, np.cumsum([*widths.values()])[:-1].tolist(), axis=-1)
+        found = {name: part for name, part in zip(widths, split, strict=True) if widths[name]}
+        edge = max(high - low for low, high in zip(*self.bounds, strict=True))
+        found["means"] = edge * found["means"]
+        if config.opacity:
+            found["logit_opacities"] = found["logit_opacities"][:, 0]
+        if config.color:
+            found["sh0"] = found["sh0"][:, None]
+        if isinstance(self.encoding, Voxels) and features is not None and config.feature:
+            found["features"] = found["features"] + self.encoding.meaning(within(means, self.bounds))
+        return Offsets(**found)
+
+
+def init_deformation(
+    key: PRNGKeyArray, config: DeformationConfig, bounds: ArrayLike, feature_size: int = 0
+) -> DeformationField:
+    """A field that changes nothing yet.
+
+    Args:
+        key: for its first values.
+        config: sizes.
+        bounds: [2, 3], least and largest coordinates of the scene, metres. They are static.
+        feature_size: of the Gaussians' features, where the field is shown them or changes them.
+
+    Raises:
+        ValueError: the box is none, or features are wanted that have no size.
+    """
+    box = np.asarray(bounds, np.float32)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise ValueError(f"bounds: expected [2, 3], least and largest coordinates, found {box.tolist()}")
+    if (config.semantic or config.feature) and feature_size < 1:
+        raise ValueError("feature_size: the field is shown features or changes them, found none")
+    key, first = jax.random.split(key)
+    encoding: HexPlane | Sinusoids | Voxels
+    if config.kind == "hexplane":
+        encoding = init_hexplane(
+            first, config.resolution, config.time_resolution, config.levels, config.channels
+        )
+    elif config.kind == "mlp":
+        encoding = Sinusoids(config.frequencies)
+    else:
+        outputs = max(1, feature_size if config.feature else 0)
+        encoding = init_voxels(first, config.resolution, config.channels, config.frequencies, outputs)
+    inputs = encoding.size + (feature_size if config.semantic else 0)
+    outputs = sum(_widths(config, feature_size).values())
+    widths = (inputs, *[config.hidden] * config.depth, outputs)
+    keys = jax.random.split(key, config.depth + 1)
+    layers = [eqx.nn.Linear(*pair, key=one) for *pair, one in zip(widths[:-1], widths[1:], keys, strict=True)]
+    layers[-1] = jax.tree.map(jnp.zeros_like, layers[-1])
+    low, high = box.tolist()
+    return DeformationField(encoding, tuple(layers), config, (tuple(low), tuple(high)))
+
+
+def _widths(config: DeformationConfig, feature_size: int) -> dict[str, int]:
+    """How many numbers of the last layer each field has."""
+    return {
+        "means": 3,
+        "turns": 3 if config.rotation == "exp" else 4,
+        "log_scales": 3,
+        "logit_opacities": int(config.opacity),
+        "sh0": 3 * config.color,
+        "features": feature_size * config.feature,
+    }
+
+
+def deform(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
+    """The Gaussians with what a field says is added to them.
+
+    Args:
+        gaussians: canonical.
+        offsets: of each.
+    """
+    quats = normalize_quats(gaussians.quats)
+    if offsets.turns.shape[-1] == 3:
+        quats = multiply_quats(jaxlie.SO3.exp(offsets.turns).wxyz, quats)
+    else:
+        quats = normalize_quats(quats + offsets.turns)
+    added = {name: getattr(offsets, name) for name in Offsets._fields if name != "turns"}
+    changed = {name: getattr(gaussians, name) + value for name, value in added.items() if value is not None}
+    return Gaussians(
+        **{name: getattr(gaussians, name) for name in ("logit_opacities", "sh0", "shN", "features")}
+        | changed
+        | {"quats": quats}
+    )
+
+
+class Nodes(NamedTuple):
+    """Places that a field is asked about instead of every Gaussian, whose answers are blended: what deforms
+    does so more smoothly than Gaussians lie (Sumner et al. 2007; SC-GS, Huang et al. 2024).
+
+    Attributes:
+        means: metres.
+        features: at these places, where the field is shown some; else None.
+        indices: which nodes each Gaussian blends.
+        weights: how much of each, 1 in sum.
+    """
+
+    means: Float[Array, "M 3"]
+    features: Float[Array, "M D"] | None
+    indices: Int[Array, "N k"]
+    weights: Float[Array, "N k"]
+
+
+def deform_by_nodes(
+    gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes
+) -> Gaussians:
+    """The scene at a time, where each Gaussian moves as the nodes around it do.
+
+    Args:
+        gaussians: canonical.
+        field: what moves them.
+        time: 0 to 1.
+        nodes: of these Gaussians.
+    """
+    offsets = field(nodes.means, time, nodes.features)
+
+    def blended(values):
+        flat = values.reshape(len(values), -1)
+        found = interpolated(flat, nodes.weights[:, None], nodes.indices[:, None])
+        return found.reshape(-1, *values.shape[1:])
+
+    return deform(gaussians, jax.tree.map(blended, offsets))
+
+
+def deform_rows(
+    gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], rows: Int[Array, "M"] | None = None
+) -> Gaussians:
+    """The scene at a time, where only some Gaussians deform: the field is asked about those alone.
+
+    Args:
+        gaussians: canonical.
+        field: what moves them.
+        time: 0 to 1.
+        rows: which deform; all unless given. Rows beyond the last Gaussian (`gaussians.num`) fill up a list
+            to a static length and change nothing.
+    """
+    if rows is None:
+        return deform(gaussians, field(gaussians.means, time, gaussians.features))
+    some = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), gaussians)
+    moved = deform(some, field(some.means, time, some.features))
+    return jax.tree.map(lambda leaf, new: leaf.at[rows].set(new, mode="drop"), gaussians, moved)

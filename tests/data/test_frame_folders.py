@@ -1,0 +1,72 @@
+"""Frames in a folder: their order, their numbers, their sizes, and what lies beside them."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from gsjax.data import DataError, DataWarning
+from gsjax.data.frame_folders import (
+    expect_one_size,
+    frame_numbers,
+    pictures,
+    pictures_beside,
+    warn_of_single_frame,
+)
+from tests.data import dots
+
+
+def save(folder, *names, size=(8, 6)):
+    for name in names:
+        dots.save(folder / name, np.zeros((size[1], size[0], 3), np.uint8))
+
+
+def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
+    save(tmp_path, "b.png", "a.jpg", "c.jpeg", ".thumb.png")
+    (tmp_path / "notes.txt").write_text("")
+    (tmp_path / "more.png").mkdir()
+    assert [path.name for path in pictures(tmp_path)] == ["a.jpg", "b.png", "c.jpeg"]
+    assert pictures(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (("frame-000003_color.png", "frame-000007_color.png"), (3, 7)),
+        (("2024_clip_01.png", "2024_clip_02.png"), (1, 2)),
+        (("a.png", "b3.png"), (0, 1)),
+        (("f1_left.png", "f1_right.png"), (0, 1)),
+    ],
+)
+def test_the_last_number_in_a_name_is_the_frames(tmp_path, names, numbers):
+    assert frame_numbers([tmp_path / name for name in names]) == numbers
+
+
+def test_numbers_that_were_not_padded_would_shuffle_frames(tmp_path):
+    frames = sorted(tmp_path / f"{i}.png" for i in (1, 2, 10))
+    with pytest.raises(DataError, match=r"found 2.png after 10.png. Pad the numbers with zeros"):
+        frame_numbers(frames)
+
+
+def test_one_size(tmp_path):
+    save(tmp_path, "0.png", "1.png")
+    assert expect_one_size(pictures(tmp_path)) == (8, 6)
+    save(tmp_path, "2.png", size=(6, 8))
+    with pytest.raises(DataError, match=r"2.png: expected 8x6 pixels as in 0.png, found 6x8"):
+        expect_one_size(pictures(tmp_path))
+
+
+def test_as_many_beside_as_there_are_frames(tmp_path):
+    save(tmp_path, "masks/0.png")
+    with pytest.raises(DataError, match=r"masks: expected 2 pictures, one a frame of clip.mp4, found 1"):
+        pictures_beside(tmp_path / "masks", 2, "clip.mp4")
+    save(tmp_path, "masks/1.jpg")
+    assert len(pictures_beside(tmp_path / "masks", 2, "images")) == 2
+
+
+def test_a_single_frame_shows_no_motion(tmp_path):
+    with pytest.warns(DataWarning, match=r"0.png: it is the only frame"):
+        warn_of_single_frame([tmp_path / "0.png"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_single_frame([tmp_path / "0.png", tmp_path / "1.png"])
