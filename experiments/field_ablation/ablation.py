@@ -88,14 +88,17 @@ PANELS = (
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
-    """A panel for each score, a bar for each variant."""
+    """A panel for each score, a bar for each variant: the mean over seeds, each of which is a dot."""
     from matplotlib.figure import Figure
     from plots import draw_variants
 
-    drawing = Figure(figsize=(14, 1.0 + 0.32 * len(rows)), dpi=100, layout="constrained")
+    names = list(dict.fromkeys(row["variant"] for row in rows))
+    drawing = Figure(figsize=(14, 1.0 + 0.4 * len(names)), dpi=100, layout="constrained")
     panels = drawing.subplots(1, len(PANELS), sharey=True)
-    names = [row["variant"] for row in rows]
     for axes, (key, title) in zip(panels, PANELS, strict=True):
-        draw_variants(axes, names, [row[key] or 0.0 for row in rows], title)
+        each = [[row[key] for row in rows if row["variant"] == name] for name in names]
+        draw_variants(axes, names, [float(np.mean(values)) for values in each], title)
+        for place, values in enumerate(each):
+            axes.plot(values, [place] * len(values), "k.", ms=4)
     panels[0].invert_yaxis()
     drawing.savefig(path, format=path.suffix.removeprefix(".") or "png")
