@@ -253,7 +253,7 @@ def test_all_pairs_are_compared_by_the_l1_distance_of_rows():
     assert distances.max() < 2
     edges = all_edges(told["valid"], 1)
     wanted = edge_values(told["teacher"], edges, told["valid"])
-    found = structure_loss(told["features"], wanted, edges, valid=told["valid"])
+    found = jax.jit(structure_loss)(told["features"], wanted, edges, None, told["valid"])
     np.testing.assert_allclose(found, np.average(distances, weights=choices), rtol=1e-9)
 
 
@@ -304,6 +304,7 @@ def test_twice_the_nodes_change_no_loss():
     told = arrays(case(6))
     twice = {name: jnp.concatenate([a, a], axis=1) if a.ndim > 1 else a for name, a in told.items()}
 
+    @jax.jit
     def across(told):  # in one frame each has a twin, which it lacks among half of them
         edges = all_edges(told["valid"], 1)
         wanted = edge_affinities(told["teacher"], edges, told["valid"])

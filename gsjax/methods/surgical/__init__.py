@@ -3,6 +3,7 @@
 config      what can be set; the two papers' recipes
 start       the first Gaussians, of depth over time
 nodes       which places the deformation is asked about
+graph       what the teacher says of nodes, and what it asks of their features
 step        deform, draw colours and features, compare, descend
 train       the host loop
 """
@@ -13,6 +14,8 @@ from gsjax.methods.surgical.config import (
     SurgicalRatesConfig,
     SurgicalWeightsConfig,
 )
+from gsjax.methods.surgical.graph import FrameGraph, GraphConfig, frame_graphs, graph_loss, graph_nodes
+from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.start import Look, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, feature_loss, surgical_loss, surgical_step
 from gsjax.methods.surgical.train import (
@@ -30,6 +33,8 @@ __all__ = [
     "Advanced",
     "Batch",
     "DeformingScene",
+    "FrameGraph",
+    "GraphConfig",
     "Look",
     "SurgicalConfig",
     "SurgicalProblem",
@@ -39,6 +44,10 @@ __all__ = [
     "begin_surgical",
     "compiled_step",
     "feature_loss",
+    "frame_graphs",
+    "graph_loss",
+    "graph_nodes",
+    "nodes_of",
     "reconstruct",
     "start_gaussians",
     "surgical_loss",

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from gsjax.methods.settings import expect
+from gsjax.methods.surgical.graph import GraphConfig
 from gsjax.scene.deformation import DeformationConfig
 
 
@@ -78,6 +79,7 @@ class SurgicalConfig:
     deformation: DeformationConfig = field(default_factory=DeformationConfig)
     rates: SurgicalRatesConfig = field(default_factory=SurgicalRatesConfig)
     weights: SurgicalWeightsConfig = field(default_factory=SurgicalWeightsConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
     channels: int = 16
     """Numbers of a Gaussian's feature, where there is a teacher."""
     seed: int = 0
@@ -96,7 +98,9 @@ class SurgicalConfig:
 
 PRESETS = MappingProxyType(
     {
-        "clin": SurgicalConfig(deformation=DeformationConfig(rotation="add")),
+        "clin": SurgicalConfig(
+            deformation=DeformationConfig(rotation="add"), graph=GraphConfig(kind="similarity")
+        ),
         "surst": SurgicalConfig(optimizer="adamw", schedule="cosine"),
     }
 )

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.losses.regularization import plane_variation, second_differences
-from gsjax.methods.surgical.config import SurgicalConfig, SurgicalWeightsConfig
+from gsjax.methods.surgical.config import SurgicalConfig
+from gsjax.methods.surgical.graph import FrameGraph, graph_loss
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows
@@ -65,6 +66,7 @@ class Batch(NamedTuple):
         ids: which row of the codebook each of the teacher's pixels has, -1 for none; None without teacher.
         codebook: what the teacher says, in the scene's channels.
         moving: what the field is asked about.
+        graph: of the look and those around it; None without.
         plan: to draw with.
     """
 
@@ -76,12 +78,15 @@ class Batch(NamedTuple):
     ids: Int[Array, "h w"] | None
     codebook: Float[Array, "k channels"] | None
     moving: Moving
+    graph: FrameGraph | None
     plan: Plan
 
 
-def surgical_loss(weights: SurgicalWeightsConfig, radius: float) -> Callable:
+def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
     """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of pixels that count (papers/003, eq. 13), depth,
-    features against the teacher's (papers/004, eq. 10), and smoothness of the field's planes (4DGS)."""
+    features against the teacher's (papers/004, eq. 10), the graph (`graph_loss`), and smoothness of the
+    field's planes (4DGS)."""
+    weights = config.weights
 
     def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
         there = scene.at(batch.time, batch.moving)
@@ -94,10 +99,13 @@ def surgical_loss(weights: SurgicalWeightsConfig, radius: float) -> Callable:
         terms = {"rgb": photometric_loss(image, target, weights.dssim) / area}
         if weights.depth and batch.depth is not None:
             known = counts * (batch.depth > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
-            off = jnp.abs(drawn.depths - batch.depth)
+            off = jnp.abs(drawn.depths - jnp.where(batch.depth > 0, batch.depth, 0.0))
             terms["depth"] = weights.depth * weighted_mean(off, known) / radius
         if weights.feature and batch.ids is not None and batch.codebook is not None:
+            assert drawn.features is not None
             terms["feature"] = weights.feature * feature_loss(drawn.features[0], batch.codebook, batch.ids)
+        if batch.graph is not None and scene.gaussians.features is not None:
+            terms |= graph_loss(scene.gaussians.features, batch.graph, config.graph)
         if scene.field is not None and isinstance(scene.field.encoding, HexPlane):
             space, time = scene.field.encoding.space, scene.field.encoding.time
             terms["planes"] = (
@@ -136,7 +144,7 @@ def surgical_step(config: SurgicalConfig, radius: float) -> Step:
     else:
         fall = optax.exponential_decay(1.0, total, _FINAL_RATE)
     told = vars(config.rates)
-    loss = surgical_loss(config.weights, radius)
+    loss = surgical_loss(config, radius)
 
     def of(scene: DeformingScene) -> Step:
         rates = {name: told[name] for name in ("quats", "log_scales", "logit_opacities", "sh0")}

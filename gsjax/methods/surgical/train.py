@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical.config import SurgicalConfig
+from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.start import Look, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
@@ -30,12 +31,16 @@ class SurgicalProblem(NamedTuple):
     """What does not change during a reconstruction.
 
     Attributes:
-        batches: one a look, without their plan.
+        looks: what was seen.
+        codebook: what the teacher says, in the scene's channels; None without.
+        batches: one a look, without what a state holds.
         first: the look that the canonical scene is like.
         config: how.
         radius: of the scene, metres; the unit of rates.
     """
 
+    looks: Sequence[Look]
+    codebook: Float[np.ndarray, "k channels"] | None
     batches: list[Batch]
     first: int
     config: SurgicalConfig
@@ -49,6 +54,7 @@ class SurgicalState(eqx.Module):
         scene: what trains.
         optimizer: what the step carries along.
         moving: what the field is asked about.
+        graphs: of each look, once they were made.
         step: how many steps were made.
         plan: that views are drawn with.
     """
@@ -56,6 +62,7 @@ class SurgicalState(eqx.Module):
     scene: DeformingScene
     optimizer: Any
     moving: Moving
+    graphs: list[FrameGraph] | None
     step: int
     plan: Plan = eqx.field(static=True)
 
@@ -97,8 +104,7 @@ def begin_surgical(
             size.
     """
     _check(looks, config, codebook)
-    if gaussians is None:
-        gaussians = start_gaussians(looks, first, config.start_pixels)
+    gaussians = gaussians or start_gaussians(looks, first, config.start_pixels)
     if codebook is not None:
         features = jnp.zeros((gaussians.num, config.channels))
         gaussians = eqx.tree_at(lambda g: g.features, gaussians, features, is_leaf=lambda leaf: leaf is None)
@@ -108,8 +114,8 @@ def begin_surgical(
     batches = [_batch(look, codebook) for look in looks]
     plan = _plan_of(gaussians, batches)
     scene = DeformingScene(gaussians)
-    problem = SurgicalProblem(batches, first, config, radius)
-    state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, 0, plan)
+    problem = SurgicalProblem(looks, codebook, batches, first, config, radius)
+    state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, None, 0, plan)
     return problem, state
 
 
@@ -120,12 +126,17 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
     advance = compiled_step(config, problem.radius)
     key = jax.random.key(config.seed)
     scene, optimizer, moving, plan = state.scene, state.optimizer, state.moving, state.plan
+    graphs, graph_from = state.graphs, config.warmup + round(config.graph.after * config.iterations)
     for i in range(state.step, config.warmup + config.iterations):
         if i == config.warmup and scene.field is None:
             scene, optimizer, moving = with_field(problem, scene)
+        if i == graph_from and graphs is None and problem.codebook is not None:
+            graphs = _graphs(problem, scene, moving)
         begun, programs = perf_counter(), advance._cache_size()
         while True:
-            batch = problem.batches[_turn(problem, i)]._replace(moving=moving, plan=plan)
+            turn = _turn(problem, i)
+            graph = None if graphs is None else graphs[turn]
+            batch = problem.batches[turn]._replace(moving=moving, graph=graph, plan=plan)
             scene, optimizer, info = advance(
                 scene, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i)
             )
@@ -133,7 +144,7 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
                 break
             plan = plan.grown(int(info["needed"]), _HEADROOM)
         seconds, new = perf_counter() - begun, advance._cache_size() > programs
-        now = SurgicalState(scene, optimizer, moving, i + 1, plan)
+        now = SurgicalState(scene, optimizer, moving, graphs, i + 1, plan)
         yield Advanced(now, info, 0.0 if new else seconds, seconds if new else 0.0)
 
 
@@ -150,6 +161,17 @@ def with_field(problem: SurgicalProblem, scene: DeformingScene) -> tuple[Deformi
     scene = DeformingScene(gaussians, field)
     moving = nodes_of(gaussians, config.nodes) if config.nodes else None
     return scene, surgical_step(config, problem.radius).init(scene), moving
+
+
+def _graphs(problem: SurgicalProblem, scene: DeformingScene, moving: Moving) -> list[FrameGraph] | None:
+    """Of each look, with nodes where the scene has them now."""
+    config = problem.config.graph
+    if config.kind == "none" or problem.codebook is None:
+        return None
+    nodes = graph_nodes(scene.gaussians.means, config.nodes)
+    at = jax.jit(lambda scene, time: scene.at(time, moving).means[nodes])
+    places = np.stack([np.asarray(at(scene, batch.time)) for batch in problem.batches])
+    return frame_graphs(places, nodes, problem.looks, problem.codebook, config, problem.radius)
 
 
 @lru_cache(maxsize=4)
@@ -189,6 +211,7 @@ def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
         jnp.asarray(look.time, dtype),
         jnp.asarray(ids, jnp.int32) if taught else None,
         jnp.asarray(codebook, dtype) if taught else None,
+        None,
         None,
         Plan(width, height, 0),
     )

@@ -1,0 +1,221 @@
+"""What experiments with deforming scenes share: looks, held-out frames, and scores against simulated truth."""
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from recordings import recorded
+from scipy.spatial import cKDTree
+
+import gsjax
+from gsjax.data import Sequence
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.surgical import (
+    Look,
+    SurgicalConfig,
+    SurgicalProblem,
+    SurgicalState,
+    begin_surgical,
+    reconstruct,
+)
+from gsjax.metrics.image import psnr, ssim
+from gsjax.scene.render import render
+
+EVERY = 8  # frame i is held out if (i - 1) mod 8 is 0, as for EndoNeRF
+TOOL = 1
+NEAR_TOOL_PX = 20
+_SEEN_WITHIN_M = 1e-3
+_CARRIED_BY = 4  # Gaussians that carry a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A recording with its frames parted.
+
+    Attributes:
+        sequence: camera 0 is the left eye, camera 1 the right one.
+        train: frames to learn from.
+        test: frames that are held out.
+    """
+
+    sequence: Sequence
+    train: list[int]
+    test: list[int]
+
+    def look(self, t: int, camera: int = 0, ids: np.ndarray | None = None, tools: bool = False) -> Look:
+        """What a camera saw in a frame; tools do not count unless wanted."""
+        s = self.sequence
+        counts = None if tools else s.mask(t, camera) != TOOL
+        time = t / (s.num_frames - 1)
+        return Look(
+            s.image(t, camera), counts, s.depth(t, camera), s.viewmats[t, camera], s.Ks[t, camera], time, ids
+        )
+
+
+def dataset(name: str = "tissue_0") -> Dataset:
+    """A recording by its name."""
+    sequence = gsjax.open_sequence(recorded(name))
+    test = [i for i in range(sequence.num_frames) if (i - 1) % EVERY == 0]
+    return Dataset(sequence, [i for i in range(sequence.num_frames) if i not in test], test)
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """A deforming scene that was learned, and what that took."""
+
+    problem: SurgicalProblem
+    state: SurgicalState
+    seconds: float
+    compile_seconds: float
+
+
+def learned(looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | None = None) -> Reconstructed:
+    """A scene of these looks; no step may be skipped."""
+    problem, state = begin_surgical(looks, config, codebook)
+    seconds = compiling = skipped = 0.0
+    for found in reconstruct(problem, state):
+        state = found.state
+        seconds, compiling = seconds + found.seconds, compiling + found.compile_seconds
+        skipped += float(found.info["skipped"])
+    assert not skipped, f"{skipped:.0f} steps were skipped"
+    return Reconstructed(problem, state, seconds, compiling)
+
+
+def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Colours, depth and features as a look would see the scene."""
+    colors, depths, features = _draw(found.state, jnp.asarray(look.time), _camera(look))
+    return tuple(None if a is None else np.asarray(a) for a in (colors, depths, features))
+
+
+@jax.jit
+def _draw(state: SurgicalState, time, camera: Camera):
+    got = render(state.scene.at(time, state.moving), camera, state.plan)
+    features = None if got.features is None else got.features[0]
+    return jnp.clip(got.colors[0], 0, 1), got.depths[0], features
+
+
+def _camera(look: Look) -> Camera:
+    height, width = look.image.shape[:2]
+    viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (look.viewmat, look.K))
+    return Camera(viewmat, K, width, height, look.near)
+
+
+def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> float:
+    """How often a second the scene is deformed and drawn, over other times; the median."""
+    camera, took = _camera(look), []
+    for i in range(repeats + 2):
+        time = jnp.asarray(i / (repeats + 2))
+        begun = perf_counter()
+        jax.block_until_ready(_draw(found.state, time, camera))
+        took.append(perf_counter() - begun)
+    return 1 / float(np.median(took[2:]))
+
+
+def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
+    """Of the held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and the right eye's."""
+    rows = []
+    for t in data.test:
+        look = data.look(t)
+        colors, depths, _ = drawn(found, look)
+        true = look.image / 255.0
+        known = look.counts & (look.depth > 0)
+        row = {
+            "psnr": psnr(colors, true, look.counts),
+            "ssim": ssim(colors, true, look.counts),
+            "depth_mm": 1e3 * float(np.abs(depths - look.depth)[known].mean()),
+            "psnr_near_tool": psnr(colors, true, look.counts & near_tool(look)),
+        }
+        if data.sequence.num_cameras > 1:
+            right = data.look(t, camera=1)
+            row["psnr_right"] = psnr(drawn(found, right)[0], right.image / 255.0, right.counts)
+        rows.append(row)
+    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+
+
+def near_tool(look: Look) -> Bool[np.ndarray, "h w"]:
+    """Pixels within some of the tool."""
+    from scipy.ndimage import distance_transform_edt
+
+    return distance_transform_edt(look.counts) <= NEAR_TOOL_PX
+
+
+def copies(data: Dataset) -> dict[str, float]:
+    """PSNR of held-out frames as copies of others, under the same masks."""
+    s = data.sequence
+
+    def of(guess):
+        return float(np.mean([psnr(guess(t), s.image(t, 0) / 255.0, data.look(t).counts) for t in data.test]))
+
+    def image(t):
+        return s.image(min(max(t, 0), s.num_frames - 1), 0) / 255.0
+
+    return {
+        "psnr_previous": of(lambda t: image(t - 1)),
+        "psnr_neighbors": of(lambda t: (image(t - 1) + image(t + 1)) / 2),
+        "psnr_first": of(lambda t: image(0)),
+    }
+
+
+def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
+    """How far vertices that frame 0 sees are from where they truly are, each carried by the displacement of
+    the four Gaussians nearest to it in frame 0; and how far if nothing moved. Millimetres."""
+    tracks, frames = data.sequence.truth.tracks, data.sequence.num_frames
+    seen = _seen(tracks[0], data.look(0))
+    start = tracks[0][seen]
+    at = jax.jit(lambda state, time: state.scene.at(time, state.moving).means)
+    means = [np.asarray(at(found.state, jnp.asarray(t / (frames - 1)))) for t in range(frames)]
+    _, carriers = cKDTree(means[0]).query(start, k=_CARRIED_BY)
+    errors, still, close = [], [], []
+    for t in range(1, frames):
+        carried = start + (means[t] - means[0])[carriers].mean(axis=1)
+        true = tracks[t][seen]
+        errors.append(1e3 * np.linalg.norm(carried - true, axis=1))
+        still.append(1e3 * np.linalg.norm(start - true, axis=1))
+        close.append(_near_tool_at(true, data, t))
+    errors, still, close = (np.stack(a) for a in (errors, still, close))
+    return {
+        "track_median_mm": float(np.median(errors)),
+        "track_p95_mm": float(np.quantile(errors, 0.95)),
+        "track_near_tool_mm": float(np.median(errors[close])) if close.any() else np.nan,
+        "still_median_mm": float(np.median(still)),
+        "still_p95_mm": float(np.quantile(still, 0.95)),
+    }
+
+
+def _pixels(
+    points: Float[np.ndarray, "n 3"], look: Look
+) -> tuple[Int[np.ndarray, "n 2"], np.ndarray, np.ndarray]:
+    """Where points fall in a look, how deep they lie, and which are inside."""
+    local = points @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
+    ahead = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+    xy = (local @ look.K.T)[:, :2] / ahead[:, None]
+    height, width = look.image.shape[:2]
+    inside = np.isfinite(ahead) & (xy >= 0).all(1) & (xy < (width, height)).all(1)
+    return np.where(inside[:, None], xy, 0).astype(int), local[:, 2], inside
+
+
+def _seen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
+    """Which points a look sees, by its depth and mask."""
+    xy, depth, inside = _pixels(points, look)
+    x, y = xy.T
+    return inside & look.counts[y, x] & (np.abs(look.depth[y, x] - depth) < _SEEN_WITHIN_M)
+
+
+def _near_tool_at(points: Float[np.ndarray, "n 3"], data: Dataset, t: int) -> Bool[np.ndarray, "n"]:
+    look = data.look(t)
+    xy, _, inside = _pixels(points, look)
+    return inside & near_tool(look)[xy[:, 1], xy[:, 0]]
+
+
+def summary(found: Reconstructed) -> dict[str, Any]:
+    """What it took."""
+    steps = found.problem.config.warmup + found.problem.config.iterations
+    return {
+        "gaussians": found.state.scene.gaussians.num,
+        "minutes": (found.seconds + found.compile_seconds) / 60,
+        "step_ms": 1e3 * found.seconds / max(1, steps),
+    }

@@ -1,0 +1,261 @@
+"""A deforming scene: where it starts, that it learns, and that it goes on to the same bits."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax.methods.surgical import (
+    PRESETS,
+    DeformingScene,
+    GraphConfig,
+    Look,
+    SurgicalConfig,
+    SurgicalRatesConfig,
+    begin_surgical,
+    compiled_step,
+    feature_loss,
+    frame_graphs,
+    graph_loss,
+    graph_nodes,
+    nodes_of,
+    reconstruct,
+    start_gaussians,
+)
+from gsjax.methods.surgical.start import known_depth
+from gsjax.metrics.image import psnr
+from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.render import render
+
+CODES = np.eye(2, 4)
+TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
+CONFIG = SurgicalConfig(
+    warmup=8,
+    iterations=24,
+    start_pixels=1.0,
+    nodes=64,
+    channels=4,
+    rates=SurgicalRatesConfig(planes=3e-2, layers=1e-2, features=3e-2),
+    deformation=TINY,
+    graph=GraphConfig(nodes=24, neighbors=3, matches=2, window=1),
+)
+
+
+@pytest.fixture(scope="module")
+def looks():
+    """Every other frame of built-in tissue, tools left out, and what each pixel shows."""
+    seen = gsjax.open_sequence("simulated:tissue?width=64&height=52&frames=10").select(range(0, 10, 2), (0,))
+    return [
+        Look(
+            seen.image(t, 0),
+            seen.mask(t, 0) == 0,
+            seen.depth(t, 0),
+            seen.viewmats[t, 0],
+            seen.Ks[t, 0],
+            t / (seen.num_frames - 1),
+            ids=seen.mask(t, 0),
+        )
+        for t in range(seen.num_frames)
+    ]
+
+
+def sight(problem, state, i):
+    """What the scene looks like where look `i` was."""
+    batch = problem.batches[i]
+    drawn = render(state.scene.at(batch.time, state.moving), batch.camera, state.plan)
+    look = problem.looks[i]
+    return psnr(np.clip(np.asarray(drawn.colors[0], float), 0, 1), look.image / 255, look.counts)
+
+
+class TestStart:
+    def test_gaussians_lie_where_the_first_look_sees_something(self, looks):
+        gaussians = start_gaussians(looks[:1], 0, 1.0)
+        look = looks[0]
+        local = np.asarray(gaussians.means) @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
+        x, y = ((local @ look.K.T)[:, :2] / local[:, 2:]).T.astype(int)
+        np.testing.assert_allclose(known_depth(look)[y, x], local[:, 2], rtol=0.02)
+
+    def test_later_looks_add_what_a_tool_hid_and_nothing_else(self, looks):
+        hidden = np.zeros_like(looks[0].counts)
+        hidden[20:32, 20:44] = True
+        first = looks[0]._replace(counts=looks[0].counts & ~hidden)
+        alone, all_ = (start_gaussians([first, *more], 0, 1.0) for more in ([], looks[1:]))
+        new = np.asarray(all_.means)[alone.num :]
+        local = new @ first.viewmat[:3, :3].T + first.viewmat[:3, 3]
+        x, y = ((local @ first.K.T)[:, :2] / local[:, 2:]).T.astype(int)
+        inside = (x >= 0) & (x < 64) & (y >= 0) & (y < 52)
+        assert hidden[y[inside], x[inside]].sum() > 60
+        assert not (known_depth(first)[y[inside], x[inside]] > 0).any()
+
+    def test_without_depth_there_is_no_start(self, looks):
+        flat = [look._replace(depth=np.zeros_like(look.depth)) for look in looks]
+        with pytest.raises(ValueError, match="depth: no look has any where a pixel counts"):
+            start_gaussians(flat, 0, 1.0)
+        with pytest.raises(ValueError, match="masks: in no look does any pixel count; are they inverted"):
+            begin_surgical([look._replace(counts=np.zeros_like(look.counts)) for look in looks], CONFIG)
+        with pytest.raises(ValueError, match="looks: expected pictures"):
+            begin_surgical([looks[0], looks[1]._replace(image=looks[1].image[:-2])], CONFIG)
+        with pytest.raises(ValueError, match="codebook: expected rows of 4 numbers, found 3"):
+            begin_surgical(looks, CONFIG, np.eye(2, 3))
+
+
+def test_nodes_blend_to_one_and_follow_what_is_near(looks):
+    gaussians = start_gaussians(looks[:1], 0, 1.0)
+    nodes = nodes_of(gaussians, 40)
+    np.testing.assert_allclose(nodes.weights.sum(axis=1), 1.0, atol=1e-5)
+    assert (nodes.weights > 0).all()
+    # A map that is linear in the place is blended to nearly itself.
+    blended_places = (nodes.means[nodes.indices] * nodes.weights[..., None]).sum(axis=1)
+    spread = np.asarray(gaussians.means).std()
+    assert np.abs(blended_places - gaussians.means).max() < 0.5 * spread
+    assert nodes_of(gaussians, 10 * gaussians.num).means.shape[0] == gaussians.num
+
+
+@pytest.fixture(scope="module")
+def learned(looks):
+    problem, state = begin_surgical(looks, CONFIG, CODES)
+    first = [sight(problem, state, i) for i in range(len(looks))]
+    infos = []
+    for found in reconstruct(problem, state):
+        state = found.state
+        infos.append(jax.device_get(found.info))
+    return problem, state, first, infos
+
+
+class TestLearning:
+    def test_all_frames_get_better(self, learned):
+        problem, state, first, infos = learned
+        now = [sight(problem, state, i) for i in range(len(first))]
+        assert not any(info["skipped"] for info in infos)
+        assert np.mean(now) > np.mean(first) + 1.5
+        assert min(now) > min(first) + 1
+        # The deformation has its share: the last frame is not the first.
+        last = len(first) - 1
+        still = problem.batches[last]._replace(time=problem.batches[0].time)
+        frozen = problem._replace(batches=[still] * len(first))
+        assert now[last] > sight(frozen, state, last) + 0.3
+
+    def test_gaussians_mean_what_the_teacher_says(self, learned):
+        *_, infos = learned
+        assert {"node", "structure"} <= set(infos[-1])
+        assert infos[-1]["feature"] < 0.6 * infos[0]["feature"]
+
+    def test_a_step_compiles_once_for_each_kind(self, learned):
+        problem, *_ = learned
+        # The warm-up, the deformation without a graph, and with it.
+        assert compiled_step(problem.config, problem.radius)._cache_size() <= 3
+
+    def test_goes_on_to_the_same_bits(self, learned, looks):
+        problem, whole, *_ = learned
+        _, state = begin_surgical(looks, CONFIG, CODES)
+        for found in reconstruct(problem, state):
+            state = found.state
+            if state.step == 22:  # after the graphs were made
+                kept = jax.tree.map(lambda a: np.array(a) if eqx.is_array(a) else a, state)
+                break
+        for found in reconstruct(
+            problem, jax.tree.map(lambda a: jnp.asarray(a) if eqx.is_array(a) else a, kept)
+        ):
+            state = found.state
+        for one, other in zip(jax.tree.leaves(whole.scene), jax.tree.leaves(state.scene), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_a_picture_without_numbers_changes_nothing(self, learned):
+        problem, state, *_ = learned
+        scene, optimizer = jax.tree.map(jnp.copy, (state.scene, state.optimizer))
+        depth = problem.batches[0].depth.at[0, 10, 10].set(jnp.nan)
+        batch = problem.batches[0]._replace(
+            depth=depth, moving=state.moving, graph=state.graphs[0], plan=state.plan
+        )
+        key = jax.random.key(0)
+        after, _, info = compiled_step(CONFIG, problem.radius)(scene, optimizer, batch, jnp.asarray(30), key)
+        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+        assert jnp.isfinite(info["loss"])
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_presets_learn(name, looks):
+    config = replace(
+        PRESETS[name], warmup=2, iterations=4, start_pixels=2.0, nodes=0, channels=4, warmup_frames="all"
+    )
+    config = replace(config, deformation=replace(config.deformation, resolution=8, levels=1, channels=2))
+    config = replace(config, graph=replace(config.graph, nodes=12, neighbors=2, matches=2, window=1))
+    problem, state = begin_surgical(looks, config, CODES)
+    infos = [jax.device_get(found.info) for found in reconstruct(problem, state)]
+    assert not any(info["skipped"] for info in infos)
+    assert infos[-1]["rgb"] < infos[0]["rgb"]
+    assert ({"spatial", "temporal"} if name == "clin" else {"node", "structure"}) <= set(infos[-1])
+
+
+class TestFeatureLoss:
+    def test_is_of_the_teachers_grid(self):
+        drawn = jnp.asarray(np.random.default_rng(0).uniform(size=(8, 12, 4)), jnp.float32)
+        ids = np.zeros((4, 6), np.int32)
+        ids[1, 2] = -1
+        small = np.asarray(jax.image.resize(drawn, (4, 6, 4), "linear", antialias=False))
+        expected = np.abs(small - CODES[0]).mean(-1)[ids >= 0].mean()
+        found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.asarray(ids))
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+    def test_a_teacher_of_its_own_size_is_not_resized(self):
+        drawn = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 7, 4)), jnp.float32)
+        found = feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.ones((5, 7), jnp.int32))
+        np.testing.assert_allclose(found, np.abs(np.asarray(drawn) - CODES[1]).mean(), rtol=1e-6)
+
+    def test_a_teacher_that_says_nothing(self):
+        drawn = jnp.ones((4, 4, 4))
+        assert feature_loss(drawn, jnp.asarray(CODES, jnp.float32), jnp.full((4, 4), -1)) == 0
+
+
+@pytest.fixture(scope="module")
+def graphs(looks):
+    gaussians = start_gaussians(looks[:1], 0, 1.0)
+    nodes = graph_nodes(gaussians.means, CONFIG.graph.nodes)
+    places = np.stack([np.asarray(gaussians.means)[nodes]] * len(looks))
+    return nodes, {
+        kind: frame_graphs(places, nodes, looks, CODES, replace(CONFIG.graph, kind=kind), 0.05)
+        for kind in ("matching", "similarity")
+    }
+
+
+class TestGraph:
+    def test_nodes_that_a_tool_hides_are_absent(self, graphs, looks):
+        nodes, found = graphs
+        there = np.asarray(found["matching"][0].valid)
+        assert there.any()
+        covered = [look._replace(counts=np.zeros_like(look.counts)) for look in looks]
+        places = np.zeros((len(looks), len(nodes), 3))
+        none = frame_graphs(places, nodes, covered, CODES, CONFIG.graph, 0.05)
+        assert not np.asarray(none[0].valid).any()
+        features = jnp.ones((nodes.max() + 1, 4))
+        assert all(value == 0 for value in graph_loss(features, none[0], CONFIG.graph).values())
+
+    def test_what_the_teacher_says_costs_nothing(self, graphs):
+        """One class in view: features that are its code have no node loss, and no pair apart."""
+        nodes, found = graphs
+        features = jnp.zeros((nodes.max() + 1, 4)).at[:, 0].set(1.0)
+        for kind, names in (("matching", ("node", "structure")), ("similarity", ("spatial", "temporal"))):
+            values = graph_loss(features, found[kind][0], replace(CONFIG.graph, kind=kind))
+            np.testing.assert_allclose([values[name] for name in names], 0, atol=1e-5)
+        apart = jnp.asarray(np.random.default_rng(0).normal(size=features.shape), jnp.float32)
+        for kind in found:
+            values = graph_loss(apart, found[kind][0], replace(CONFIG.graph, kind=kind))
+            assert sum(values.values()) > 0.01
+
+    def test_slopes_reach_nodes_alone(self, graphs):
+        nodes, found = graphs
+        features = jnp.asarray(np.random.default_rng(0).normal(size=(nodes.max() + 5, 4)), jnp.float32)
+        slope = jax.grad(lambda f: sum(graph_loss(f, found["matching"][2], CONFIG.graph).values()))(features)
+        assert jnp.isfinite(slope).all()
+        others = np.setdiff1d(np.arange(len(features)), nodes)
+        assert (np.asarray(slope)[others] == 0).all()
+        assert (np.asarray(slope)[nodes] != 0).any()
+
+
+def test_a_scene_without_a_field_stands_still(looks):
+    scene = DeformingScene(start_gaussians(looks[:1], 0, 2.0))
+    assert scene.at(jnp.asarray(0.7)) is scene.gaussians
