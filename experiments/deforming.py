@@ -1,4 +1,4 @@
-"""What experiments with deforming scenes share: looks, held-out frames, and scores against simulated truth."""
+"""What experiments with deforming scenes share: looks, held-out frames, scores against simulated truth."""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -116,7 +116,7 @@ def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> fl
 
 
 def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
-    """Of the held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and the right eye's."""
+    """Of held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and of the right eye."""
     rows = []
     for t in data.test:
         look = data.look(t)
