@@ -15,7 +15,9 @@ import gsjax
 from gsjax.data import Sequence
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical import (
+    DeformingScene,
     Look,
+    Moving,
     SurgicalConfig,
     SurgicalProblem,
     SurgicalState,
@@ -23,6 +25,7 @@ from gsjax.methods.surgical import (
     reconstruct,
 )
 from gsjax.metrics.image import psnr, ssim
+from gsjax.rasterize.plan import Plan
 from gsjax.scene.render import render
 
 EVERY = 8  # frame i is held out if (i - 1) mod 8 is 0, as for EndoNeRF
@@ -87,13 +90,16 @@ def learned(looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | No
 
 def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Colours, depth and features as a look would see the scene."""
-    colors, depths, features = _draw(found.state, jnp.asarray(look.time), _camera(look))
+    plan = found.problem.plan_for(found.state)
+    colors, depths, features = _draw(
+        found.state.scene, found.state.moving, jnp.asarray(look.time), _camera(look), plan
+    )
     return tuple(None if a is None else np.asarray(a) for a in (colors, depths, features))
 
 
 @jax.jit
-def _draw(state: SurgicalState, time, camera: Camera):
-    got = render(state.scene.at(time, state.moving), camera, state.plan)
+def _draw(scene: DeformingScene, moving: Moving, time, camera: Camera, plan: Plan):
+    got = render(scene.at(time, moving), camera, plan)
     features = None if got.features is None else got.features[0]
     return jnp.clip(got.colors[0], 0, 1), got.depths[0], features
 
@@ -106,11 +112,12 @@ def _camera(look: Look) -> Camera:
 
 def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> float:
     """How often a second the scene is deformed and drawn, over other times; the median."""
-    camera, took = _camera(look), []
+    camera, took, state = _camera(look), [], found.state
+    plan = found.problem.plan_for(state)
     for i in range(repeats + 2):
         time = jnp.asarray(i / (repeats + 2))
         begun = perf_counter()
-        jax.block_until_ready(_draw(found.state, time, camera))
+        jax.block_until_ready(_draw(state.scene, state.moving, time, camera, plan))
         took.append(perf_counter() - begun)
     return 1 / float(np.median(took[2:]))
 
@@ -166,8 +173,9 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     tracks, frames = data.sequence.truth.tracks, data.sequence.num_frames
     seen = _seen(tracks[0], data.look(0))
     start = tracks[0][seen]
-    at = jax.jit(lambda state, time: state.scene.at(time, state.moving).means)
-    means = [np.asarray(at(found.state, jnp.asarray(t / (frames - 1)))) for t in range(frames)]
+    at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
+    scene, moving = found.state.scene, found.state.moving
+    means = [np.asarray(at(scene, moving, jnp.asarray(t / (frames - 1)))) for t in range(frames)]
     _, carriers = cKDTree(means[0]).query(start, k=_CARRIED_BY)
     errors, still, close = [], [], []
     for t in range(1, frames):

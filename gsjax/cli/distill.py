@@ -1,32 +1,34 @@
 """`gsjax distill`: meaning on the Gaussians of a scene that stands, to be asked by `gsjax query`."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 from rich.console import Console
 
-from gsjax.cli.distill_loop import Learning, learn, load
 from gsjax.cli.feature_cache import FeatureCache, cache_folder
 from gsjax.cli.field_file import FOLDER, NAME, StoredField, write_field
 from gsjax.cli.field_results import judge, print_results, write_results
 from gsjax.cli.field_scene import FieldScene, SceneOptions, open_scene
 from gsjax.cli.field_teacher import Asked, Masks, Second, Teaching
+from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
 from gsjax.cli.recording import located
 from gsjax.cli.run_folder import RunFolder, plain
 from gsjax.cli.run_records import digest
-from gsjax.methods.feature_field import FieldConfig, begin_field
+from gsjax.methods.feature_field import FieldConfig, begin_field, distill
 
 HELP = (
     " As in `gsjax distill RUN`, or, of what others made, `gsjax distill scene.ply --images PHOTOGRAPHS "
     "--features FILES --out FIELD`. What encoders and segmenters say of photographs is kept by what they "
     f"were shown, in {cache_folder()}; delete that folder to have it said anew, or for its space."
 )
+_LOSSES = ("rec", "cos", "contrast", "tv")
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
@@ -108,7 +110,8 @@ def run(options: Options) -> int:
             learning = load(folder.resume, learning)
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
-        learning = learn(problem, learning, folder, console)
+        course = Course("distilling", options.field.iterations, _LOSSES, _told)
+        learning = learn(distill(problem, learning.state), learning, course, folder, console)
         told = asdict(settings)
         stored = StoredField(
             learning.state.field,
@@ -166,6 +169,11 @@ def run(options: Options) -> int:
     if learning.stopped is not None:
         raise learning.stopped
     return 0
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    """The means of a row in words."""
+    return "1 - cosine to the teacher " + ("–" if row["cos"] is None else f"{row['cos']:.3f}")
 
 
 def _out(options: Options, scene: Path) -> Path:

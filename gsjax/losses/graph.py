@@ -114,6 +114,7 @@ class Matching:
     temperature: float = 1.0
     """In units of sqrt(d), as far as chance takes the score of two layer-normalised features."""
     slack: float | None = None
+    """A score: those of two features lie between -d and d."""
     iterations: int = 20
     derivative: Derivative = "unrolled"
 

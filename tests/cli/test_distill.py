@@ -15,7 +15,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from gsjax.cli import distill, distill_loop, field_scores, field_teacher
+from gsjax.cli import distill, field_scores, field_teacher, learning
 from gsjax.cli.distill import Options
 from gsjax.cli.feature_cache import FeatureCache
 from gsjax.cli.field_results import draw_features, feature_colors
@@ -329,7 +329,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(distill_loop, "hear", hear)
+        patch.setattr(learning, "hear", hear)
         assert gsjax(*told)[0] == 130
     before, mask = (out / "field.npz").read_bytes(), recording / "seg/0/000000.png"
     gaussians = read_ply(file)[0]

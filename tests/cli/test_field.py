@@ -90,7 +90,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 
 
 def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
-    from gsjax.cli import distill_loop
+    from gsjax.cli import learning
 
     steps, heard = ("--field.iterations", STEPS, *TABLE), []
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
@@ -101,7 +101,7 @@ def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, disti
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(distill_loop, "hear", hear)
+        patch.setattr(learning, "hear", hear)
         code, said = gsjax(*told)
     assert code == 130, said
     assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be asked

@@ -17,13 +17,21 @@ from gsjax.methods.surgical.config import (
 from gsjax.methods.surgical.graph import FrameGraph, GraphConfig, frame_graphs, graph_loss, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.start import Look, start_gaussians
-from gsjax.methods.surgical.step import Batch, DeformingScene, feature_loss, surgical_loss, surgical_step
+from gsjax.methods.surgical.step import (
+    Batch,
+    DeformingScene,
+    Moving,
+    feature_loss,
+    surgical_loss,
+    surgical_step,
+)
 from gsjax.methods.surgical.train import (
     Advanced,
     SurgicalProblem,
     SurgicalState,
     begin_surgical,
     compiled_step,
+    of_step,
     reconstruct,
     with_field,
 )
@@ -36,6 +44,7 @@ __all__ = [
     "FrameGraph",
     "GraphConfig",
     "Look",
+    "Moving",
     "SurgicalConfig",
     "SurgicalProblem",
     "SurgicalRatesConfig",
@@ -48,6 +57,7 @@ __all__ = [
     "graph_loss",
     "graph_nodes",
     "nodes_of",
+    "of_step",
     "reconstruct",
     "start_gaussians",
     "surgical_loss",

@@ -1,6 +1,7 @@
 """The host loop of a deforming scene: which frame is next, in the warm-up or with the deformation."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render
 
 _HEADROOM = 1.3
+_OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
 _MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
 
 
@@ -37,6 +39,8 @@ class SurgicalProblem(NamedTuple):
         first: the look that the canonical scene is like.
         config: how.
         radius: of the scene, metres; the unit of rates.
+        bounds: of the deformation field, around the first Gaussians, metres.
+        plan: that views are drawn with, as large as the first Gaussians need it.
     """
 
     looks: Sequence[Look]
@@ -45,6 +49,12 @@ class SurgicalProblem(NamedTuple):
     first: int
     config: SurgicalConfig
     radius: float
+    bounds: Float[np.ndarray, "2 3"]
+    plan: Plan
+
+    def plan_for(self, state: "SurgicalState") -> Plan:
+        """That views of a state are drawn with."""
+        return replace(self.plan, capacity=max(self.plan.capacity, state.capacity))
 
 
 class SurgicalState(eqx.Module):
@@ -56,7 +66,7 @@ class SurgicalState(eqx.Module):
         moving: what the field is asked about.
         graphs: of each look, once they were made.
         step: how many steps were made.
-        plan: that views are drawn with.
+        capacity: that the plan has grown to.
     """
 
     scene: DeformingScene
@@ -64,7 +74,7 @@ class SurgicalState(eqx.Module):
     moving: Moving
     graphs: list[FrameGraph] | None
     step: int
-    plan: Plan = eqx.field(static=True)
+    capacity: int
 
 
 class Advanced(NamedTuple):
@@ -104,18 +114,22 @@ def begin_surgical(
             size.
     """
     _check(looks, config, codebook)
-    gaussians = gaussians or start_gaussians(looks, first, config.start_pixels)
+    scene = DeformingScene(gaussians or start_gaussians(looks, first, config.start_pixels))
     if codebook is not None:
-        features = jnp.zeros((gaussians.num, config.channels))
-        gaussians = eqx.tree_at(lambda g: g.features, gaussians, features, is_leaf=lambda leaf: leaf is None)
-    means = np.asarray(gaussians.means)
+        features = jnp.zeros((scene.gaussians.num, config.channels))
+        scene = eqx.tree_at(
+            lambda s: s.gaussians.features, scene, features, is_leaf=lambda leaf: leaf is None
+        )
+    means = np.asarray(scene.gaussians.means)
     middle = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
     batches = [_batch(look, codebook) for look in looks]
-    plan = _plan_of(gaussians, batches)
-    scene = DeformingScene(gaussians)
-    problem = SurgicalProblem(looks, codebook, batches, first, config, radius)
-    state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, None, 0, plan)
+    plan = _plan_of(scene.gaussians, batches)
+    low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
+    room = _MARGIN * np.maximum(high - low, 1e-3 * radius)
+    bounds = np.stack([low - room, high + room])
+    problem = SurgicalProblem(looks, codebook, batches, first, config, radius, bounds, plan)
+    state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, None, 0, plan.capacity)
     return problem, state
 
 
@@ -125,12 +139,12 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
     config = problem.config
     advance = compiled_step(config, problem.radius)
     key = jax.random.key(config.seed)
-    scene, optimizer, moving, plan = state.scene, state.optimizer, state.moving, state.plan
-    graphs, graph_from = state.graphs, config.warmup + round(config.graph.after * config.iterations)
+    scene, optimizer, moving, graphs = state.scene, state.optimizer, state.moving, state.graphs
+    plan = problem.plan_for(state)
     for i in range(state.step, config.warmup + config.iterations):
         if i == config.warmup and scene.field is None:
             scene, optimizer, moving = with_field(problem, scene)
-        if i == graph_from and graphs is None and problem.codebook is not None:
+        if i == _graph_from(config) and graphs is None:
             graphs = _graphs(problem, scene, moving)
         begun, programs = perf_counter(), advance._cache_size()
         while True:
@@ -144,20 +158,35 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
                 break
             plan = plan.grown(int(info["needed"]), _HEADROOM)
         seconds, new = perf_counter() - begun, advance._cache_size() > programs
-        now = SurgicalState(scene, optimizer, moving, graphs, i + 1, plan)
+        now = SurgicalState(scene, optimizer, moving, graphs, i + 1, plan.capacity)
         yield Advanced(now, info, 0.0 if new else seconds, seconds if new else 0.0)
+
+
+def of_step(problem: SurgicalProblem, state: SurgicalState, step: int) -> SurgicalState:
+    """A state of the form that one after so many steps has, to be filled with what was saved of that.
+
+    Args:
+        state: from `begin_surgical`.
+    """
+    if step > problem.config.warmup:
+        scene, optimizer, moving = with_field(problem, state.scene)
+        graphs = _graphs(problem, scene, moving) if step > _graph_from(problem.config) else None
+        state = SurgicalState(scene, optimizer, moving, graphs, step, state.capacity)
+    return state
+
+
+def _graph_from(config: SurgicalConfig) -> int:
+    """The step before which the graph is made."""
+    return config.warmup + round(config.graph.after * config.iterations)
 
 
 def with_field(problem: SurgicalProblem, scene: DeformingScene) -> tuple[DeformingScene, Any, Moving]:
     """The scene with a field that moves nothing yet, an optimizer that knows nothing yet, and what the field
     is asked about."""
     config, gaussians = problem.config, scene.gaussians
-    means = np.asarray(gaussians.means, np.float64)
-    low, high = np.quantile(means, (0.005, 0.995), axis=0)
-    margin = _MARGIN * np.maximum(high - low, 1e-3 * problem.radius)
     size = 0 if gaussians.features is None else gaussians.features.shape[1]
     key = jax.random.fold_in(jax.random.key(config.seed), config.warmup)
-    field = init_deformation(key, config.deformation, np.stack([low - margin, high + margin]), size)
+    field = init_deformation(key, config.deformation, problem.bounds, size)
     scene = DeformingScene(gaussians, field)
     moving = nodes_of(gaussians, config.nodes) if config.nodes else None
     return scene, surgical_step(config, problem.radius).init(scene), moving

@@ -1,11 +1,11 @@
-"""The steps of `gsjax distill`: shown and saved while they go on, until there are enough."""
+"""Steps of a method that learns by descent: shown and saved while they go on, until there are enough."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -17,18 +17,42 @@ from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.saving import Saver
 from gsjax.io.atomic import atomic_write
 from gsjax.io.checkpoints import load_checkpoint, load_metadata
-from gsjax.methods.feature_field import Distilled, FieldProblem, FieldState, distill
 
-LOSSES = ("rec", "cos", "contrast", "tv")
-_STATE = "field.npz"
+_STATE = "state.npz"
 _LOGGED_EVERY = 10  # steps
 _SHOWN_EVERY_S = 0.2
 _LINES = 10  # of a log
 
 
+class Made(Protocol):
+    """A step that was made, as every host loop yields it: the state after it, what it says, and its time."""
+
+    state: Any
+    info: dict[str, Any]
+    seconds: float
+    compile_seconds: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is to be learned.
+
+    Attributes:
+        doing: in a word: "distilling".
+        total: steps, in all.
+        losses: by the names that steps have for them, those that a row has.
+        told: a row in words.
+    """
+
+    doing: str
+    total: int
+    losses: tuple[str, ...]
+    told: Callable[[Mapping[str, Any]], str]
+
+
 @dataclass
 class Learning:
-    """How a distillation goes on.
+    """How it goes on.
 
     Attributes:
         state: to go on from.
@@ -41,7 +65,7 @@ class Learning:
         stopped: what ended it early, or None.
     """
 
-    state: FieldState
+    state: Any
     about: Mapping[str, str | None]
     rows: list[dict[str, Any]] = field(default_factory=list)
     recent: list[dict[str, Any]] = field(default_factory=list)
@@ -79,27 +103,36 @@ def load(folder: Path, first: Learning) -> Learning:
     return Learning(state, about, **stored)
 
 
-def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console: Console) -> Learning:
-    """Go on until all steps are made, Ctrl-C or an error."""
-    save, total = Saver(folder.resume / _STATE, "distilling"), problem.config.iterations
-    columns = (TextColumn("distilling"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+def learn(
+    steps: Iterator[Made], learning: Learning, course: Course, folder: RunFolder, console: Console
+) -> Learning:
+    """Go on until all steps are made, Ctrl-C or an error.
+
+    Args:
+        steps: those that go on from the state of `learning`.
+        learning: how far it is.
+        course: what is to be learned.
+        folder: of the run.
+        console: that shows it.
+    """
+    save, total = Saver(folder.resume / _STATE, course.doing), course.total
+    columns = (TextColumn(course.doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
     words = TextColumn("{task.description}")
     if not console.is_terminal:
-        console.print("distilling; compiling, which takes half a minute the first time", soft_wrap=True)
+        console.print(f"{course.doing}; compiling, which takes half a minute the first time", soft_wrap=True)
     shown = 0.0
     with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=total, completed=learning.state.step)
-        steps = distill(problem, learning.state)
         try:
             while undisturbed(_made_one_more, steps, learning):
                 step = learning.state.step
                 if step % _LOGGED_EVERY == 0 or step == total:
-                    undisturbed(_add_row, learning, folder)
+                    undisturbed(_add_row, learning, course, folder)
                 if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
-                    bar.update(task, completed=step, description=_told(learning.rows[-1]))
+                    bar.update(task, completed=step, description=course.told(learning.rows[-1]))
                     shown = perf_counter()
                 if not console.is_terminal and _is_told(step, total):
-                    told = f": {_told(learning.rows[-1])}" if learning.rows else ""
+                    told = f": {course.told(learning.rows[-1])}" if learning.rows else ""
                     console.print(f"{step:,} of {total:,} steps{told}", soft_wrap=True)
                 save(learning.state, learning.metadata, last=False)
                 hear()
@@ -113,7 +146,7 @@ def learn(problem: FieldProblem, learning: Learning, folder: RunFolder, console:
     return learning
 
 
-def _made_one_more(steps: Iterator[Distilled], learning: Learning) -> bool:
+def _made_one_more(steps: Iterator[Made], learning: Learning) -> bool:
     """Whether there was a step to make, which gives away the buffers of the state before."""
     if (found := next(steps, None)) is None:
         return False
@@ -124,7 +157,7 @@ def _made_one_more(steps: Iterator[Distilled], learning: Learning) -> bool:
     return True
 
 
-def _add_row(learning: Learning, folder: RunFolder) -> None:
+def _add_row(learning: Learning, course: Course, folder: RunFolder) -> None:
     """A row of means, which stands in metrics.jsonl at once."""
     infos = jax.device_get(learning.recent)
     sound = [info for info in infos if not info["skipped"]]
@@ -134,7 +167,7 @@ def _add_row(learning: Learning, folder: RunFolder) -> None:
         "step": learning.state.step,
         "seconds": learning.seconds + learning.compile_seconds,
     }
-    for name in ("loss", *LOSSES):
+    for name in ("loss", *course.losses):
         values = [float(info[name]) for info in sound if name in info]
         row[name] = float(np.mean(values)) if values else None
     learning.rows.append(row)
@@ -146,8 +179,3 @@ def _is_told(step: int, total: int) -> bool:
     """Whether a log has a line of this step: about ten in all, each of which was measured just now."""
     every = max(1, total // (_LINES * _LOGGED_EVERY)) * _LOGGED_EVERY
     return step % every == 0 or step == total
-
-
-def _told(row: dict[str, Any]) -> str:
-    """The means of a row in words."""
-    return "1 - cosine to the teacher " + ("–" if row["cos"] is None else f"{row['cos']:.3f}")
