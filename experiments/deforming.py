@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from recordings import recorded
-from scipy.spatial import cKDTree
 
 import gsjax
 from gsjax.data import Sequence
@@ -25,6 +24,7 @@ from gsjax.methods.surgical import (
     reconstruct,
 )
 from gsjax.metrics.image import psnr, ssim
+from gsjax.metrics.tracking import carried_points
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.render import render
 
@@ -32,7 +32,6 @@ EVERY = 8  # frame i is held out if (i - 1) mod 8 is 0, as for EndoNeRF
 TOOL = 1
 NEAR_TOOL_PX = 20
 _SEEN_WITHIN_M = 1e-3
-_CARRIED_BY = 4  # Gaussians that carry a vertex
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,12 +175,11 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
     scene, moving = found.state.scene, found.state.moving
     means = [np.asarray(at(scene, moving, jnp.asarray(t / (frames - 1)))) for t in range(frames)]
-    _, carriers = cKDTree(means[0]).query(start, k=_CARRIED_BY)
+    carried = carried_points(start, np.stack(means))
     errors, still, close = [], [], []
     for t in range(1, frames):
-        carried = start + (means[t] - means[0])[carriers].mean(axis=1)
         true = tracks[t][seen]
-        errors.append(1e3 * np.linalg.norm(carried - true, axis=1))
+        errors.append(1e3 * np.linalg.norm(carried[t] - true, axis=1))
         still.append(1e3 * np.linalg.norm(start - true, axis=1))
         close.append(_near_tool_at(true, data, t))
     errors, still, close = (np.stack(a) for a in (errors, still, close))

@@ -16,6 +16,7 @@ COMMANDS = {
     "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
     "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs, and report on it"),
     "parts": ("gsjax.cli.parts", "find the parts of a moving scene from several cameras, and their joints"),
+    "deform": ("gsjax.cli.deform", "reconstruct what deforms, from an endoscope say, with its meaning"),
     "edit": ("gsjax.cli.edit", "change when, where and how parts of a run move, and film it"),
     "distill": ("gsjax.cli.distill", "give the Gaussians of a scene a meaning, to be asked by query"),
     "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),

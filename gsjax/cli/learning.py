@@ -78,11 +78,18 @@ class Learning:
         """What is saved beside the state."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
         kept = ("rows", "seconds", "compile_seconds", "skipped")
-        return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
+        told = {"about": dict(self.about), "recent": recent, "step": self.state.step}
+        return {name: getattr(self, name) for name in kept} | told
 
 
-def load(folder: Path, first: Learning) -> Learning:
+def load(folder: Path, first: Learning, form_at: Callable[[Any, int], Any] | None = None) -> Learning:
     """What a run had come to; `first` where it was stopped before it had saved anything.
+
+    Args:
+        folder: where it was saved.
+        first: before its first step.
+        form_at: (first state, step) -> a state of the form that one after so many steps has, where that
+            changes.
 
     Raises:
         CheckpointError: it is damaged.
@@ -92,14 +99,15 @@ def load(folder: Path, first: Learning) -> Learning:
     if not path.is_file():
         return first
     stored = load_metadata(path)
-    about = stored.pop("about", {})
+    about, step = stored.pop("about", {}), stored.pop("step", 0)
     others = [what for what, digest in first.about.items() if about.get(what) != digest]
     if others:
         raise ValueError(
             f"--resume: {' and '.join(others)}: expected what the run in {folder.parent} was begun with, "
             "found something else; put that back, or replace the run with --overwrite instead"
         )
-    state, _ = load_checkpoint(path, first.state)
+    like = first.state if form_at is None else form_at(first.state, step)
+    state, _ = load_checkpoint(path, like)
     return Learning(state, about, **stored)
 
 

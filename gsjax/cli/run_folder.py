@@ -16,7 +16,7 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
-_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz", "field.npz")
+_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz", "field.npz", "deformation.npz")
 _FOLDERS = (
     "canonical",
     "renders",
@@ -27,11 +27,13 @@ _FOLDERS = (
     "edit",
     "field",
     "tensorboard",
+    "test",
     "resume",
 )
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
 _OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
+_OF_WORTH += ("deformation.npz",)
 OF_QUERY = ("query.json", "selection.npz", "masks", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
 """What `gsjax query` writes into its folder."""
@@ -78,6 +80,7 @@ class RunFolder:
           parts.npz               of `gsjax parts`: anchor, means0 [N,3], weights [N,P], labels [N],
                                   centres [P,3], R [T,P,3,3], t [T,P,3], times [T]
           field.npz               of `gsjax distill`: features of places, and what they mean
+          deformation.npz         of `gsjax deform`: the canonical scene, its features, and what moves it
           scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
           canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
@@ -89,6 +92,7 @@ class RunFolder:
           resume/                 what an unfinished run goes on from; a finished one has none
           query/, grasp/, eval/   what `gsjax query`, `gsjax grasp` and `gsjax eval` found afterwards
           field/                  of `gsjax distill`: a run of its own
+          test/FRAME.png          of `gsjax deform`: held-out frames as the scene has them
           edit/NAME/              of `gsjax edit`: video.mp4, edit.yaml, metrics.json, perhaps ply/FRAME.ply
           tensorboard/            of a fit with --tensorboard: its event files
 

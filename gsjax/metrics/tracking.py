@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Integer
+from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import project
 
@@ -171,3 +172,18 @@ def score_tracks(
     if labels.shape != (means.shape[1],):
         raise ValueError(f"labels: got shape {labels.shape}, want [{means.shape[1]}] to match means")
     return {label: score_object(means[:, labels == label], poses[label], anchor) for label in sorted(poses)}
+
+
+def carried_points(
+    points: Float[np.ndarray, "V 3"], means: Float[np.ndarray, "T N 3"], carriers: int = 4
+) -> Float[np.ndarray, "T V 3"]:
+    """Points of frame 0 where Gaussians carry them: each moves by the mean displacement of those nearest to
+    it in frame 0.
+
+    Args:
+        points: world, metres.
+        means: of Gaussians over time, metres.
+        carriers: how many carry a point.
+    """
+    _, nearest = cKDTree(means[0]).query(points, k=[*range(1, min(carriers, means.shape[1]) + 1)])
+    return points + (means[:, nearest] - means[0][nearest]).mean(axis=2)

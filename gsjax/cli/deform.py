@@ -1,0 +1,170 @@
+"""`gsjax deform`: a scene that deforms, seen by one moving camera, with its meaning."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, make_dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from gsjax.cli.deform_data import DeformData, Features, Tools, deform_data
+from gsjax.cli.deform_results import judge, print_results, write_results, write_scene
+from gsjax.cli.learning import Course, Learning, learn, load
+from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.messages import Notes, reason, stage
+from gsjax.cli.recording import located, open_recording
+from gsjax.cli.run_folder import RunFolder, expect_dataset
+from gsjax.data.open import ReadOptions
+from gsjax.methods.surgical import PRESETS, SurgicalConfig, begin_surgical, of_step, reconstruct
+
+HELP = (
+    " As in `gsjax deform DATASET --out RUN`. Frames are to have depth; masks say where tools are, which are "
+    "left out unless --tools draw."
+)
+_LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
+_OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax deform` is told."""
+
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+    """Folder of a recording over time (EndoNeRF's layout, say), or a built-in scene: simulated:tissue."""
+    out: Path
+    """Folder for the run."""
+    method: Literal["surst", "clin"] = "surst"
+    """Whose recipe: SurstSplat's or GaussianClin's. What is said of --deform counts more."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames, as Python slices them."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID")] = ()
+    """Id of the one camera to learn from. The first, unless given; the others only judge."""
+    scale: float = 1.0
+    """Learn from pictures at this fraction of their size (width and height); time goes with the number of
+    pixels."""
+    test_every: int = 8
+    """Hold out frame i, to judge by, where i - 1 is a multiple of this; 0 holds out none."""
+    tools: Tools = "leave-out"
+    """What masks call something else than 0: leave out, or draw it too."""
+    features: Features = "auto"
+    """What is to be learned beside colours: classes (a code for each class of the masks), or none. auto:
+    classes if masks have more than one among the pixels that count."""
+    resume: bool = False
+    """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
+    overwrite: bool = False
+    """Replace an earlier run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """What the layout of the data leaves open."""
+    deform: SurgicalConfig = field(default_factory=lambda: PRESETS["surst"])
+    """How it is learned."""
+
+
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
+    """The options whose defaults are those of the method that is named."""
+    named = [word for before, word in pairwise(arguments) if before == "--method"]
+    named += [a.removeprefix("--method=") for a in arguments if a.startswith("--method=")]
+    if not named or named[-1] not in PRESETS:
+        return Options, arguments
+    learned = ("deform", SurgicalConfig, field(default=PRESETS[named[-1]]))
+    return make_dataclass("Options", [learned], bases=(Options,), frozen=True), arguments
+
+
+def run(options: Options) -> int:
+    """Reconstruct a deforming scene and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
+    """
+    _check(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        expect_dataset(options.dataset)
+        data = _data(options, notes, console)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset))
+        if options.resume:
+            folder.check_config(settings, but=_OF_NO_BEARING)
+        config = options.deform
+        with stage(console, "placing the first Gaussians"):
+            problem, state = begin_surgical(data.looks, config, data.codebook)
+        learning = Learning(state, {})
+        if options.resume:
+            learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
+            notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
+        folder.write_config(settings)  # from here on an earlier run is gone
+        course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
+        learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
+        complete = learning.stopped is None
+        write_scene(folder, problem, learning.state, data)
+        with stage(console, "looking at held-out frames"):
+            judged = judge(folder, problem, learning.state, data, options.tools)
+        if learning.skipped:
+            notes.warn(f"{learning.skipped} steps met numbers that are not finite and changed nothing")
+        if not data.test:
+            notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
+        found = {
+            "kind": "deform",
+            "dataset": data.sequence.name,
+            "method": options.method,
+            "complete": complete,
+            "report": True,
+            "stopped": None if complete else reason(learning.stopped),
+            "steps": learning.state.step,
+            "skipped": learning.skipped,
+            "num_gaussians": learning.state.scene.gaussians.num,
+            "frames": {"learned": len(data.train), "held_out": len(data.test)},
+            "size": (data.sequence.width, data.sequence.height),
+            "names": list(data.names.values()),
+            "seconds": {
+                "steps": learning.seconds,
+                "compile": learning.compile_seconds,
+                "total": perf_counter() - begun,
+            },
+            "machine": describe_machine(),
+            **judged,
+            "curve": learning.rows,
+            "notes": notes.all,
+        }
+        folder.write_metrics(found)
+        write_results(folder, found)
+        if complete:
+            folder.forget_resume()
+    print_results(folder, found)
+    if isinstance(learning.stopped, KeyboardInterrupt):
+        return 130
+    if learning.stopped is not None:
+        raise learning.stopped
+    return 0
+
+
+def _data(options: Options, notes: Notes, console: Console) -> DeformData:
+    """The recording, the camera that is learned from first."""
+    whole = open_recording(options.dataset, (), (), options.frames, options.read, options.scale).judged
+    first = options.cameras[0] if options.cameras else whole.camera_ids[0]
+    if first not in whole.camera_ids:
+        raise ValueError(f"--cameras: {whole.name} has no camera {first}; it has {list(whole.camera_ids)}")
+    sequence = whole.select(cameras=[first, *(c for c in whole.camera_ids if c != first)])
+    if not sequence.has_depth:
+        raise ValueError(
+            f"{sequence.name}: expected frames with depth, found none; gsjax deform begins with it. Give "
+            "depth from stereo or a network beside the frames, as EndoNeRF has it (docs/data.md)"
+        )
+    told = (options.test_every, options.tools, options.features, options.deform.channels)
+    return deform_data(sequence, *told, notes, console)
+
+
+def _check(options: Options) -> None:
+    if len(options.cameras) > 1:
+        raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
+    if options.test_every < 0 or options.test_every == 1:
+        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    """The means of a row in words."""
+    return "–" if row["psnr"] is None else f"{row['psnr']:.1f} dB"

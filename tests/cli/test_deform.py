@@ -1,0 +1,113 @@
+"""`gsjax deform` from the command line: what it writes, resuming, and what is odd."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from gsjax.cli import learning, main
+from gsjax.io.checkpoints import load_metadata
+from gsjax.io.ply import read_ply
+
+SCENE = "simulated:tissue?width=64&height=52&frames=10"
+SMALL = ("--deform.warmup", 6, "--deform.iterations", 24, "--deform.start-pixels", 1.5, "--deform.nodes", 48)
+SMALL += ("--deform.deformation.resolution", 8, "--deform.deformation.levels", 1, "--deform.channels", 4)
+SMALL += ("--deform.graph.nodes", 16, "--deform.graph.neighbors", 2, "--deform.graph.window", 1)
+
+
+def metrics(run):
+    return json.loads((run / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def deformed(tmp_path_factory):
+    run = tmp_path_factory.mktemp("deformed") / "run"
+    told = ("deform", SCENE, "--out", run, "--tools", "draw", *SMALL)
+    assert main([str(one) for one in told]) == 0
+    return run
+
+
+def test_what_a_run_writes(deformed):
+    found = metrics(deformed)
+    assert (found["kind"], found["complete"], found["steps"], found["skipped"]) == ("deform", True, 30, 0)
+    assert found["frames"] == {"learned": 8, "held_out": 2}  # frames 1 and 9
+    assert found["names"] == ["tissue", "tool"]
+    assert found["test"]["psnr_masked"] > 15
+    assert found["test"]["fps"] > 0
+    assert found["tracks"]["points"] > 50
+    for frame in (1, 9):
+        picture = cv2.imread(str(deformed / "test" / f"{frame:06d}.png"))
+        assert picture.shape == (52, 64, 3)
+        assert picture.std() > 5
+    assert "frames a second" in (deformed / "report.html").read_text()
+    assert read_ply(deformed / "scene.ply")[0].num == found["num_gaussians"]
+    told = load_metadata(deformed / "deformation.npz")
+    assert told["names"] == {"0": "tissue", "1": "tool"}
+    assert not (deformed / "resume").exists()
+    assert [row["step"] for row in found["curve"]] == [10, 20, 30]
+    assert found["curve"][-1]["structure"] is not None  # the graph counts in the end
+
+
+def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
+    told, heard = ("deform", SCENE, "--out", tmp_path / "run", "--tools", "draw", *SMALL), []
+
+    def hear():  # after each step
+        heard.append(1)
+        if len(heard) == 25:  # after the graph was made
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learning, "hear", hear)
+        code, said = gsjax(*told)
+    assert code == 130, said
+    assert metrics(tmp_path / "run")["complete"] is False
+    code, said = gsjax(*told, "--resume")
+    assert code == 0, said
+    ours, theirs = np.load(tmp_path / "run" / "deformation.npz"), np.load(deformed / "deformation.npz")
+    for name in theirs.files:
+        if not name.startswith("__"):
+            np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+
+
+def test_a_recipe_by_its_name(gsjax, tmp_path):
+    """GaussianClin's turns are differences of quaternions; with tools left out there is one class."""
+    run = tmp_path / "run"
+    code, said = gsjax("deform", SCENE, "--method", "clin", "--out", run, "--scale", 0.5, *SMALL)
+    assert code == 0, said
+    assert load_metadata(run / "deformation.npz")["config"]["deformation"]["rotation"] == "add"
+    assert metrics(run)["names"] == []
+    assert metrics(run)["size"] == [32, 26]
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (("--cameras", 7), "--cameras: tissue_seed0 has no camera 7; it has [0, 1]"),
+        (("--cameras", 0, 1), "--cameras: expected one to learn from, found [0, 1]"),
+        (("--test-every", 1), "--test-every: expected 0 (none) or 2 and more, found 1"),
+        (("--features", "classes"), "expected two classes or more among pixels that count, found 1"),
+        (("--tools", "draw", "--deform.channels", 1), "--deform.channels 1: expected at least 2"),
+        (("--scale", 2), "--scale: expected above 0 and at most 1"),
+    ],
+)
+def test_what_is_asked_is_checked(gsjax, tmp_path, told, words):
+    code, said = gsjax("deform", SCENE, "--out", tmp_path / "run", *told)
+    assert code == 2
+    assert words in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_recording_without_depth(gsjax, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for i in range(4):
+        picture = np.random.default_rng(i).integers(0, 255, (48, 64, 3), np.uint8)
+        cv2.imwrite(str(frames / f"{i:03d}.png"), picture)
+    writer = cv2.VideoWriter(str(tmp_path / "clip.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
+    for i in range(4):
+        writer.write(cv2.imread(str(frames / f"{i:03d}.png")))
+    writer.release()
+    code, said = gsjax("deform", tmp_path / "clip.mp4", "--out", tmp_path / "run")
+    assert code == 2
+    assert "expected frames with depth, found none" in said
