@@ -88,7 +88,7 @@ def deform_data(
                 f"{len(counted)}; --tools draw counts tools too"
             )
         learns = False
-    called = {NOTHING_ELSE: "tissue"} | dict(sequence.label_names)
+    called = {NOTHING_ELSE: "tissue"} | sequence.names_of_labels
     names = {value: called.get(value, f"object {value}") for value in counted}
     codebook = basis = None
     rows: dict[int, int] = {}

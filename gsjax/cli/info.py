@@ -197,9 +197,7 @@ def mask_table(masks: dict[int, np.ndarray], sequence: Sequence) -> Table | None
     labels = sorted({int(value) for mask in masks.values() for value in np.unique(mask)} - {0})
     if not labels or len(labels) > MOST_LABELS:
         return None
-    truth = sequence.truth
-    names = {} if truth is None else dict(zip(truth.label_ids.tolist(), truth.names, strict=True))
-    names |= {} if truth is None or truth.robot is None else {truth.robot: "robot"}
+    names = sequence.names_of_labels
     table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), title_justify="left", title_style="bold")
     table.add_column("first masks")
     for label in labels:

@@ -209,16 +209,6 @@ class Photographs:
             raise DataError(self.where(kind, i), expected, found, "Correct the file or its loader.")
 
 
-def _names_of_labels(sequence: Sequence) -> dict[int, str]:
-    """The name of each mask value of a recording that has one."""
-    names = dict(sequence.label_names) | {m.label: m.name for m in sequence.models if m.label}
-    truth = sequence.truth
-    if truth is not None:
-        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
-        names |= {} if truth.robot is None else {truth.robot: "robot"}
-    return names
-
-
 def photographs_of(sequence: Sequence) -> Photographs:
     """All frames of all cameras of a recording as photographs, frame by frame."""
     frames, cameras = sequence.num_frames, sequence.num_cameras
@@ -233,7 +223,7 @@ def photographs_of(sequence: Sequence) -> Photographs:
         load_image=lambda i: sequence.image(*places[i]),
         load_depth=(lambda i: sequence.depth(*places[i])) if sequence.has_depth else None,
         load_labels=(lambda i: sequence.mask(*places[i])) if sequence.has_masks else None,
-        label_names=_names_of_labels(sequence),
+        label_names=sequence.names_of_labels,
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
         near=sequence.near,
         locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *places[i]),

@@ -201,6 +201,16 @@ class Sequence:
         """Whether optical flow is known."""
         return self.load_flow is not None
 
+    @property
+    def names_of_labels(self) -> dict[int, str]:
+        """The name of each mask value that has one: the data's own, a model's, the truth's."""
+        names = dict(self.label_names) | {m.label: m.name for m in self.models if m.label}
+        if self.truth is not None:
+            labels = (int(label) for label in self.truth.label_ids)
+            names |= dict(zip(labels, self.truth.names, strict=True))
+            names |= {} if self.truth.robot is None else {self.truth.robot: "robot"}
+        return names
+
     def camera(self, t: int, c: int) -> Camera:
         """Camera `c` as it stood in frame `t`, in JAX's default float type."""
         dtype = jnp.result_type(float)
