@@ -36,7 +36,7 @@ CODES = np.eye(2, 4)
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
 CONFIG = SurgicalConfig(
     warmup=8,
-    iterations=100,
+    iterations=70,
     start_pixels=1.0,
     nodes=64,
     channels=4,
@@ -154,11 +154,11 @@ class TestLearning:
         problem, whole, *_ = learned
         _, state = begin_surgical(looks, CONFIG, CODES)
         for found in reconstruct(problem, state):
-            if found.state.step == 70:  # after the graphs were made
+            if found.state.step == 50:  # after the graphs were made
                 save_checkpoint(tmp_path / "state.npz", jax.device_get(found.state))
                 break
         _, first = begin_surgical(looks, CONFIG, CODES)
-        state, _ = load_checkpoint(tmp_path / "state.npz", of_step(problem, first, 70))
+        state, _ = load_checkpoint(tmp_path / "state.npz", of_step(problem, first, 50))
         for found in reconstruct(problem, state):
             state = found.state
         for one, other in zip(jax.tree.leaves(whole.scene), jax.tree.leaves(state.scene), strict=True):
@@ -172,7 +172,7 @@ class TestLearning:
             depth=depth, moving=state.moving, graph=state.graphs[0], plan=problem.plan_for(state)
         )
         key = jax.random.key(0)
-        after, _, info = compiled_step(CONFIG, problem.radius)(scene, optimizer, batch, jnp.asarray(100), key)
+        after, _, info = compiled_step(CONFIG, problem.radius)(scene, optimizer, batch, jnp.asarray(70), key)
         assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
         assert jnp.isfinite(info["loss"])
 
@@ -180,10 +180,10 @@ class TestLearning:
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_learn(name, looks):
     config = replace(
-        PRESETS[name], warmup=2, iterations=4, start_pixels=2.0, nodes=0, channels=4, warmup_frames="all"
+        PRESETS[name], warmup=0, iterations=6, start_pixels=2.0, nodes=0, channels=4, warmup_frames="all"
     )
     config = replace(config, deformation=replace(config.deformation, resolution=8, levels=1, channels=2))
-    config = replace(config, graph=replace(config.graph, nodes=12, neighbors=2, matches=2, window=1))
+    config = replace(config, graph=replace(config.graph, after=0, nodes=12, neighbors=2, matches=2, window=1))
     problem, state = begin_surgical(looks, config, CODES)
     infos = [jax.device_get(found.info) for found in reconstruct(problem, state)]
     assert not any(info["skipped"] for info in infos)
