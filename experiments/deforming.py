@@ -122,7 +122,11 @@ def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> fl
 
 
 def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
-    """Of held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and of the right eye."""
+    """Of held-out frames, under the masks: PSNR, SSIM, depth, PSNR around the tool, and of the right eye.
+
+    Means over frames; `psnr_pooled` is that of the mean squared error of all their pixels, in which the worst
+    frame counts most.
+    """
     rows = []
     for t in data.test:
         look = data.look(t)
@@ -131,6 +135,7 @@ def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
         known = look.counts & (look.depth > 0)
         row = {
             "psnr": psnr(colors, true, look.counts),
+            "mse": _mse(colors, true, look.counts),
             "ssim": ssim(colors, true, look.counts),
             "depth_mm": 1e3 * float(np.abs(depths - look.depth)[known].mean()),
             "psnr_near_tool": psnr(colors, true, look.counts & near_tool(look)),
@@ -139,7 +144,12 @@ def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
             right = data.look(t, camera=1)
             row["psnr_right"] = psnr(drawn(found, right)[0], right.image / 255.0, right.counts)
         rows.append(row)
-    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+    means = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+    return means | {"psnr_pooled": -10 * np.log10(means.pop("mse"))}
+
+
+def _mse(image: np.ndarray, true: np.ndarray, counts: np.ndarray) -> float:
+    return float(np.square(image - true)[counts].mean())
 
 
 def near_tool(look: Look) -> Bool[np.ndarray, "h w"]:
@@ -150,20 +160,22 @@ def near_tool(look: Look) -> Bool[np.ndarray, "h w"]:
 
 
 def copies(data: Dataset) -> dict[str, float]:
-    """PSNR of held-out frames as copies of others, under the same masks."""
+    """PSNR of held-out frames as copies of others, under the same masks: means, and pooled as in `scores`."""
     s = data.sequence
 
-    def of(guess):
-        return float(np.mean([psnr(guess(t), s.image(t, 0) / 255.0, data.look(t).counts) for t in data.test]))
+    def of(name, guess):
+        each = [_mse(guess(t), s.image(t, 0) / 255.0, data.look(t).counts) for t in data.test]
+        mean, pooled = float(np.mean(-10 * np.log10(each))), float(-10 * np.log10(np.mean(each)))
+        return {f"psnr_{name}": mean, f"pooled_{name}": pooled}
 
     def image(t):
         return s.image(min(max(t, 0), s.num_frames - 1), 0) / 255.0
 
-    return {
-        "psnr_previous": of(lambda t: image(t - 1)),
-        "psnr_neighbors": of(lambda t: (image(t - 1) + image(t + 1)) / 2),
-        "psnr_first": of(lambda t: image(0)),
-    }
+    return (
+        of("previous", lambda t: image(t - 1))
+        | of("neighbors", lambda t: (image(t - 1) + image(t + 1)) / 2)
+        | of("first", lambda t: image(0))
+    )
 
 
 def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:

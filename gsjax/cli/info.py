@@ -14,7 +14,7 @@ from gsjax.cli.info_picture import by_camera, by_split, write_picture
 from gsjax.cli.messages import Notes
 from gsjax.cli.run_folder import expect_dataset
 from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence, photographs_of
-from gsjax.data.open import is_of_photographs
+from gsjax.data.open import is_of_photographs, is_recording
 from gsjax.methods.reconstruction import extent_of
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -46,7 +46,7 @@ def run(options: Options) -> int:
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
     expect_dataset(options.dataset)
-    if is_of_photographs(options.dataset):
+    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
         return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):
         sequence = open_sequence(options.dataset, options.read)
@@ -214,4 +214,7 @@ def _truth(sequence: Sequence) -> str:
         return "none"
     named = [f"{name} (label {label})" for name, label in zip(truth.names, truth.label_ids, strict=True)]
     robot = [] if truth.robot is None else [f"robot (label {truth.robot})"]
-    return "poses of " + ", ".join(named) + (f"; {', '.join(robot)}" if robot else "")
+    known = ["poses of " + ", ".join(named)] if named else []
+    known += [", ".join(robot)] if robot else []
+    known += [] if truth.tracks is None else [f"tracks of {truth.tracks.shape[1]:,} points"]
+    return "; ".join(known)

@@ -102,3 +102,11 @@ def test_pictures_of_another_kind_are_refused_before_anything_is_read(capfd):
     assert main(["info", "nowhere", "--picture", "scene.bmp"]) == 2
     said = capfd.readouterr().err
     assert "--picture: expected a name that ends in .png, .svg, .pdf, found 'scene.bmp'" in said
+
+
+def test_a_recording_that_is_also_photographs_is_told_as_what_it_is_over_time(shared_data, capfd):
+    """EndoNeRF's folders have poses_bounds.npy as LLFF's do."""
+    assert main(["info", str(shared_data / "tissue_0")]) == 0
+    out = capfd.readouterr().out
+    assert "60" in out
+    assert "tracks of 784 points" in out
