@@ -19,12 +19,14 @@ from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
 from gsjax.methods.feature_field import FieldConfig, begin_field, distill, teacher_of_objects
 from gsjax.methods.object_tracker import PRESETS, start_scene, track
+from gsjax.methods.surgical import GraphConfig, Look, SurgicalConfig, begin_surgical, reconstruct
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 
 TABLE = "simulated:tabletop?width=240&height=180&frames={}"
+TISSUE = "simulated:tissue?width=160&height=128&frames=6"
 FIT_GAUSSIANS, FIT_SIZE = 10_000, (320, 240)
 RATES = {"means": 1e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh0": 5e-3}
 
@@ -94,6 +96,31 @@ def field(repeats: int) -> StepTimes:
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 
+def deform(repeats: int) -> StepTimes:
+    """One step of a scene that deforms, as it comes: deformation, colours, features, and the graph."""
+    seen = open_sequence(TISSUE).select(cameras=(0,))
+    last = seen.num_frames - 1
+    looks = [
+        Look(
+            seen.image(t, 0),
+            None,
+            seen.depth(t, 0),
+            seen.viewmats[t, 0],
+            seen.Ks[t, 0],
+            t / last,
+            seen.mask(t, 0),
+        )
+        for t in range(seen.num_frames)
+    ]
+    config = SurgicalConfig(warmup=0, iterations=repeats + 1, graph=GraphConfig(after=0.0))
+    problem, state = begin_surgical(looks, config, np.eye(2, config.channels))
+    updates = list(reconstruct(problem, state))
+    if any(bool(update.info["skipped"]) for update in updates):
+        raise RuntimeError("a step of the deforming scene was skipped: a number is not finite")
+    what = f"{state.scene.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
+    return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
+
+
 def _loss(gaussians, target, *, step, key, plan, camera):
     rendered = render(gaussians, camera, plan)
     return photometric_loss(rendered.colors, target), {"overflow": rendered.meta.overflow}
@@ -104,6 +131,7 @@ STEPS: dict[str, Callable[[int], StepTimes]] = {
     "steps-tracker-fast": partial(tracker, preset="fast"),
     "steps-fit": fit,
     "steps-field": field,
+    "steps-deform": deform,
 }
 
 
