@@ -24,6 +24,7 @@ from gsjax.methods.surgical import (
     graph_nodes,
     nodes_of,
     of_step,
+    prompt_probabilities,
     reconstruct,
     start_gaussians,
 )
@@ -259,3 +260,33 @@ class TestGraph:
 def test_a_scene_without_a_field_stands_still(looks):
     scene = DeformingScene(start_gaussians(looks[:1], 0, 2.0))
     assert scene.at(jnp.asarray(0.7)) is scene.gaussians
+
+
+@pytest.mark.usefixtures("x64")
+class TestPrompts:
+    def test_are_a_softmax_of_cosines(self):
+        rng = np.random.default_rng(0)
+        features, prompts = rng.normal(size=(7, 4)), rng.normal(size=(3, 4))
+        cosines = (features @ prompts.T) / np.outer(
+            np.linalg.norm(features, axis=1), np.linalg.norm(prompts, axis=1)
+        )
+        expected = np.exp(cosines / 0.1) / np.exp(cosines / 0.1).sum(axis=1, keepdims=True)
+        found = prompt_probabilities(jnp.asarray(features), jnp.asarray(prompts))
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+        longer = prompt_probabilities(jnp.asarray(1e3 * features), jnp.asarray(1e-3 * prompts))
+        np.testing.assert_allclose(longer, expected, atol=1e-12)
+
+    def test_nothing_is_as_likely_each(self):
+        features = jnp.zeros((2, 4)).at[1, 0].set(1.0)
+        found = prompt_probabilities(features, jnp.asarray(CODES))
+        np.testing.assert_allclose(found[0], 0.5)
+        assert found[1, 0] > 0.99
+        slope = jax.grad(lambda f: prompt_probabilities(f, jnp.asarray(CODES))[:, 0].sum())(features)
+        assert jnp.isfinite(slope).all()
+
+
+def test_a_learned_scene_is_asked_what_it_was_taught(learned):
+    """One class in view of the tools that are left out: what it was taught is what it answers."""
+    _, state, *_ = learned
+    found = prompt_probabilities(state.scene.gaussians.features, jnp.asarray(CODES, jnp.float32))
+    assert (found[:, 0] > 0.9).mean() > 0.8

@@ -6,6 +6,7 @@ nodes       which places the deformation is asked about
 graph       what the teacher says of nodes, and what it asks of their features
 step        deform, draw colours and features, compare, descend
 train       the host loop
+query       which Gaussians a prompt means
 """
 
 from gsjax.methods.surgical.config import (
@@ -16,6 +17,7 @@ from gsjax.methods.surgical.config import (
 )
 from gsjax.methods.surgical.graph import FrameGraph, GraphConfig, frame_graphs, graph_loss, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
+from gsjax.methods.surgical.query import prompt_probabilities
 from gsjax.methods.surgical.start import Look, start_gaussians
 from gsjax.methods.surgical.step import (
     Batch,
@@ -58,6 +60,7 @@ __all__ = [
     "graph_nodes",
     "nodes_of",
     "of_step",
+    "prompt_probabilities",
     "reconstruct",
     "start_gaussians",
     "surgical_loss",
