@@ -12,6 +12,7 @@ from recordings import recorded
 
 import gsjax
 from gsjax.data import Sequence
+from gsjax.data.files import read_arrays
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical import (
     DeformingScene,
@@ -42,11 +43,19 @@ class Dataset:
         sequence: camera 0 is the left eye, camera 1 the right one.
         train: frames to learn from.
         test: frames that are held out.
+        truth: arrays of the simulation.
     """
 
     sequence: Sequence
     train: list[int]
     test: list[int]
+    truth: dict[str, np.ndarray]
+
+    def classes(self, t: int) -> np.ndarray:
+        """What the left eye sees of the simulated scene, by its truth: rows of a codebook of background and
+        tissue, -1 where there is the tool."""
+        seg = self.truth["seg"][t]
+        return np.where(seg < 2, seg, -1).astype(np.int32)
 
     def look(self, t: int, camera: int = 0, ids: np.ndarray | None = None, tools: bool = False) -> Look:
         """What a camera saw in a frame; tools do not count unless wanted."""
@@ -62,7 +71,8 @@ def dataset(name: str = "tissue_0") -> Dataset:
     """A recording by its name."""
     sequence = gsjax.open_sequence(recorded(name))
     test = [i for i in range(sequence.num_frames) if (i - 1) % EVERY == 0]
-    return Dataset(sequence, [i for i in range(sequence.num_frames) if i not in test], test)
+    train = [i for i in range(sequence.num_frames) if i not in test]
+    return Dataset(sequence, train, test, read_arrays(recorded(name) / "truth.npz"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         )
         config = replace(config, start_pixels=BASE.start_pixels)
     codes = np.eye(2, CHANNELS) if semantic else None
-    looks = [data.look(t, ids=data.sequence.mask(t, 0) if semantic else None) for t in data.train]
+    looks = [data.look(t, ids=data.classes(t) if semantic else None) for t in data.train]
     found = learned(looks, config, codes)
     return {
         **scores(found, data),

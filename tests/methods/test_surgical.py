@@ -290,3 +290,14 @@ def test_a_learned_scene_is_asked_what_it_was_taught(learned):
     _, state, *_ = learned
     found = prompt_probabilities(state.scene.gaussians.features, jnp.asarray(CODES, jnp.float32))
     assert (found[:, 0] > 0.9).mean() > 0.8
+
+
+@pytest.mark.parametrize("smaller", [1, 2])
+def test_what_does_not_count_is_not_taught(looks, smaller):
+    """Else what lies behind a tool would learn that it is one."""
+    counts = np.ones_like(looks[0].counts)
+    counts[10:20, 30:44] = False
+    ids = np.ones(counts.shape, np.int32)[::smaller, ::smaller]
+    problem, _ = begin_surgical([looks[0]._replace(counts=counts, ids=ids)], CONFIG, CODES)
+    np.testing.assert_array_equal(problem.batches[0].ids == 1, counts[::smaller, ::smaller])
+    np.testing.assert_array_equal(problem.batches[0].ids == -1, ~counts[::smaller, ::smaller])

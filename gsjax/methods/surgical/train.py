@@ -224,13 +224,23 @@ def _turn(problem: SurgicalProblem, step: int) -> int:
     return int(np.random.default_rng((problem.config.seed, epoch)).permutation(count)[place])
 
 
+def counted_ids(look: Look) -> Int[np.ndarray, "h w"]:
+    """What the teacher says of pixels that count: what is behind a tool is not to learn that it is one."""
+    assert look.ids is not None
+    if look.counts is None:
+        return look.ids
+    (high, wide), (height, width) = look.ids.shape, look.counts.shape
+    rows, columns = (np.arange(n) * m // n for n, m in ((high, height), (wide, width)))
+    return np.where(look.counts[np.ix_(rows, columns)], look.ids, -1)
+
+
 def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
     """A look on the device."""
     dtype = jnp.result_type(float)
     height, width = look.image.shape[:2]
     viewmat, K = (jnp.asarray(a, dtype)[None] for a in (look.viewmat, look.K))
     counts = np.ones((height, width), bool) if look.counts is None else look.counts
-    ids: Int[np.ndarray, "h w"] | None = look.ids
+    ids = None if look.ids is None else counted_ids(look)
     taught = codebook is not None and ids is not None
     return Batch(
         jnp.asarray(look.image)[None],
