@@ -54,8 +54,8 @@ class Dataset:
     def classes(self, t: int) -> np.ndarray:
         """What the left eye sees of the simulated scene, by its truth: rows of a codebook of background and
         tissue, -1 where there is the tool."""
-        seg = self.truth["seg"][t]
-        return np.where(seg < 2, seg, -1).astype(np.int32)
+        seg = self.truth["seg"][t].astype(np.int32)
+        return np.where(seg < 2, seg, -1)
 
     def look(self, t: int, camera: int = 0, ids: np.ndarray | None = None, tools: bool = False) -> Look:
         """What a camera saw in a frame; tools do not count unless wanted."""
