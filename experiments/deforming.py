@@ -11,13 +11,12 @@ from jaxtyping import Bool, Float, Int
 from recordings import recorded
 
 import gsjax
+from gsjax.cli.deform_data import unit_times
+from gsjax.cli.deform_results import draw
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
-from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical import (
-    DeformingScene,
     Look,
-    Moving,
     SurgicalConfig,
     SurgicalProblem,
     SurgicalState,
@@ -26,8 +25,6 @@ from gsjax.methods.surgical import (
 )
 from gsjax.metrics.image import psnr, ssim
 from gsjax.metrics.tracking import carried_points
-from gsjax.rasterize.plan import Plan
-from gsjax.scene.render import render
 
 EVERY = 8  # frame i is held out if (i - 1) mod 8 is 0, as for EndoNeRF
 TOOL = 1
@@ -61,7 +58,7 @@ class Dataset:
         """What a camera saw in a frame; tools do not count unless wanted."""
         s = self.sequence
         counts = None if tools else s.mask(t, camera) != TOOL
-        time = t / (s.num_frames - 1)
+        time = float(unit_times(s)[t])
         return Look(
             s.image(t, camera), counts, s.depth(t, camera), s.viewmats[t, camera], s.Ks[t, camera], time, ids
         )
@@ -97,36 +94,17 @@ def learned(looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | No
     return Reconstructed(problem, state, seconds, compiling)
 
 
-def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Colours, depth and features as a look would see the scene."""
-    plan = found.problem.plan_for(found.state)
-    colors, depths, features = _draw(
-        found.state.scene, found.state.moving, jnp.asarray(look.time), _camera(look), plan
-    )
-    return tuple(None if a is None else np.asarray(a) for a in (colors, depths, features))
-
-
-@jax.jit
-def _draw(scene: DeformingScene, moving: Moving, time, camera: Camera, plan: Plan):
-    got = render(scene.at(time, moving), camera, plan)
-    features = None if got.features is None else got.features[0]
-    return jnp.clip(got.colors[0], 0, 1), got.depths[0], features
-
-
-def _camera(look: Look) -> Camera:
-    height, width = look.image.shape[:2]
-    viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (look.viewmat, look.K))
-    return Camera(viewmat, K, width, height, look.near)
+def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and depth as a look would see the scene."""
+    return draw(found.state.scene, found.state.moving, look, found.problem.plan_for(found.state))
 
 
 def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> float:
-    """How often a second the scene is deformed and drawn, over other times; the median."""
-    camera, took, state = _camera(look), [], found.state
-    plan = found.problem.plan_for(state)
+    """How often a second the scene is deformed, drawn and brought to the host, over times; the median."""
+    took = []
     for i in range(repeats + 2):
-        time = jnp.asarray(i / (repeats + 2))
         begun = perf_counter()
-        jax.block_until_ready(_draw(state.scene, state.moving, time, camera, plan))
+        drawn(found, look._replace(time=i / (repeats + 2)))
         took.append(perf_counter() - begun)
     return 1 / float(np.median(took[2:]))
 
@@ -140,7 +118,7 @@ def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
     rows = []
     for t in data.test:
         look = data.look(t)
-        colors, depths, _ = drawn(found, look)
+        colors, depths = drawn(found, look)
         true = look.image / 255.0
         known = look.counts & (look.depth > 0)
         row = {
@@ -196,7 +174,8 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     start = tracks[0][seen]
     at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
     scene, moving = found.state.scene, found.state.moving
-    means = [np.asarray(at(scene, moving, jnp.asarray(t / (frames - 1)))) for t in range(frames)]
+    times = jnp.asarray(unit_times(data.sequence), jnp.float32)
+    means = [np.asarray(at(scene, moving, time)) for time in times]
     carried = carried_points(start, np.stack(means))
     errors, still, close = [], [], []
     for t in range(1, frames):

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
-from gsjax.methods.surgical import PRESETS, GraphConfig, SurgicalConfig
+from gsjax.methods.surgical import GraphConfig, SurgicalConfig
 
 BASE = SurgicalConfig(warmup=200, iterations=800, start_pixels=1.8)
 CHANNELS = BASE.channels
@@ -24,13 +24,6 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         config = replace(config, warmup=config.warmup + config.iterations, iterations=0, warmup_frames="all")
     elif variant == "no graph":
         config = replace(config, graph=GraphConfig(kind="none"))
-    elif variant == "a field asked about each Gaussian":
-        config = replace(config, nodes=0)
-    elif variant in PRESETS:
-        config = replace(
-            PRESETS[variant], **{k: getattr(config, k) for k in ("warmup", "iterations", "seed")}
-        )
-        config = replace(config, start_pixels=BASE.start_pixels)
     codes = np.eye(2, CHANNELS) if semantic else None
     looks = [data.look(t, ids=data.classes(t) if semantic else None) for t in data.train]
     found = learned(looks, config, codes)

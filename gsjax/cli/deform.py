@@ -1,4 +1,4 @@
-"""`gsjax deform`: a scene that deforms, seen by one moving camera, with its meaning."""
+"""`gsjax deform`: a scene that deforms, seen by one moving camera, with --tools draw what is what in it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
@@ -41,7 +41,7 @@ class Options:
     frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
     """Which frames, as Python slices them."""
     cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID")] = ()
-    """Id of the one camera to learn from. The first, unless given; the others only judge."""
+    """Id of the one camera to learn from. The first, unless given; the next one only judges."""
     scale: float = 1.0
     """Learn from pictures at this fraction of their size (width and height); time goes with the number of
     pixels."""
@@ -92,7 +92,7 @@ def run(options: Options) -> int:
         config = options.deform
         with stage(console, "placing the first Gaussians"):
             problem, state = begin_surgical(data.looks, config, data.codebook)
-        learning = Learning(state, {})
+        learning = Learning(state, {"frames, depth, masks and poses": data.digest()})
         if options.resume:
             learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
@@ -105,6 +105,8 @@ def run(options: Options) -> int:
             judged = judge(folder, problem, learning.state, data, options.tools)
         if learning.skipped:
             notes.warn(f"{learning.skipped} steps met numbers that are not finite and changed nothing")
+        if not data.names:
+            notes.add("One class among the pixels that count: colours are learned, and no meaning or graph.")
         if not data.test:
             notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
         found = {

@@ -1,5 +1,6 @@
 """What `gsjax deform` learns from: frames of one camera, what counts in them, and what masks call things."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,6 +41,20 @@ class DeformData:
     codebook: Float[np.ndarray, "k channels"] | None
     basis: Float[np.ndarray, "channels d"] | None
 
+    @property
+    def times(self) -> Float[np.ndarray, "t"]:
+        """Of all frames, 0 to 1."""
+        return unit_times(self.sequence)
+
+    def digest(self) -> str:
+        """Of all that is learned from, in hexadecimal."""
+        found = hashlib.sha256()
+        for look in self.looks:
+            for value in look:
+                if value is not None:
+                    found.update(np.ascontiguousarray(value).tobytes())
+        return found.hexdigest()
+
     def look(self, t: int, camera: int, tools: Tools) -> Look:
         """What a camera saw at a frame, without a teacher."""
         return _look(self.sequence, t, camera, tools, None)
@@ -66,7 +81,7 @@ def deform_data(
         console: that shows how it goes on.
 
     Raises:
-        ValueError: there are too few frames, or too many classes, or nothing to learn from.
+        ValueError: there are too many classes, or too few that classes are asked for.
         DataError: a file is bad.
     """
     count = sequence.num_frames
@@ -100,6 +115,12 @@ def deform_data(
     return DeformData(sequence, train, test, looks, names if learns else {}, codebook, basis)
 
 
+def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
+    """Times of frames, 0 to 1 over the recording."""
+    since = sequence.times - sequence.times[0]
+    return since / max(since[-1], 1e-12)
+
+
 def _look(sequence: Sequence, t: int, camera: int, tools: Tools, ids: np.ndarray | None) -> Look:
     mask = sequence.mask(t, camera) if tools == "leave-out" and sequence.has_masks else None
     return Look(
@@ -108,7 +129,7 @@ def _look(sequence: Sequence, t: int, camera: int, tools: Tools, ids: np.ndarray
         sequence.depth(t, camera),
         sequence.viewmats[t, camera],
         sequence.Ks[t, camera],
-        t / max(1, sequence.num_frames - 1),
+        float(unit_times(sequence)[t]),
         ids,
         sequence.near,
     )

@@ -177,7 +177,8 @@ def _add_row(learning: Learning, course: Course, folder: RunFolder) -> None:
     }
     for name in ("loss", *course.losses):
         values = [float(info[name]) for info in sound if name in info]
-        row[name] = float(np.mean(values)) if values else None
+        mean = float(np.mean(values)) if values else np.nan
+        row[name] = mean if np.isfinite(mean) else None  # JSON has no infinity
     learning.rows.append(row)
     with atomic_write(folder.metrics_lines) as temporary:
         temporary.write_text("".join(json.dumps(one) + "\n" for one in learning.rows), encoding="utf-8")

@@ -79,7 +79,7 @@ def per_field_adam(
         rates: by the names of fields.
         default: rate of fields that are not named.
         others: what is done with fields that Adam does not change.
-        decay: what AdamW takes of each number a step, times the rate.
+        decay: what AdamW takes of each number of these fields a step, times the rate.
 
     Raises:
         ValueError: from the optimizer's init, where a rate is for a field that the module lacks.

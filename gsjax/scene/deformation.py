@@ -214,14 +214,12 @@ class Nodes(NamedTuple):
     does so more smoothly than Gaussians lie (Sumner et al. 2007; SC-GS, Huang et al. 2024).
 
     Attributes:
-        means: metres.
-        features: at these places, where the field is shown some; else None.
+        rows: which Gaussians are nodes.
         indices: which nodes each Gaussian blends.
         weights: how much of each, 1 in sum.
     """
 
-    means: Float[Array, "M 3"]
-    features: Float[Array, "M D"] | None
+    rows: Int[Array, "M"]
     indices: Int[Array, "N k"]
     weights: Float[Array, "N k"]
 
@@ -237,7 +235,8 @@ def deform_by_nodes(
         time: 0 to 1.
         nodes: of these Gaussians.
     """
-    offsets = field(nodes.means, time, nodes.features)
+    features = None if gaussians.features is None else gaussians.features[nodes.rows]
+    offsets = field(gaussians.means[nodes.rows], time, features)
 
     def blended(values):
         flat = values.reshape(len(values), -1)

@@ -169,4 +169,6 @@ def init_voxels(key: PRNGKeyArray, resolution: int, channels: int, frequencies: 
         features=channels,
         depth=0,
     )
-    return Voxels(init_feature_grid(key, config, outputs, _UNIT_BOX), frequencies)
+    grid = init_feature_grid(key, config, outputs, _UNIT_BOX)
+    still = jax.tree.map(jnp.zeros_like, grid.layers[-1])  # meanings are as they were, at first
+    return Voxels(eqx.tree_at(lambda g: g.layers[-1], grid, still), frequencies)

@@ -1,6 +1,7 @@
 """A deforming scene: where it starts, that it learns, and that it goes on to the same bits."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +104,21 @@ class TestStart:
             begin_surgical([looks[0], looks[1]._replace(image=looks[1].image[:-2])], CONFIG)
         with pytest.raises(ValueError, match="codebook: expected rows of 4 numbers, found 3"):
             begin_surgical(looks, CONFIG, np.eye(2, 3))
+        with pytest.raises(ValueError, match="expected ids of 1 rows of the codebook, or -1, found 1 in"):
+            begin_surgical(looks, CONFIG, CODES[:1])
+        with pytest.raises(ValueError, match="found none in 1"):
+            begin_surgical([looks[0], looks[1]._replace(ids=None)], CONFIG, CODES)
+        with pytest.raises(ValueError, match="looks: expected depth of"):
+            begin_surgical([looks[0], looks[1]._replace(depth=looks[1].depth[:-2])], CONFIG)
+        lone = np.zeros_like(looks[0].depth)
+        lone[20, 20] = 0.1
+        with pytest.raises(ValueError, match="depth: expected a scene of some extent"):
+            begin_surgical([looks[0]._replace(depth=lone)], CONFIG)
+
+    def test_a_first_frame_that_is_all_tool_is_not_begun_with(self, looks):
+        hidden = looks[0]._replace(counts=np.zeros_like(looks[0].counts))
+        problem, _ = begin_surgical([hidden, *looks[1:]], CONFIG)
+        assert problem.first == 1
 
 
 def test_nodes_blend_to_one_and_follow_what_is_near(looks):
@@ -111,10 +127,10 @@ def test_nodes_blend_to_one_and_follow_what_is_near(looks):
     np.testing.assert_allclose(nodes.weights.sum(axis=1), 1.0, atol=1e-5)
     assert (nodes.weights > 0).all()
     # A map that is linear in the place is blended to nearly itself.
-    blended_places = (nodes.means[nodes.indices] * nodes.weights[..., None]).sum(axis=1)
+    blended_places = (gaussians.means[nodes.rows][nodes.indices] * nodes.weights[..., None]).sum(axis=1)
     spread = np.asarray(gaussians.means).std()
     assert np.abs(blended_places - gaussians.means).max() < 0.5 * spread
-    assert nodes_of(gaussians, 10 * gaussians.num).means.shape[0] == gaussians.num
+    assert len(nodes_of(gaussians, 10 * gaussians.num).rows) == gaussians.num
 
 
 @pytest.fixture(scope="module")
@@ -165,17 +181,48 @@ class TestLearning:
         for one, other in zip(jax.tree.leaves(whole.scene), jax.tree.leaves(state.scene), strict=True):
             np.testing.assert_array_equal(one, other)
 
-    def test_a_picture_without_numbers_changes_nothing(self, learned):
+    def test_depth_that_is_no_number_is_unknown(self, looks):
+        depth = looks[0].depth.copy()
+        depth[10, 10], depth[11, 11] = np.nan, np.inf
+        told = replace(CONFIG, warmup=1, iterations=0)
+        problem, state = begin_surgical([looks[0]._replace(depth=depth)], told)
+        info = jax.device_get(next(reconstruct(problem, state)).info)
+        assert np.isfinite(info["loss"])
+        assert not info["skipped"]
+
+    def test_a_teacher_without_numbers_changes_nothing(self, learned):
         problem, state, *_ = learned
         scene, optimizer = jax.tree.map(jnp.copy, (state.scene, state.optimizer))
-        depth = problem.batches[0].depth.at[0, 10, 10].set(jnp.nan)
+        before = jax.device_get(scene)
         batch = problem.batches[0]._replace(
-            depth=depth, moving=state.moving, graph=state.graphs[0], plan=problem.plan_for(state)
+            codebook=problem.batches[0].codebook.at[0, 0].set(jnp.nan),
+            moving=state.moving,
+            graph=state.graphs[0],
+            plan=problem.plan_for(state),
         )
-        key = jax.random.key(0)
-        after, _, info = compiled_step(CONFIG, problem.radius)(scene, optimizer, batch, jnp.asarray(70), key)
-        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
-        assert jnp.isfinite(info["loss"])
+        advance = compiled_step(CONFIG, problem.radius)
+        after, _, info = advance(scene, optimizer, batch, jnp.asarray(70), jax.random.key(0))
+        assert info["skipped"]
+        for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_rates_fall_over_both_parts_of_the_learning(self, looks):
+        """The optimizer begins anew with the deformation, and its rates do not."""
+        told = replace(CONFIG, warmup=3, iterations=3, schedule="cosine", warmup_frames="all")
+        problem, state = begin_surgical(looks, told)
+        means = [np.array(state.scene.gaussians.means)]
+        for found in reconstruct(problem, state):
+            means.append(np.array(found.state.scene.gaussians.means))
+        steps = [np.abs(b - a).max() for a, b in pairwise(means)]
+        # Adam's first step is as long as the rate: of the third step after the warm-up, half of the first.
+        fall = 0.5 * (1 + np.cos(np.pi * 3 / 6))
+        np.testing.assert_allclose(steps[3] / steps[0], fall, rtol=0.02)
+
+    def test_what_was_given_is_kept(self, looks):
+        given = start_gaussians(looks[:1], 0, 2.0)
+        problem, state = begin_surgical(looks, replace(CONFIG, warmup=1, iterations=0), gaussians=given)
+        next(reconstruct(problem, state))
+        assert not given.means.is_deleted()
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))

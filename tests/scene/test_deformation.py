@@ -85,10 +85,11 @@ class TestField:
         return DeformationConfig(kind=kind, **SMALL | options)
 
     def test_at_first_nothing_moves(self, kind):
-        gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene())
-        found = deform_rows(
-            gaussians, init_deformation(jax.random.key(0), self.config(kind), BOX), jnp.asarray(TIME)
-        )
+        gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene(features=2))
+        config = self.config(kind, semantic=True, color=True, opacity=True, feature=True)
+        found = deform_rows(gaussians, init_deformation(jax.random.key(0), config, BOX, 2), jnp.asarray(TIME))
+        for name in ("logit_opacities", "sh0", "features"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(gaussians, name))
         np.testing.assert_array_equal(found.means, gaussians.means)
         np.testing.assert_array_equal(found.log_scales, gaussians.log_scales)
         np.testing.assert_allclose(
@@ -134,7 +135,7 @@ class TestField:
         gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene(features=2))
         config = self.config(kind, color=True, opacity=True, feature=True)
         field = moving(init_deformation(jax.random.key(0), config, BOX, 2))
-        each = Nodes(gaussians.means, gaussians.features, jnp.arange(6)[:, None], jnp.ones((6, 1)))
+        each = Nodes(jnp.arange(6), jnp.arange(6)[:, None], jnp.ones((6, 1)))
         whole, by_nodes = (
             deform_rows(gaussians, field, jnp.asarray(TIME)),
             deform_by_nodes(gaussians, field, jnp.asarray(TIME), each),

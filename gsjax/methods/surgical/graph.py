@@ -30,7 +30,7 @@ from gsjax.losses.graph import (
 from gsjax.methods.settings import expect
 from gsjax.methods.surgical.start import Look, known_depth
 
-_NEAR_M = 0.05  # of the depth: by how much what is seen may lie before or behind a node
+_NEAR = 0.05  # share of the depth by which what is seen may lie before or behind a node
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def _said(
     inside = np.isfinite(ahead) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     column, row = (np.where(inside, a, 0).astype(int) for a in (x, y))
     depth = known_depth(look)[row, column]
-    unhidden = (depth == 0) | (np.abs(depth - local[:, 2]) < _NEAR_M * depth)
+    unhidden = (depth == 0) | (np.abs(depth - local[:, 2]) < _NEAR * depth)
     counted = np.ones(len(x), bool) if look.counts is None else look.counts[row, column]
     assert look.ids is not None
     high, wide = look.ids.shape

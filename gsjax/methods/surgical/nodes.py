@@ -31,10 +31,8 @@ def nodes_of(gaussians: Gaussians, count: int) -> Nodes:
     weights = np.exp(-np.square(distances / width))
     weights = np.maximum(weights - np.where(nearest > 1, weights[:, -1:], 0.0), 1e-6)
     weights /= weights.sum(axis=1, keepdims=True)
-    features = None if gaussians.features is None else gaussians.features[chosen]
     return Nodes(
-        gaussians.means[chosen],
-        features,
+        jnp.asarray(chosen, jnp.int32),
         jnp.asarray(indices, jnp.int32),
         jnp.asarray(weights, gaussians.means.dtype),
     )

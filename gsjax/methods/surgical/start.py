@@ -42,8 +42,8 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
     """Gaussians on what the first look shows, and, from the other looks, on what it does not: there lay a
     tool, or it lay outside.
 
-    A point of a later look is new if none of those before lies within two pixels of it; what has moved in the
-    meantime is near where it was, and is not doubled.
+    A point of a later look is new if it falls where the first look shows nothing, and none of those before
+    lies within two pixels of it; so what has moved in the meantime is not doubled.
 
     Args:
         looks: over time.
@@ -65,7 +65,7 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
             pixel = float(np.median(known[known > 0])) / look.K[0, 0]
         some, shades = points_from_rgbd(look.image, known, look.viewmat, look.K)
         if len(points):
-            new = _in_other_pixels(some, looks[first]) if len(points) else np.ones(len(some), bool)
+            new = _in_other_pixels(some, looks[first])
             apart, _ = cKDTree(points).query(some, distance_upper_bound=_NEAR_PX * pixel)
             new &= ~np.isfinite(apart)
             some, shades = some[new], shades[new]

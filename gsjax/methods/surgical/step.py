@@ -155,7 +155,8 @@ def surgical_step(config: SurgicalConfig, radius: float) -> Step:
             inner = {"hexplane": ("space", "time"), "mlp": (), "voxels": ("grid",)}
             rates |= dict.fromkeys(inner[scene.field.config.kind], told["planes"])
             rates["layers"] = told["layers"]
-        falling = {name: _falling(rate, fall) for name, rate in rates.items()}
+        made = 0 if scene.field is None else config.warmup  # by the optimizer before this one
+        falling = {name: _falling(rate, fall, made) for name, rate in rates.items()}
         decay = _DECAY if config.optimizer == "adamw" else 0.0
         return gradient_step(loss, per_field_adam(falling, decay=decay))
 
@@ -165,5 +166,5 @@ def surgical_step(config: SurgicalConfig, radius: float) -> Step:
     return Step(lambda params: of(params).init(params), update)
 
 
-def _falling(rate: float, fall: Callable) -> Callable:
-    return lambda count: rate * fall(count)
+def _falling(rate: float, fall: Callable, made: int) -> Callable:
+    return lambda count: rate * fall(count + made)

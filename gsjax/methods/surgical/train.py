@@ -16,7 +16,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
-from gsjax.methods.surgical.start import Look, start_gaussians
+from gsjax.methods.surgical.start import Look, known_depth, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
@@ -97,7 +97,7 @@ def begin_surgical(
     looks: Sequence[Look],
     config: SurgicalConfig,
     codebook: Float[np.ndarray, "k channels"] | None = None,
-    first: int = 0,
+    first: int | None = None,
     gaussians: Gaussians | None = None,
 ) -> tuple[SurgicalProblem, SurgicalState]:
     """A reconstruction before its first step.
@@ -106,15 +106,20 @@ def begin_surgical(
         looks: what a camera saw over time, all of one size.
         config: how.
         codebook: what the teacher says of the rows that looks name, in `config.channels` numbers.
-        first: the look that the canonical scene is like.
+        first: the look that the canonical scene is like; the first with depth where a pixel counts, unless
+            given.
         gaussians: canonical scene to begin with; made of depth unless given.
 
     Raises:
-        ValueError: looks differ in size, no pixel counts, there is no depth, or the codebook has another
-            size.
+        ValueError: looks differ in size, no pixel counts, there is no depth, or the teacher says what the
+            codebook has not.
     """
     _check(looks, config, codebook)
-    scene = DeformingScene(gaussians or start_gaussians(looks, first, config.start_pixels))
+    if first is None:
+        first = next((i for i, look in enumerate(looks) if known_depth(look).any()), 0)
+    if gaussians is None:
+        gaussians = start_gaussians(looks, first, config.start_pixels)
+    scene = DeformingScene(jax.tree.map(jnp.array, gaussians))  # copies, for steps give buffers away
     if codebook is not None:
         features = jnp.zeros((scene.gaussians.num, config.channels))
         scene = eqx.tree_at(
@@ -123,6 +128,8 @@ def begin_surgical(
     means = np.asarray(scene.gaussians.means)
     middle = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
+    if not radius > 0:
+        raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
     batches = [_batch(look, codebook) for look in looks]
     plan = _plan_of(scene.gaussians, batches)
     low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
@@ -135,7 +142,8 @@ def begin_surgical(
 
 def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Advanced]:
     """Step by step, until all is done: the canonical scene alone, then with its deformation. The same state
-    and problem give the same bits, wherever the reconstruction was begun or resumed."""
+    and problem give the same bits, wherever the reconstruction was begun or resumed. The arrays of `state`
+    are given away in the first step."""
     config = problem.config
     advance = compiled_step(config, problem.radius)
     key = jax.random.key(config.seed)
@@ -245,7 +253,7 @@ def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
     return Batch(
         jnp.asarray(look.image)[None],
         jnp.asarray(counts)[None],
-        None if look.depth is None else jnp.asarray(look.depth, dtype)[None],
+        None if look.depth is None else jnp.asarray(known_depth(look), dtype)[None],
         Camera(viewmat, K, width, height, look.near),
         jnp.asarray(look.time, dtype),
         jnp.asarray(ids, jnp.int32) if taught else None,
@@ -272,6 +280,17 @@ def _check(looks: Sequence[Look], config: SurgicalConfig, codebook: np.ndarray |
         if look.image.shape != shape:
             raise ValueError(
                 f"looks: expected pictures {shape} as the first, found {look.image.shape} in {i}"
+            )
+        for name in ("counts", "depth"):
+            value = getattr(look, name)
+            if value is not None and value.shape != shape[:2]:
+                raise ValueError(
+                    f"looks: expected {name} of {shape[:2]} pixels like pictures, found {value.shape} in {i}"
+                )
+        if codebook is not None and (look.ids is None or look.ids.max(initial=-1) >= len(codebook)):
+            found = "none" if look.ids is None else f"{look.ids.max()}"
+            raise ValueError(
+                f"looks: expected ids of {len(codebook)} rows of the codebook, or -1, found {found} in {i}"
             )
     if not any(look.counts is None or look.counts.any() for look in looks):
         raise ValueError("masks: in no look does any pixel count; are they inverted?")
