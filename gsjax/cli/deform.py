@@ -14,7 +14,7 @@ from gsjax.cli.deform_data import DeformData, Features, Tools, deform_data
 from gsjax.cli.deform_results import judge, print_results, write_results, write_scene
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.messages import Notes, reason, stage
+from gsjax.cli.messages import Notes, stage
 from gsjax.cli.recording import located, open_recording
 from gsjax.cli.run_folder import RunFolder, expect_dataset
 from gsjax.data.open import ReadOptions
@@ -99,7 +99,6 @@ def run(options: Options) -> int:
         folder.write_config(settings)  # from here on an earlier run is gone
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
         learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
-        complete = learning.stopped is None
         write_scene(folder, problem, learning.state, data)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
@@ -113,35 +112,21 @@ def run(options: Options) -> int:
             "kind": "deform",
             "dataset": data.sequence.name,
             "method": options.method,
-            "complete": complete,
-            "report": True,
-            "stopped": None if complete else reason(learning.stopped),
-            "steps": learning.state.step,
-            "skipped": learning.skipped,
             "num_gaussians": learning.state.scene.gaussians.num,
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
             "names": list(data.names.values()),
-            "seconds": {
-                "steps": learning.seconds,
-                "compile": learning.compile_seconds,
-                "total": perf_counter() - begun,
-            },
+            **learning.found(begun),
             "machine": describe_machine(),
             **judged,
-            "curve": learning.rows,
             "notes": notes.all,
         }
         folder.write_metrics(found)
         write_results(folder, found)
-        if complete:
+        if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    if isinstance(learning.stopped, KeyboardInterrupt):
-        return 130
-    if learning.stopped is not None:
-        raise learning.stopped
-    return 0
+    return learning.exit_code()
 
 
 def _data(options: Options, notes: Notes, console: Console) -> DeformData:

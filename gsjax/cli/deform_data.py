@@ -30,7 +30,6 @@ class DeformData:
         looks: what the camera saw in the former.
         names: what masks call things, by their value.
         codebook: what the teacher says of each, in the scene's channels; None without a teacher.
-        basis: from the class codes' numbers to the channels; None without a teacher.
     """
 
     sequence: Sequence
@@ -39,7 +38,6 @@ class DeformData:
     looks: list[Look]
     names: dict[int, str]
     codebook: Float[np.ndarray, "k channels"] | None
-    basis: Float[np.ndarray, "channels d"] | None
 
     @property
     def times(self) -> Float[np.ndarray, "t"]:
@@ -105,14 +103,14 @@ def deform_data(
         learns = False
     called = {NOTHING_ELSE: "tissue"} | sequence.names_of_labels
     names = {value: called.get(value, f"object {value}") for value in counted}
-    codebook = basis = None
+    codebook = None
     rows: dict[int, int] = {}
     if learns:
-        codebook, basis = _codebook(names, channels)
+        codebook = _codebook(names, channels)
         rows = {value: row for row, value in enumerate(names)}
     taught = ((t, _ids(mask, rows) if learns and mask is not None else None) for t, mask in seen)
     looks = [_look(sequence, t, 0, tools, ids) for t, ids in taught]
-    return DeformData(sequence, train, test, looks, names if learns else {}, codebook, basis)
+    return DeformData(sequence, train, test, looks, names if learns else {}, codebook)
 
 
 def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
@@ -142,9 +140,7 @@ def _ids(mask: Int[np.ndarray, "h w"], rows: dict[int, int]) -> Int[np.ndarray, 
     return ids
 
 
-def _codebook(
-    names: dict[int, str], channels: int
-) -> tuple[Float[np.ndarray, "k channels"], Float[np.ndarray, "channels d"]]:
+def _codebook(names: dict[int, str], channels: int) -> Float[np.ndarray, "k channels"]:
     """Codes of classes in the scene's channels: a projection with orthonormal rows in which they keep their
     lengths and angles (METHODS.md: fixed, for two that learn agree best where both are 0).
 
@@ -160,4 +156,4 @@ def _codebook(
     _, _, axes = np.linalg.svd(codes, full_matrices=False)
     basis = np.zeros((channels, codes.shape[1]))
     basis[: len(axes)] = axes
-    return codes @ basis.T, basis
+    return codes @ basis.T

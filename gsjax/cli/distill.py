@@ -17,7 +17,7 @@ from gsjax.cli.field_scene import FieldScene, SceneOptions, open_scene
 from gsjax.cli.field_teacher import Asked, Masks, Second, Teaching
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
-from gsjax.cli.messages import Notes, reason, stage
+from gsjax.cli.messages import Notes, stage
 from gsjax.cli.recording import located
 from gsjax.cli.run_folder import RunFolder, plain
 from gsjax.cli.run_records import digest
@@ -126,49 +126,34 @@ def run(options: Options) -> int:
             },
         )
         write_field(folder.path / NAME, stored)
-        complete = learning.stopped is None
         with stage(console, "asking it about views"):
             judged = judge(folder, scene, teaching, stored, options.field, notes)
         _say_what_was_odd(scene, learning, notes)
         found = {
             "kind": "distill",
             "dataset": photographs.name,
-            "complete": complete,
-            "report": True,
-            "stopped": None if complete else reason(learning.stopped),
             "features": teaching.source.kind,
             "second": options.second,
             "features_are": teaching.about,
             "masks": teaching.masks,
             "names": sorted(teaching.source.names.values()),
             "dimension": teaching.teacher.dimension,
-            "steps": learning.state.step,
-            "skipped": learning.skipped,
             "num_gaussians": scene.gaussians.num,
             "trained": sum(leaf.size for leaf in jax.tree.leaves(learning.state.field)),
             "views": {"taught": len(problem.views), "held_out": len(scene.held_out)},
             "size": photographs.sizes.max(0),
             "encoded": {"anew": cache.asked, "from_cache": cache.found},
-            "seconds": {
-                "steps": learning.seconds,
-                "compile": learning.compile_seconds,
-                "total": perf_counter() - begun,
-            },
+            **learning.found(begun),
             "machine": describe_machine(),
             **judged,
-            "curve": learning.rows,
             "notes": notes.all,
         }
         folder.write_metrics(found)
         write_results(folder, found)
-        if complete:
+        if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    if isinstance(learning.stopped, KeyboardInterrupt):
-        return 130
-    if learning.stopped is not None:
-        raise learning.stopped
-    return 0
+    return learning.exit_code()
 
 
 def _told(row: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.interrupts import hear, undisturbed
+from gsjax.cli.messages import reason
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.saving import Saver
 from gsjax.io.atomic import atomic_write
@@ -80,6 +81,34 @@ class Learning:
         kept = ("rows", "seconds", "compile_seconds", "skipped")
         told = {"about": dict(self.about), "recent": recent, "step": self.state.step}
         return {name: getattr(self, name) for name in kept} | told
+
+    def found(self, begun: float) -> dict[str, Any]:
+        """What metrics.json says of it; `begun` is by the performance counter."""
+        return {
+            "complete": self.stopped is None,
+            "report": True,
+            "stopped": None if self.stopped is None else reason(self.stopped),
+            "steps": self.state.step,
+            "skipped": self.skipped,
+            "seconds": {
+                "steps": self.seconds,
+                "compile": self.compile_seconds,
+                "total": perf_counter() - begun,
+            },
+            "curve": self.rows,
+        }
+
+    def exit_code(self) -> int:
+        """That of the command.
+
+        Raises:
+            BaseException: what ended it early, unless that was Ctrl-C.
+        """
+        if self.stopped is None:
+            return 0
+        if isinstance(self.stopped, KeyboardInterrupt):
+            return 130
+        raise self.stopped
 
 
 def load(folder: Path, first: Learning, form_at: Callable[[Any, int], Any] | None = None) -> Learning:

@@ -16,6 +16,7 @@ from gsjax.methods.feature_field.config import FieldConfig
 from gsjax.methods.feature_field.distill import FieldBatch, distillation_step
 from gsjax.methods.feature_field.field import FeatureField, init_field, used_part, whole
 from gsjax.methods.feature_field.teacher import Teacher, most_rows, of_view
+from gsjax.methods.turns import whose_turn
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, freeze_views
 from gsjax.rasterize.plan import Plan
@@ -112,7 +113,7 @@ def distill(problem: FieldProblem, state: FieldState) -> Iterator[Distilled]:
     field, optimizer = state.field, state.optimizer
     for i in range(state.step, config.iterations):
         begun, programs = perf_counter(), advance._cache_size()
-        batch = problem.views[_turn(config.seed, i, len(problem.views))]
+        batch = problem.views[whose_turn(config.seed, i, len(problem.views))]
         field, optimizer, info = advance(field, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i))
         jax.block_until_ready(info)
         seconds, new = perf_counter() - begun, advance._cache_size() > programs
@@ -153,12 +154,6 @@ def compiled_step(config: FieldConfig) -> Callable:
         return step.update(field, optimizer, batch, step=i, key=key)
 
     return advance
-
-
-def _turn(seed: int, step: int, count: int) -> int:
-    """Which view a step looks at: all of them in a random order, and then in another."""
-    epoch, place = divmod(step, count)
-    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
 
 
 def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:

@@ -24,6 +24,7 @@ from gsjax.methods.reconstruction.step import (
     slots_wanted,
     split,
 )
+from gsjax.methods.turns import whose_turn
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.gaussians import Gaussians
@@ -155,7 +156,7 @@ def fit(
         begun, compiling = perf_counter(), 0.0
         degree = min(config.sh_degree, i // config.sh_every)
         model, optimizer = enlarged(problem, model, optimizer, degree, 0)
-        v, shrink = _turn(config.seed, i, len(views)), _shrink(config, done)
+        v, shrink = whose_turn(config.seed, i, len(views)), _shrink(config, done)
         if (v, shrink) not in seen:
             if any(of != shrink for _, of in seen):
                 seen.clear()  # photographs of a size that is over
@@ -211,12 +212,6 @@ def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
         return split(model, optimizer, key, config, radius, reset, i > every, all_looked)
 
     return advance, densify
-
-
-def _turn(seed: int, step: int, count: int) -> int:
-    """Which photograph a step looks at: all of them in a random order, and then in another."""
-    epoch, place = divmod(step, count)
-    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
 
 
 def _shrink(config: FitConfig, share: float) -> int:

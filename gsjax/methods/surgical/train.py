@@ -18,6 +18,7 @@ from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.start import Look, known_depth, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
+from gsjax.methods.turns import whose_turn
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.deformation import init_deformation
@@ -156,9 +157,9 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
             graphs = _graphs(problem, scene, moving)
         begun, programs = perf_counter(), advance._cache_size()
         while True:
-            turn = _turn(problem, i)
-            graph = None if graphs is None else graphs[turn]
-            batch = problem.batches[turn]._replace(moving=moving, graph=graph, plan=plan)
+            look = _turn(problem, i)
+            graph = None if graphs is None else graphs[look]
+            batch = problem.batches[look]._replace(moving=moving, graph=graph, plan=plan)
             scene, optimizer, info = advance(
                 scene, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i)
             )
@@ -227,9 +228,7 @@ def _turn(problem: SurgicalProblem, step: int) -> int:
     """Which look a step has: all of them in a random order, and then in another."""
     if step < problem.config.warmup and problem.config.warmup_frames == "first":
         return problem.first
-    count = len(problem.batches)
-    epoch, place = divmod(step, count)
-    return int(np.random.default_rng((problem.config.seed, epoch)).permutation(count)[place])
+    return whose_turn(problem.config.seed, step, len(problem.batches))
 
 
 def counted_ids(look: Look) -> Int[np.ndarray, "h w"]:
