@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, no_type_check
 
 DEAF = frozenset({"called_by_xla", "undisturbed"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions; what is not to be disturbed."""
@@ -19,6 +19,7 @@ RETRY_S = 0.01
 _waiting = threading.Event()  # signals are the process's, and so is whether one waits
 
 
+@no_type_check  # a wrapper that checks types would be disturbed between the call's end and its own
 def undisturbed(call: Callable[..., Any], *arguments: Any) -> Any:
     """What `call` gives; Ctrl-C waits for its end and for `hear`. It is for steps that give away the buffers
     they replace: to stop in the middle of one would lose both the old and the new."""
