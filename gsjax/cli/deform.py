@@ -7,18 +7,30 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
+import jax
+import numpy as np
 import tyro
 from rich.console import Console
 
 from gsjax.cli.deform_data import DeformData, Features, Tools, deform_data
-from gsjax.cli.deform_results import judge, print_results, write_results, write_scene
+from gsjax.cli.deform_file import NAME, StoredDeformation, write_deformation
+from gsjax.cli.deform_results import judge, print_results, write_results
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
 from gsjax.cli.recording import located, open_recording
 from gsjax.cli.run_folder import RunFolder, expect_dataset
 from gsjax.data.open import ReadOptions
-from gsjax.methods.surgical import PRESETS, SurgicalConfig, begin_surgical, of_step, reconstruct
+from gsjax.io.ply import write_ply
+from gsjax.methods.surgical import (
+    PRESETS,
+    SurgicalConfig,
+    SurgicalState,
+    begin_surgical,
+    of_step,
+    reconstruct,
+)
+from gsjax.scene.deformation import Nodes
 
 HELP = (
     " As in `gsjax deform DATASET --out RUN`. Frames are to have depth; masks say where tools are, which are "
@@ -99,7 +111,7 @@ def run(options: Options) -> int:
         folder.write_config(settings)  # from here on an earlier run is gone
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
         learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
-        write_scene(folder, problem, learning.state, data)
+        _write_scene(folder, learning.state, data)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
         if learning.skipped:
@@ -143,6 +155,15 @@ def _data(options: Options, notes: Notes, console: Console) -> DeformData:
         )
     told = (options.test_every, options.tools, options.features, options.deform.channels)
     return deform_data(sequence, *told, notes, console)
+
+
+def _write_scene(folder: RunFolder, state: SurgicalState, data: DeformData) -> None:
+    """Writes deformation.npz, and scene.ply, the scene as it was at the first frame."""
+    assert state.moving is None or isinstance(state.moving, Nodes)
+    names, frame_ids = tuple(data.names.values()), np.asarray(data.sequence.frame_ids)
+    stored = StoredDeformation(state.scene, state.moving, names, data.codebook, data.times, frame_ids)
+    write_deformation(folder.path / NAME, stored)
+    write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
 def _check(options: Options) -> None:

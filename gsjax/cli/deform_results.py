@@ -1,6 +1,5 @@
 """What a deforming scene came to: held-out frames, the other eye, tracks where truth has them; the report."""
 
-from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -17,8 +16,6 @@ from gsjax.cli.outputs import write_png
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
 from gsjax.geometry.cameras import Camera
-from gsjax.io.checkpoints import save_checkpoint
-from gsjax.io.ply import write_ply
 from gsjax.methods.surgical import DeformingScene, Look, Moving, SurgicalProblem, SurgicalState
 from gsjax.metrics.image import psnr, ssim
 from gsjax.metrics.tracking import carried_points
@@ -27,23 +24,11 @@ from gsjax.scene.render import render
 from gsjax.viz.colors import side_by_side, to_uint8
 from gsjax.viz.plots import losses_over_steps, save
 
-NAME = "deformation.npz"
 _SHOWN = 8  # frames in the report
 _TIMED = 12  # frames drawn to say how many a second
 _SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
 _HEADROOM = 1.3
 _LEAST_SIDE = 11  # of SSIM's window
-
-
-def write_scene(folder: RunFolder, problem: SurgicalProblem, state: SurgicalState, data: DeformData) -> None:
-    """Writes deformation.npz, all that deforms, and scene.ply, the scene as it was at the first frame."""
-    told = {
-        "config": asdict(problem.config),
-        "bounds": problem.bounds.tolist(),
-        "names": {str(value): name for value, name in data.names.items()},
-    }
-    save_checkpoint(folder.path / NAME, jax.device_get((state.scene, state.moving)), told)
-    write_ply(folder.scene, jax.device_get(state.scene.at(jnp.asarray(0.0), state.moving)))
 
 
 def judge(

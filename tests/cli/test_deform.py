@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsjax.cli import learning, main
-from gsjax.io.checkpoints import load_metadata
+from gsjax.cli.deform_file import read_deformation
 from gsjax.io.ply import read_ply
 
 SCENE = "simulated:tissue?width=64&height=52&frames=10"
@@ -42,8 +42,8 @@ def test_what_a_run_writes(deformed):
         assert picture.std() > 5
     assert "frames a second" in (deformed / "report.html").read_text()
     assert read_ply(deformed / "scene.ply")[0].num == found["num_gaussians"]
-    told = load_metadata(deformed / "deformation.npz")
-    assert told["names"] == {"0": "tissue", "1": "tool"}
+    told = read_deformation(deformed / "deformation.npz")
+    assert told.names == ("tissue", "tool")
     assert not (deformed / "resume").exists()
     assert [row["step"] for row in found["curve"]] == [10, 20, 30]
     assert found["curve"][-1]["structure"] is not None  # the graph counts in the end
@@ -75,7 +75,7 @@ def test_a_recipe_by_its_name(gsjax, tmp_path):
     run = tmp_path / "run"
     code, said = gsjax("deform", SCENE, "--method", "clin", "--out", run, "--scale", 0.5, *SMALL)
     assert code == 0, said
-    assert load_metadata(run / "deformation.npz")["config"]["deformation"]["rotation"] == "add"
+    assert read_deformation(run / "deformation.npz").scene.field.config.rotation == "add"
     assert metrics(run)["names"] == []
     assert metrics(run)["size"] == [32, 26]
 

@@ -1,0 +1,129 @@
+"""deformation.npz: a scene that deforms, apart from the recording that it was learned from."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
+from gsjax.methods.surgical import DeformingScene
+from gsjax.scene.deformation import DeformationConfig, Nodes, init_deformation
+from gsjax.scene.gaussians import Gaussians
+
+NAME = "deformation.npz"
+_FORMAT = 1
+_AGAIN = "reconstruct it again with this version of gsjax"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDeformation:
+    """A deforming scene as it lies on disk.
+
+    Attributes:
+        scene: canonical Gaussians, and the field that moves them; None of a scene that stands still.
+        moving: what the field is asked about.
+        names: of what there is in it, in the order of the codebook; none without features.
+        codebook: the feature of each; None without.
+        times: of the recording's frames, 0 to 1.
+        frame_ids: what the recording calls these.
+    """
+
+    scene: DeformingScene
+    moving: Nodes | None
+    names: tuple[str, ...]
+    codebook: Float[np.ndarray, "k channels"] | None
+    times: Float[np.ndarray, "T"]
+    frame_ids: Int[np.ndarray, "T"]
+
+    def at(self, time: float) -> Gaussians:
+        """The scene at a time, 0 to 1."""
+        return _at(self.scene, self.moving, jnp.asarray(time, jnp.float32))
+
+
+@jax.jit
+def _at(scene: DeformingScene, moving: Nodes | None, time: Float[Array, ""]) -> Gaussians:
+    return scene.at(time, moving)
+
+
+def write_deformation(path: Path, stored: StoredDeformation) -> None:
+    """Writes it; atomic."""
+    gaussians, field, nodes = stored.scene.gaussians, stored.scene.field, stored.moving
+    about: dict[str, Any] = {
+        "format": _FORMAT,
+        "gaussians": {name: list(leaf.shape) for name, leaf in vars(gaussians).items() if leaf is not None},
+        "field": None if field is None else {"config": asdict(field.config), "bounds": field.bounds},
+        "nodes": None if nodes is None else [len(nodes.rows), nodes.indices.shape[1]],
+        "names": stored.names,
+        "codebook": None if stored.codebook is None else stored.codebook.tolist(),
+        "times": stored.times.tolist(),
+        "frame_ids": stored.frame_ids.tolist(),
+    }
+    save_checkpoint(path, jax.device_get((gaussians, field, nodes)), about)
+
+
+def read_deformation(path: Path) -> StoredDeformation:
+    """The inverse of `write_deformation`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is none of these, or numbers in it are not finite.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a scene that `gsjax deform` wrote, found no file")
+    about = load_metadata(path)
+    try:
+        if about["format"] != _FORMAT:
+            raise ValueError(f"format {about['format']}")
+        like = _like(about)
+        names, book = tuple(map(str, about["names"])), about["codebook"]
+        codebook = None if book is None else np.array(book, np.float64)
+        times, frame_ids = np.array(about["times"], float), np.array(about["frame_ids"], int)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected what `gsjax deform` writes, found {error!r}; {_AGAIN}") from error
+    (gaussians, field, nodes), _ = load_checkpoint(path, like)
+    scene = DeformingScene(gaussians, field)
+    fits = codebook is None or (
+        gaussians.features is not None and codebook.shape == (len(names), gaussians.features.shape[1])
+    )
+    if not fits or len(times) != len(frame_ids) or not len(times):
+        raise ValueError(f"{path}: expected a code for each name and a time for each frame; {_AGAIN}")
+    for leaf in jax.tree.leaves(eqx.filter((scene, nodes), eqx.is_inexact_array)):
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise ValueError(f"{path}: expected finite numbers, found others; {_AGAIN}")
+    _check_nodes(path, nodes, gaussians.num)
+    return StoredDeformation(scene, nodes, names, codebook, times, frame_ids)
+
+
+def _like(about: Mapping[str, Any]) -> Any:
+    """A tree of the stored one's form."""
+    shapes = {name: tuple(map(int, shape)) for name, shape in about["gaussians"].items()}
+    features, nodes = shapes.get("features", (0, 0))[1], about["nodes"]
+
+    def made():
+        gaussians = Gaussians(**{name: jnp.zeros(shape) for name, shape in shapes.items()})
+        field = None
+        if about["field"] is not None:
+            config = DeformationConfig(**about["field"]["config"])
+            field = init_deformation(jax.random.key(0), config, np.array(about["field"]["bounds"]), features)
+        if nodes is None:
+            return gaussians, field, None
+        places, blended = map(int, nodes)
+        whole = jnp.zeros((shapes["means"][0], blended), jnp.int32)
+        rows = jnp.zeros(places, jnp.int32)
+        return gaussians, field, Nodes(rows, whole, jnp.zeros(whole.shape))
+
+    return eqx.filter_eval_shape(made)
+
+
+def _check_nodes(path: Path, nodes: Nodes | None, count: int) -> None:
+    if nodes is None:
+        return
+    for name, array, most in (("rows", nodes.rows, count), ("indices", nodes.indices, len(nodes.rows))):
+        if array.min() < 0 or array.max() >= most:
+            raise ValueError(f"{path}: nodes' {name}: expected 0 to {most - 1}, found others; {_AGAIN}")

@@ -1,0 +1,98 @@
+"""deformation.npz: what is written is what is read, and what a file may not be."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.cli.deform_file import StoredDeformation, read_deformation, write_deformation
+from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
+from gsjax.methods.surgical import DeformingScene, nodes_of
+from gsjax.scene.deformation import DeformationConfig, init_deformation
+from gsjax.scene.initialize import gaussians_from_points
+
+
+def stored(kind="hexplane", nodes=0, features=0, moves=True):
+    key = jax.random.key(3)
+    points = np.random.default_rng(0).uniform(0, 1, (30, 3)).astype(np.float32)
+    gaussians = gaussians_from_points(points, points)
+    if features:
+        values = jax.random.normal(key, (30, features))
+        gaussians = gaussians.__class__(**vars(gaussians) | {"features": values})
+    field = None
+    if moves:
+        config = DeformationConfig(kind, resolution=4, time_resolution=3, levels=2, channels=2, hidden=5)
+        field = init_deformation(key, config, np.array([[0, 0, 0], [1, 1, 1]]), features)
+        field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), field)
+    scene = DeformingScene(gaussians, field)
+    names, book = (("tissue", "tool"), np.eye(2, features)) if features else ((), None)
+    moving = nodes_of(gaussians, nodes) if nodes else None
+    return StoredDeformation(scene, moving, names, book, np.linspace(0, 1, 4), np.arange(4) + 7)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"nodes": 8, "features": 3},
+        {"kind": "mlp", "features": 2},
+        {"kind": "voxels", "nodes": 5},
+        {"moves": False},
+    ],
+)
+def test_what_is_written_is_what_is_read(given, tmp_path):
+    first = stored(**given)
+    write_deformation(tmp_path / "deformation.npz", first)
+    again = read_deformation(tmp_path / "deformation.npz")
+    assert again.names == first.names
+    for one, other in (
+        (first.codebook, again.codebook),
+        (first.times, again.times),
+        (first.frame_ids, again.frame_ids),
+    ):
+        np.testing.assert_array_equal(one, other)
+    for time in (0.0, 0.4):
+        jax.tree.map(np.testing.assert_array_equal, first.at(time), again.at(time))
+    assert jax.tree.structure(first.scene) == jax.tree.structure(again.scene)
+
+
+def test_a_file_that_is_none(tmp_path):
+    path = tmp_path / "deformation.npz"
+    with pytest.raises(FileNotFoundError, match="gsjax deform"):
+        read_deformation(path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="damaged"):
+        read_deformation(path)
+    save_checkpoint(path, {"a": jnp.zeros(3)}, {"format": 1})
+    with pytest.raises(ValueError, match="expected what `gsjax deform` writes"):
+        read_deformation(path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (lambda saved: saved[0].means.at[2, 1].set(jnp.nan), "finite"),
+        (lambda saved: saved[2].indices.at[0, 0].set(99), "indices: expected 0 to 7"),
+    ],
+)
+def test_a_file_with_what_no_scene_has(spoil, match, tmp_path):
+    path, first = tmp_path / "deformation.npz", stored(nodes=8)
+    write_deformation(path, first)
+    saved = (first.scene.gaussians, first.scene.field, first.moving)
+    (gaussians, field, nodes), about = load_checkpoint(path, saved)
+    if "finite" in match:
+        gaussians = gaussians.__class__(**vars(gaussians) | {"means": spoil(saved)})
+    else:
+        nodes = nodes._replace(indices=spoil(saved))
+    save_checkpoint(path, (gaussians, field, nodes), about)
+    with pytest.raises(ValueError, match=match):
+        read_deformation(path)
+
+
+def test_a_codebook_of_other_names(tmp_path):
+    path, first = tmp_path / "deformation.npz", stored(features=3)
+    write_deformation(path, first)
+    saved = (first.scene.gaussians, first.scene.field, first.moving)
+    save_checkpoint(path, saved, load_metadata(path) | {"names": ["tissue"]})
+    with pytest.raises(ValueError, match="a code for each name"):
+        read_deformation(path)
