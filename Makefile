@@ -20,7 +20,7 @@ demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 
 # Two workers at most: XLA compiles on several threads by itself. A file stays with one worker, so what one
 # of its tests compiled serves the next.
-PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses=2 --dist=loadfile
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses=2 --dist=loadfile --durations=30 --durations-min=5
 
 test: $(VENV)/installed-test ## the tests; slow ones left out
 	$(PYTEST)

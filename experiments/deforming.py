@@ -7,14 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from recordings import recorded
 
 import gsjax
 from gsjax.cli.deform_data import unit_times
-from gsjax.cli.deform_results import draw
+from gsjax.cli.deform_scores import draw
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
+from gsjax.geometry.cameras import PixelsOf, pixels_of
 from gsjax.methods.surgical import (
     Look,
     SurgicalConfig,
@@ -64,9 +65,9 @@ class Dataset:
         )
 
 
-def dataset(name: str = "tissue_0") -> Dataset:
-    """A recording by its name."""
-    sequence = gsjax.open_sequence(recorded(name))
+def dataset(name: str = "tissue_0", scale: float = 1.0) -> Dataset:
+    """A recording by its name, in pictures of a fraction of their width and height."""
+    sequence = gsjax.open_sequence(recorded(name)).scaled(scale)
     test = [i for i in range(sequence.num_frames) if (i - 1) % EVERY == 0]
     train = [i for i in range(sequence.num_frames) if i not in test]
     return Dataset(sequence, train, test, read_arrays(recorded(name) / "truth.npz"))
@@ -82,9 +83,11 @@ class Reconstructed:
     compile_seconds: float
 
 
-def learned(looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | None = None) -> Reconstructed:
-    """A scene of these looks; no step may be skipped."""
-    problem, state = begin_surgical(looks, config, codebook)
+def learned(
+    looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | None = None, first: int | None = None
+) -> Reconstructed:
+    """A scene of these looks, that begins with one of them; no step may be skipped."""
+    problem, state = begin_surgical(looks, config, codebook, first)
     seconds = compiling = skipped = 0.0
     for found in reconstruct(problem, state):
         state = found.state
@@ -96,7 +99,8 @@ def learned(looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | No
 
 def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray]:
     """Colours and depth as a look would see the scene."""
-    return draw(found.state.scene, found.state.moving, look, found.problem.plan_for(found.state))
+    got = draw(found.state.scene, found.state.moving, look, found.problem.plan_for(found.state))
+    return got.colors, got.depths
 
 
 def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> float:
@@ -193,29 +197,22 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     }
 
 
-def _pixels(
-    points: Float[np.ndarray, "n 3"], look: Look
-) -> tuple[Int[np.ndarray, "n 2"], np.ndarray, np.ndarray]:
-    """Where points fall in a look, how deep they lie, and which are inside."""
-    local = points @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
-    ahead = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    xy = (local @ look.K.T)[:, :2] / ahead[:, None]
+def _pixels(points: Float[np.ndarray, "n 3"], look: Look) -> PixelsOf:
+    """Where points fall in a look."""
     height, width = look.image.shape[:2]
-    inside = np.isfinite(ahead) & (xy >= 0).all(1) & (xy < (width, height)).all(1)
-    return np.where(inside[:, None], xy, 0).astype(int), local[:, 2], inside
+    return pixels_of(points, look.viewmat, look.K, width, height)
 
 
 def _seen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
     """Which points a look sees, by its depth and mask."""
-    xy, depth, inside = _pixels(points, look)
-    x, y = xy.T
+    x, y, depth, inside = _pixels(points, look)
     return inside & look.counts[y, x] & (np.abs(look.depth[y, x] - depth) < _SEEN_WITHIN_M)
 
 
 def _near_tool_at(points: Float[np.ndarray, "n 3"], data: Dataset, t: int) -> Bool[np.ndarray, "n"]:
     look = data.look(t)
-    xy, _, inside = _pixels(points, look)
-    return inside & near_tool(look)[xy[:, 1], xy[:, 0]]
+    at = _pixels(points, look)
+    return at.inside & near_tool(look)[at.rows, at.columns]
 
 
 def summary(found: Reconstructed) -> dict[str, Any]:

@@ -25,6 +25,7 @@ COMMANDS = {
     "info": ("gsjax.cli.info", "say what is understood of a recording"),
     "view": ("gsjax.cli.view", "look at a run or a PLY file in a browser"),
     "query": ("gsjax.cli.query", "find what a text means: objects of a run, or Gaussians by a field"),
+    "ask": ("gsjax.cli.ask", "answer a question on a scene that deforms, in plain English"),
     "grasp": ("gsjax.cli.grasp", "find the best grasp of the object that a text means, in every frame"),
     "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),

@@ -10,17 +10,23 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.cli.deform_data import DeformData, Features, Tools, deform_data
+from gsjax.cli.deform_depth import Deep, Depth, with_depth
 from gsjax.cli.deform_file import NAME, StoredDeformation, write_deformation
-from gsjax.cli.deform_results import judge, print_results, write_results
+from gsjax.cli.deform_poses import as_refined
+from gsjax.cli.deform_results import print_results, write_results
+from gsjax.cli.deform_scores import judge
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.recording import located, open_recording
+from gsjax.cli.recording import expect_scale, located, open_recording, parse_frames
 from gsjax.cli.run_folder import RunFolder, expect_dataset
-from gsjax.data.open import ReadOptions
+from gsjax.data import Photographs
+from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
+from gsjax.data.ordered import in_order
 from gsjax.io.ply import write_ply
 from gsjax.methods.surgical import (
     PRESETS,
@@ -33,8 +39,8 @@ from gsjax.methods.surgical import (
 from gsjax.scene.deformation import Nodes
 
 HELP = (
-    " As in `gsjax deform DATASET --out RUN`. Frames are to have depth; masks say where tools are, which are "
-    "left out unless --tools draw."
+    " As in `gsjax deform DATASET --out RUN`. Masks say where tools are, which are left out unless --tools "
+    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane."
 )
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
@@ -60,7 +66,11 @@ class Options:
     test_every: int = 8
     """Hold out frame i, to judge by, where i - 1 is a multiple of this; 0 holds out none."""
     tools: Tools = "leave-out"
-    """What masks call something else than 0: leave out, or draw it too."""
+    """What masks call a tool, by the names of their values, or without names all but 0: leave out, or draw it
+    too."""
+    depth: Depth = "auto"
+    """Where depth is from: data (files), stereo (camera to learn from and the next one are matched) or plane
+    (none: the scene begins on one, and its depth is of no unit). auto: the first of these that there is."""
     features: Features = "auto"
     """What is to be learned beside colours: classes (a code for each class of the masks), or none. auto:
     classes if masks have more than one among the pixels that count."""
@@ -96,7 +106,9 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        data = _data(options, notes, console)
+        deep = _recording(options, notes)
+        told = (options.test_every, options.tools, options.features, options.deform.channels)
+        data = deform_data(deep.sequence, *told, notes, console)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
@@ -111,7 +123,8 @@ def run(options: Options) -> int:
         folder.write_config(settings)  # from here on an earlier run is gone
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
         learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
-        _write_scene(folder, learning.state, data)
+        data, refined = as_refined(folder, problem, learning.state.scene, data, notes)
+        write_scene(folder, learning.state, data)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
         if learning.skipped:
@@ -128,6 +141,8 @@ def run(options: Options) -> int:
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
             "names": list(data.names.values()),
+            "depth": deep.found,
+            "poses": refined,
             **learning.found(begun),
             "machine": describe_machine(),
             **judged,
@@ -141,27 +156,53 @@ def run(options: Options) -> int:
     return learning.exit_code()
 
 
-def _data(options: Options, notes: Notes, console: Console) -> DeformData:
-    """The recording, the camera that is learned from first."""
-    whole = open_recording(options.dataset, (), (), options.frames, options.read, options.scale).judged
+def _recording(options: Options, notes: Notes) -> Deep:
+    """The recording, the camera that is learned from first, with its depth."""
+    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+        expect_scale(options.scale)
+        photographs = open_photographs(
+            options.dataset, options.read
+        )  # what `gsjax poses` made of a video, say
+        whole = in_order(photographs).select(frames=parse_frames(options.frames)).scaled(options.scale)
+        notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
+    else:
+        whole = open_recording(options.dataset, (), (), options.frames, options.read, options.scale).judged
     first = options.cameras[0] if options.cameras else whole.camera_ids[0]
     if first not in whole.camera_ids:
         raise ValueError(f"--cameras: {whole.name} has no camera {first}; it has {list(whole.camera_ids)}")
     sequence = whole.select(cameras=[first, *(c for c in whole.camera_ids if c != first)])
-    if not sequence.has_depth:
-        raise ValueError(
-            f"{sequence.name}: expected frames with depth, found none; gsjax deform begins with it. Give "
-            "depth from stereo or a network beside the frames, as EndoNeRF has it (docs/data.md)"
-        )
-    told = (options.test_every, options.tools, options.features, options.deform.channels)
-    return deform_data(sequence, *told, notes, console)
+    return with_depth(sequence, options.depth, options.deform.plane_depth, notes)
 
 
-def _write_scene(folder: RunFolder, state: SurgicalState, data: DeformData) -> None:
+def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) -> str:
+    """What their poses and points say of the unit of lengths; `facing` is the first view matrix."""
+    told = f"{photographs.num} photographs are taken as frames, in their order."
+    if photographs.cloud is None or not len(photographs.cloud.points):
+        return told
+    away = float(np.median(photographs.cloud.points @ facing[2, :3] + facing[2, 3]))
+    return (
+        f"{told} The points that came with their poses lie {away:.3g} before the first, in the poses' unit."
+    )
+
+
+def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData) -> None:
     """Writes deformation.npz, and scene.ply, the scene as it was at the first frame."""
     assert state.moving is None or isinstance(state.moving, Nodes)
-    names, frame_ids = tuple(data.names.values()), np.asarray(data.sequence.frame_ids)
-    stored = StoredDeformation(state.scene, state.moving, names, data.codebook, data.times, frame_ids)
+    seen = data.sequence
+    stored = StoredDeformation(
+        state.scene,
+        state.moving,
+        tuple(data.names.values()),
+        data.codebook,
+        data.times,
+        np.asarray(seen.frame_ids),
+        float(seen.times[-1] - seen.times[0]),
+        seen.viewmats[:, 0],
+        seen.Ks[:, 0],
+        (seen.width, seen.height),
+        seen.near,
+        np.array(data.test, int),
+    )
     write_deformation(folder.path / NAME, stored)
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 

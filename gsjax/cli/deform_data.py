@@ -11,12 +11,12 @@ from rich.progress import track
 
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
+from gsjax.data.tool_masks import TISSUE, is_tool, tools_in
 from gsjax.methods.surgical import Look
 from gsjax.perception.codebook import ClassCodebook
 
 Tools = Literal["leave-out", "draw"]
 Features = Literal["auto", "classes", "none"]
-NOTHING_ELSE = 0  # the mask value of what is no tool
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +52,12 @@ class DeformData:
                 if value is not None:
                     found.update(np.ascontiguousarray(value).tobytes())
         return found.hexdigest()
+
+    def classes(self, t: int) -> Int[np.ndarray, "h w"] | None:
+        """Which row of the codebook each pixel of the camera that is learned from has by its mask, -1 for
+        none; None without a teacher."""
+        rows = {value: row for row, value in enumerate(self.names)}
+        return _ids(self.sequence.mask(t, 0), rows) if rows else None
 
     def look(self, t: int, camera: int, tools: Tools) -> Look:
         """What a camera saw at a frame, without a teacher."""
@@ -93,7 +99,8 @@ def deform_data(
     shown = track(train, "reading", console=console, transient=True, disable=not console.is_terminal)
     seen = [(t, sequence.mask(t, 0)) for t in shown] if learns else [(t, None) for t in train]
     values = sorted({int(v) for _, mask in seen if mask is not None for v in np.unique(mask)})
-    counted = [v for v in values if tools == "draw" or v == NOTHING_ELSE]
+    names = sequence.names_of_labels
+    counted = [v for v in values if v >= TISSUE and (tools == "draw" or not is_tool(v, names))]
     if learns and len(counted) < 2:
         if features == "classes":
             raise ValueError(
@@ -101,7 +108,7 @@ def deform_data(
                 f"{len(counted)}; --tools draw counts tools too"
             )
         learns = False
-    called = {NOTHING_ELSE: "tissue"} | sequence.names_of_labels
+    called = {TISSUE: "tissue"} | names
     names = {value: called.get(value, f"object {value}") for value in counted}
     codebook = None
     rows: dict[int, int] = {}
@@ -123,7 +130,7 @@ def _look(sequence: Sequence, t: int, camera: int, tools: Tools, ids: np.ndarray
     mask = sequence.mask(t, camera) if tools == "leave-out" and sequence.has_masks else None
     return Look(
         sequence.image(t, camera),
-        None if mask is None else mask == NOTHING_ELSE,
+        None if mask is None else ~tools_in(mask, sequence.names_of_labels),
         sequence.depth(t, camera),
         sequence.viewmats[t, camera],
         sequence.Ks[t, camera],

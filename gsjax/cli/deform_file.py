@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.geometry.cameras import Camera
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.surgical import DeformingScene
 from gsjax.scene.deformation import DeformationConfig, Nodes, init_deformation
 from gsjax.scene.gaussians import Gaussians
 
 NAME = "deformation.npz"
-_FORMAT = 1
+_FORMAT = 2  # 1 had no cameras
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -32,6 +33,12 @@ class StoredDeformation:
         codebook: the feature of each; None without.
         times: of the recording's frames, 0 to 1.
         frame_ids: what the recording calls these.
+        seconds: that the recording lasts.
+        viewmats: of the camera that was learned from, in each frame: world to camera, OpenCV axes.
+        Ks: its intrinsics, pixels.
+        size: width and height of its pictures, pixels.
+        near: what is nearer to it is not drawn, metres.
+        held_out: which of the frames nothing was learned from.
     """
 
     scene: DeformingScene
@@ -40,10 +47,26 @@ class StoredDeformation:
     codebook: Float[np.ndarray, "k channels"] | None
     times: Float[np.ndarray, "T"]
     frame_ids: Int[np.ndarray, "T"]
+    seconds: float
+    viewmats: Float[np.ndarray, "T 4 4"]
+    Ks: Float[np.ndarray, "T 3 3"]
+    size: tuple[int, int]
+    near: float
+    held_out: Int[np.ndarray, "held"]
 
     def at(self, time: float) -> Gaussians:
         """The scene at a time, 0 to 1."""
         return _at(self.scene, self.moving, jnp.asarray(time, jnp.float32))
+
+    def camera(self, frame: int) -> Camera:
+        """The camera at a frame, 0 to T - 1, as a batch of one."""
+        viewmat, K = (jnp.asarray(a[frame], jnp.float32)[None] for a in (self.viewmats, self.Ks))
+        return Camera(viewmat, K, *self.size, self.near)
+
+    @property
+    def meaning_changes(self) -> bool:
+        """Whether features are not the same at all times."""
+        return self.scene.field is not None and self.scene.field.config.feature
 
 
 @jax.jit
@@ -63,8 +86,13 @@ def write_deformation(path: Path, stored: StoredDeformation) -> None:
         "codebook": None if stored.codebook is None else stored.codebook.tolist(),
         "times": stored.times.tolist(),
         "frame_ids": stored.frame_ids.tolist(),
+        "seconds": stored.seconds,
+        "size": stored.size,
+        "near": stored.near,
+        "held_out": stored.held_out.tolist(),
     }
-    save_checkpoint(path, jax.device_get((gaussians, field, nodes)), about)
+    cameras = tuple(np.asarray(a, np.float64) for a in (stored.viewmats, stored.Ks))
+    save_checkpoint(path, (*jax.device_get((gaussians, field, nodes)), *cameras), about)
 
 
 def read_deformation(path: Path) -> StoredDeformation:
@@ -83,21 +111,31 @@ def read_deformation(path: Path) -> StoredDeformation:
         like = _like(about)
         names, book = tuple(map(str, about["names"])), about["codebook"]
         codebook = None if book is None else np.array(book, np.float64)
-        times, frame_ids = np.array(about["times"], float), np.array(about["frame_ids"], int)
+        times, frame_ids = np.array(about["times"], float), _whole(about["frame_ids"])
+        seconds, near, held_out = float(about["seconds"]), float(about["near"]), _whole(about["held_out"])
+        width, height = _whole(about["size"]).tolist()
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected what `gsjax deform` writes, found {error!r}; {_AGAIN}") from error
-    (gaussians, field, nodes), _ = load_checkpoint(path, like)
+    (gaussians, field, nodes, viewmats, Ks), _ = load_checkpoint(path, like)
     scene = DeformingScene(gaussians, field)
     fits = codebook is None or (
         gaussians.features is not None and codebook.shape == (len(names), gaussians.features.shape[1])
     )
     if not fits or len(times) != len(frame_ids) or not len(times):
         raise ValueError(f"{path}: expected a code for each name and a time for each frame; {_AGAIN}")
-    for leaf in jax.tree.leaves(eqx.filter((scene, nodes), eqx.is_inexact_array)):
+    if min(width, height) < 1 or not set(held_out) <= set(range(len(times))):
+        raise ValueError(f"{path}: expected a size of pictures, and held-out frames of these; {_AGAIN}")
+    numbers = (scene, nodes, viewmats, Ks, times, np.array([seconds, near]))
+    for leaf in jax.tree.leaves(eqx.filter(numbers, eqx.is_inexact_array)):
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{path}: expected finite numbers, found others; {_AGAIN}")
     _check_nodes(path, nodes, gaussians.num)
-    return StoredDeformation(scene, nodes, names, codebook, times, frame_ids)
+    cameras = (viewmats, Ks, (width, height), near)
+    return StoredDeformation(scene, nodes, names, codebook, times, frame_ids, seconds, *cameras, held_out)
+
+
+def _whole(values: list[int]) -> Int[np.ndarray, "n"]:
+    return np.array(values, int).reshape(-1)
 
 
 def _like(about: Mapping[str, Any]) -> Any:
@@ -118,7 +156,8 @@ def _like(about: Mapping[str, Any]) -> Any:
         rows = jnp.zeros(places, jnp.int32)
         return gaussians, field, Nodes(rows, whole, jnp.zeros(whole.shape))
 
-    return eqx.filter_eval_shape(made)
+    frames = len(about["times"])
+    return (*eqx.filter_eval_shape(made), np.zeros((frames, 4, 4)), np.zeros((frames, 3, 3)))
 
 
 def _check_nodes(path: Path, nodes: Nodes | None, count: int) -> None:

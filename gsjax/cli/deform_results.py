@@ -1,154 +1,25 @@
-"""What a deforming scene came to: held-out frames, the other eye, tracks where truth has them; the report."""
+"""What a deforming scene came to, in a few lines and as a report."""
 
-from time import perf_counter
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 from rich.table import Table as Grid
 
-from gsjax.cli.deform_data import DeformData, Tools
-from gsjax.cli.fit_results import PANELS, mean_scores
+from gsjax.cli.deform_scores import OVER_TIME
 from gsjax.cli.machine import in_words
-from gsjax.cli.outputs import write_png
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
-from gsjax.geometry.cameras import Camera
-from gsjax.methods.surgical import DeformingScene, Look, Moving, SurgicalProblem, SurgicalState
-from gsjax.metrics.image import psnr, ssim
-from gsjax.metrics.tracking import carried_points
-from gsjax.rasterize.plan import Plan
-from gsjax.scene.render import render
-from gsjax.viz.colors import side_by_side, to_uint8
 from gsjax.viz.plots import losses_over_steps, save
 
-_SHOWN = 8  # frames in the report
-_TIMED = 12  # frames drawn to say how many a second
-_SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
-_HEADROOM = 1.3
-_LEAST_SIDE = 11  # of SSIM's window
-
-
-def judge(
-    folder: RunFolder, problem: SurgicalProblem, state: SurgicalState, data: DeformData, tools: Tools
-) -> dict[str, Any]:
-    """Scores of held-out frames, or of some that were learned from where none is, and pictures of them."""
-    plan, scene, moving = problem.plan_for(state), state.scene, state.moving
-    which = data.test or data.train[:: max(1, len(data.train) // _SHOWN)][:_SHOWN]
-    rows: list[dict[str, Any]] = []
-    for t in which:
-        look = data.look(t, 0, tools)
-        colors, depths = draw(scene, moving, look, plan)
-        number = data.sequence.frame_ids[t]
-        path = folder.path / "test" / f"{number:06d}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_png(path, to_uint8(colors))
-        row = {"frame": number, **_scores(colors, depths, look)}
-        if data.sequence.num_cameras > 1:
-            other = data.look(t, 1, tools)
-            row["psnr_other"] = psnr(draw(scene, moving, other, plan)[0], other.image / 255.0, other.counts)
-        if len(rows) < _SHOWN:
-            panels = folder.render("held_out" if data.test else "learned", number)
-            write_png(panels, side_by_side(look.image, colors, _difference(colors, look), captions=PANELS))
-            row["picture"] = str(panels.relative_to(folder.path))
-        rows.append(row)
-    test = mean_scores(rows, ("psnr_masked", "ssim", "depth_mm", "psnr_other"))
-    return {
-        "judged_by": "held out" if data.test else "learned",
-        "test": test | {"fps": _fps(scene, moving, data.look(0, 0, tools), plan)},
-        "tracks": _tracks(scene, moving, data, tools),
-        "scores": rows,
-    }
-
-
-def draw(scene: DeformingScene, moving: Moving, look: Look, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and depth of the scene where and when a look was."""
-    height, width = look.image.shape[:2]
-    viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (look.viewmat, look.K))
-    camera = Camera(viewmat, K, width, height, look.near)
-    while True:
-        time = jnp.asarray(look.time, jnp.float32)
-        colors, depths, overflow, needed = _drawn(scene, moving, time, camera, plan)
-        if not bool(overflow):  # views that nothing learned from may need a larger plan
-            return np.asarray(colors), np.asarray(depths)
-        plan = plan.grown(int(needed), _HEADROOM)
-
-
-@jax.jit
-def _drawn(scene: DeformingScene, moving: Moving, time, camera: Camera, plan: Plan):
-    got = render(scene.at(time, moving), camera, plan)
-    return jnp.clip(got.colors[0], 0, 1), got.depths[0], got.meta.overflow.any(), got.meta.needed.max()
-
-
-def _scores(colors: np.ndarray, depths: np.ndarray, look: Look) -> dict[str, Any]:
-    true = look.image / 255.0
-    row: dict[str, Any] = {"psnr_masked": psnr(colors, true, look.counts)}
-    row["ssim"] = ssim(colors, true, look.counts) if min(true.shape[:2]) >= _LEAST_SIDE else None
-    row["depth_mm"] = None
-    if look.depth is not None:
-        known = look.depth > 0 if look.counts is None else look.counts & (look.depth > 0)
-        if known.any():
-            row["depth_mm"] = 1e3 * float(np.abs(depths - look.depth)[known].mean())
-    return row
-
-
-def _difference(colors: np.ndarray, look: Look) -> np.ndarray:
-    """Five times the difference; grey where nothing counts."""
-    off = 5 * np.abs(colors - look.image / 255.0)
-    return to_uint8(
-        np.clip(off if look.counts is None else np.where(look.counts[..., None], off, 0.25), 0, 1)
-    )
-
-
-def _fps(scene: DeformingScene, moving: Moving, look: Look, plan: Plan) -> float:
-    """How often a second the scene is deformed and drawn; the median."""
-    took = []
-    for i in range(_TIMED):
-        begun = perf_counter()
-        draw(scene, moving, look._replace(time=i / _TIMED), plan)
-        took.append(perf_counter() - begun)
-    return 1 / float(np.median(took[2:]))
-
-
-def _tracks(scene: DeformingScene, moving: Moving, data: DeformData, tools: Tools) -> dict[str, float] | None:
-    """How far points that the first frame sees are from where they truly are; None without truth."""
-    truth, count = data.sequence.truth, data.sequence.num_frames
-    if truth is None or truth.tracks is None or count < 2:
-        return None
-    look = data.look(0, 0, tools)
-    start = truth.tracks[0][_seen(truth.tracks[0], look)]
-    if not len(start):
-        return None
-    at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
-    times = jnp.asarray(data.times, jnp.float32)
-    means = [np.asarray(at(scene, moving, time)) for time in times]
-    true = truth.tracks[:, _seen(truth.tracks[0], look)]
-    errors = 1e3 * np.linalg.norm(carried_points(start, np.stack(means)) - true, axis=-1)[1:]
-    still = 1e3 * np.linalg.norm(start - true, axis=-1)[1:]
-    return {
-        "points": len(start),
-        "median_mm": float(np.median(errors)),
-        "p95_mm": float(np.quantile(errors, 0.95)),
-        "still_median_mm": float(np.median(still)),
-        "still_p95_mm": float(np.quantile(still, 0.95)),
-    }
-
-
-def _seen(points: np.ndarray, look: Look) -> np.ndarray:
-    """Which points a look sees, by its depth and masks."""
-    local = points @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
-    ahead = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    x, y = ((local @ look.K.T)[:, :2] / ahead[:, None]).T
-    height, width = look.image.shape[:2]
-    inside = np.isfinite(ahead) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    column, row = (np.where(inside, a, 0).astype(int) for a in (x, y))
-    counts = inside if look.counts is None else inside & look.counts[row, column]
-    if look.depth is None:
-        return counts
-    depth = look.depth[row, column]
-    return counts & (np.abs(depth - local[:, 2]) < _SEEN_WITHIN * depth)
+_COLUMNS = (  # key, head, unit and decimals, where frames have it
+    ("frame", "frame", "", None),
+    ("psnr_masked", "PSNR where it counts", "dB", 2),
+    ("ssim", "SSIM", "", 4),
+    ("ms_ssim", "MS-SSIM", "", 4),
+    ("f_psnr", "f-PSNR", "dB", 2),
+    ("depth_mm", "depth is off by", "mm", 2),
+    ("psnr_other", "PSNR, other camera", "dB", 2),
+)
 
 
 def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
@@ -170,15 +41,17 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
             cards[words] = (f"{test[key]:.{digits}f}", unit)
     if tracks is not None:
         cards["tracks are off by, median"] = (f"{tracks['median_mm']:.2f}", "mm")
+    if test["iou"] is not None:
+        cards["IoU of classes"] = f"{test['iou']:.3f}"
     cards["frames a second"] = f"{test['fps']:.1f}"
     cards["Gaussians"] = found["num_gaussians"]
     minutes = (found["seconds"]["steps"] + found["seconds"]["compile"]) / 60
     cards["Learned for"] = (f"{minutes:.1f}", "minutes")
-    keys = ("frame", "psnr_masked", "ssim", "depth_mm", "psnr_other")
-    heads = ("frame", "PSNR where it counts", "SSIM", "depth is off by", "PSNR, other camera")
+    columns = [c for c in _COLUMNS if any(row.get(c[0]) is not None for row in found["scores"])]
+    keys, heads, units, decimals = zip(*columns, strict=True)
     rows = [[row.get(key) for key in keys] for row in found["scores"]]
-    units, decimals = ("", "dB", "", "mm", "dB"), (None, 2, 4, 2, 2)
     tables = [Table(f"Frames, {judged}", heads, rows, units=units, decimals=decimals)]
+    tables += [*_over_time(test), *_of_classes(found["classes"], test)]
     if tracks is not None:
         words = ("the scene", tracks["median_mm"], tracks["p95_mm"])
         still = ("if nothing moved", tracks["still_median_mm"], tracks["still_p95_mm"])
@@ -200,8 +73,40 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
         strips=shown,
         plots=plots,
         tables=tables,
-        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+        notes=[*found["notes"], f"{_memory(found)}.", f"Machine: {in_words(found['machine'])}."],
     )
+
+
+def _over_time(test: dict[str, Any]) -> list[Table]:
+    """How steady neighbouring frames are, beside the recording."""
+    if test["t_ssim"] is None:
+        return []
+    heads = ("each frame and its neighbour", "t-SSIM", "flow-warped error", "warped SSIM")
+    ends = (("the scene", ""), ("the recording", "_true"), ("apart", "_gap"))
+    rows = [[words, *(test[name + end] for name in OVER_TIME)] for words, end in ends]
+    share = test["flow_warp_share"]
+    note = "Nearer to the recording is better: what stands still is steadier than anything true."
+    note += "" if share is None else f" Along the flow, {share:.0%} of the pixels that count were compared."
+    return [Table("Over time", heads, rows, note=note, decimals=(None, 4, 5, 4))]
+
+
+def _of_classes(classes: list[dict[str, Any]], test: dict[str, Any]) -> list[Table]:
+    """How well what is drawn says what is what."""
+    if not classes:
+        return []
+    keys = ("class", "iou", "dice")
+    rows = [[one[key] for key in keys] for one in classes] + [["mean", test["iou"], test["dice"]]]
+    right = test["accuracy"]
+    note = "" if right is None else f"{right:.2%} of the pixels that count are named right."
+    heads = ("class", "IoU", "Dice (F1)")
+    return [Table("What is what", heads, rows, note=note, decimals=(None, 4, 4))]
+
+
+def _memory(found: dict[str, Any]) -> str:
+    """What learning took at most."""
+    memory = found["memory_mb"]
+    words, device = f"Memory, at most: {memory['process'] / 1e3:.2f} GB", memory["device"]
+    return words if device is None else f"{words}, and {device / 1e3:.2f} GB on the device"
 
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
@@ -209,11 +114,16 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     console, grid = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0))
     test, tracks, seconds = found["test"], found["tracks"], found["seconds"]
     words = [f"{test['psnr_masked']:.2f} dB"] if test["psnr_masked"] is not None else []
-    words += [f"SSIM {test['ssim']:.4f}"] if test["ssim"] is not None else []
+    for key, name in (("ssim", "SSIM"), ("ms_ssim", "MS-SSIM")):
+        words += [f"{name} {test[key]:.4f}"] if test[key] is not None else []
     words += [f"depth off by {test['depth_mm']:.2f} mm"] if test["depth_mm"] is not None else []
     grid.add_row(f"[bold]{found['judged_by']}[/]", ", ".join(words))
     if test["psnr_other"] is not None:
         grid.add_row("[bold]other camera[/]", f"{test['psnr_other']:.2f} dB")
+    if test["t_ssim"] is not None and test["flow_warp_error"] is not None:
+        words = f"t-SSIM {test['t_ssim']:.4f} (recorded {test['t_ssim_true']:.4f})"
+        words += f", flow-warped {test['flow_warp_error']:.5f} ({test['flow_warp_error_true']:.5f})"
+        grid.add_row("[bold]over time[/]", words)
     if tracks is not None:
         grid.add_row(
             "[bold]tracks[/]",
@@ -222,6 +132,10 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
         )
     if found["names"]:
         grid.add_row("[bold]names[/]", ", ".join(found["names"]))
+    if test["iou"] is not None:
+        words = f"IoU {test['iou']:.4f}, Dice {test['dice']:.4f}, accuracy {test['accuracy']:.4f}"
+        words += "" if test["f_psnr"] is None else f", f-PSNR {test['f_psnr']:.2f} dB"
+        grid.add_row("", words)
     grid.add_row(
         "[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, drawn {test['fps']:.1f} times a second"
     )

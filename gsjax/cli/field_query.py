@@ -1,7 +1,6 @@
 """`gsjax query` on a field: the Gaussians that a text, a picture or a point means, and what is done with
 them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -18,9 +17,9 @@ from gsjax.cli.field_pictures import draw
 from gsjax.cli.field_run import FieldRun, short_names
 from gsjax.cli.messages import Notes
 from gsjax.cli.run_folder import OF_QUERY, replaced_folder
+from gsjax.cli.selected import Changes, write_scenes, write_selection
 from gsjax.data.photographs import Photographs
-from gsjax.io.atomic import write_json, write_npz
-from gsjax.io.ply import write_ply
+from gsjax.io.atomic import write_json
 from gsjax.methods.feature_field import (
     Threshold,
     frozen_views,
@@ -30,8 +29,6 @@ from gsjax.methods.feature_field import (
     threshold_for,
 )
 from gsjax.rasterize.frozen import strip_of
-from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.selection import only, shifted, tinted
 
 _LITTLE = 0.5  # of a pixel's light that the scene must send
 
@@ -62,27 +59,6 @@ class Question:
         if self.point is not None:
             return f"what is at {self.point[0]:g},{self.point[1]:g} of {self.camera}"
         return repr(self.text) if self.image is None else f"what {self.image.name} shows"
-
-
-@dataclass(frozen=True)
-class Changes:
-    """What is done with what was found.
-
-    Attributes:
-        color: RGB, 0 to 1, that it has in recolored.ply.
-        move: metres by which it is moved in moved.ply; None writes none.
-    """
-
-    color: tuple[float, float, float]
-    move: tuple[float, float, float] | None = None
-
-    def of(self, gaussians: Gaussians, selected: Bool[np.ndarray, "n"]) -> dict[str, Gaussians]:
-        """Scenes with the selected ones changed, by the names of their files."""
-        there = jnp.asarray(selected)
-        scenes = {"recolored": jax.jit(tinted)(gaussians, there, jnp.asarray(self.color))}
-        if self.move is not None:
-            scenes["moved"] = jax.jit(shifted)(gaussians, there, jnp.asarray(self.move))
-        return scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +125,9 @@ def answer(
         )
     scenes = changes.of(run.gaussians, selected)
     with replaced_folder(folder, OF_QUERY) as new:
-        _write_selection(new / "selection.npz", run, found)
-        _write_scenes(new, run, selected, scenes)
+        rows = (run.rows, run.num_rows)
+        write_selection(new / "selection.npz", run.gaussians, selected, found.scores, *rows)
+        write_scenes(new, run.gaussians, selected, scenes, run.labels)
         pixels: dict[str, int] = {}
         if chosen:
             at = found.threshold.value
@@ -178,33 +155,6 @@ def answer(
         }
         write_json(new / "query.json", told)
     return told
-
-
-def _write_selection(path: Path, run: FieldRun, found: Selection) -> None:
-    """Writes selection.npz, by rows of the scene's file."""
-    selected = found.selected
-    all_scores = np.full(run.num_rows, np.nan, np.float32)
-    all_scores[run.rows] = found.scores
-    arrays = {
-        "indices": run.rows[selected],
-        "scores": found.scores[selected].astype(np.float32),
-        "means": np.asarray(run.gaussians.means)[selected],
-        "all_scores": all_scores,
-    }
-    write_npz(path, arrays)
-
-
-def _write_scenes(
-    folder: Path, run: FieldRun, selected: Bool[np.ndarray, "n"], scenes: Mapping[str, Gaussians]
-) -> None:
-    """Writes PLY files of what was found, of the rest, and of the changed scenes, with the file's labels."""
-    labels = run.labels
-    for name, kept in (("object", selected), ("without", ~selected)):
-        if kept.any():
-            part = None if labels is None else labels[kept]
-            write_ply(folder / f"{name}.ply", only(run.gaussians, kept), labels=part)
-    for name, scene in scenes.items():
-        write_ply(folder / f"{name}.ply", scene, labels=labels)
 
 
 def select(run: FieldRun, question: Question) -> Selection:

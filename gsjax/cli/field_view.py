@@ -1,9 +1,7 @@
 """A field in the viewer: what the page asks it, and what it keeps."""
 
-import re
 import threading
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from time import perf_counter
 
@@ -14,14 +12,10 @@ from jaxtyping import Bool
 
 from gsjax.cli.field_query import Question, select
 from gsjax.cli.field_run import FieldRun
-from gsjax.io.atomic import write_new
-from gsjax.io.ply import write_ply
+from gsjax.cli.selected import EXTRACTED, keep_part
 from gsjax.methods.feature_field import FeatureField, features_of, gaussian_cosines, threshold_for
 from gsjax.perception.closed_vocabulary import COLORS, OUTLINES
-from gsjax.scene.selection import only
 from gsjax.viz.viewer import Asking, Found
-
-FOLDER = "extracted"
 
 
 def asking_of(run: FieldRun) -> Asking:
@@ -36,12 +30,12 @@ def asking_of(run: FieldRun) -> Asking:
         vector = jnp.matmul(field.lift, field.encoding[row], precision="highest")
         return gaussian_cosines(field, None, vector[None])[:, 0]
 
-    def ask(text: str) -> Found:
+    def ask(text: str, frame: int) -> Found:
         with one_by_one:  # several pages may ask before the encoder is loaded
             found = select(run, Question(text=text))
         return Found(text, found.scores, found.threshold.value, found.threshold.rule, found.seconds)
 
-    def like(row: int) -> Found:
+    def like(row: int, frame: int) -> Found:
         jax.block_until_ready(likeness(jnp.asarray(row)))  # what compiles is no answer's time
         begun = perf_counter()
         scores = np.asarray(likeness(jnp.asarray(row)))
@@ -49,13 +43,8 @@ def asking_of(run: FieldRun) -> Asking:
         seconds = perf_counter() - begun
         return Found(f"like Gaussian {row}", scores, threshold.value, threshold.rule, seconds)
 
-    def save(selected: Bool[np.ndarray, "n"], name: str) -> Path:
-        folder = run.path / FOLDER
-        folder.mkdir(exist_ok=True)
-        stem = "_".join(re.findall(r"[^\W_]+", name.lower())) or "selection"
-        names = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))
-        labels = None if run.labels is None else run.labels[selected]
-        return write_new(names, lambda path: write_ply(path, only(run.gaussians, selected), labels=labels))
+    def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
+        return keep_part(run.path / EXTRACTED, name, run.gaussians, selected, run.labels)
 
     return Asking(_hint(run), ask, like, save)
 

@@ -70,6 +70,21 @@ def resident_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # macOS counts bytes
 
 
+def peak_memory_mb() -> dict[str, float | None]:
+    """The most memory that this process ever held, and that JAX ever held on the first device, MB; None where
+    the device does not tell (a CPU, whose memory is the process's)."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    peak = next((int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM")), None)
+    if peak is None:
+        import resource
+
+        unit = 1e6 if platform.system() == "Darwin" else 1e3
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    on_device = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    return {"process": peak, "device": None if on_device is None else on_device / 1e6}
+
+
 def available_mb() -> float:
     """Memory that a program may still take, MB; infinity where the system does not tell."""
     meminfo = Path("/proc/meminfo")

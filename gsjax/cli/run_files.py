@@ -18,7 +18,7 @@ from gsjax.data.errors import DataError
 from gsjax.io.ply import PlyReport, read_ply
 from gsjax.scene.gaussians import Gaussians
 
-_SETTINGS = ("dataset", "cameras", "eval_cameras", "frames")
+_SETTINGS = ("dataset", "cameras", "frames")
 
 
 def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.ndarray]:
@@ -115,7 +115,9 @@ def reopen(
         wanted = also(settings)
         read = _read_options(settings.get("read") or {})
         scale = float(settings.get("scale", 1.0))
-        return open_recording(*(settings[name] for name in _SETTINGS), read, scale), wanted
+        dataset, cameras, frames = (settings[name] for name in _SETTINGS)
+        held_out = settings.get("eval_cameras") or ()  # which not all commands have
+        return open_recording(dataset, cameras, held_out, frames, read, scale), wanted
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error

@@ -34,7 +34,7 @@ _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
 _OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
 _OF_WORTH += ("deformation.npz",)
-OF_QUERY = ("query.json", "selection.npz", "masks", "video.mp4", "overview.png")
+OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
 """What `gsjax query` writes into its folder."""
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too

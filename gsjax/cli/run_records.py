@@ -60,7 +60,7 @@ def read_record(path: Path) -> Record:
         ValueError: a file of it cannot be read, or the run is neither of `gsjax fit` nor of `gsjax track`.
     """
     expect_run(path)
-    config = _config(path / "config.yml")
+    config = read_config(path / "config.yml")
     kind = _kind(path, config)
     metrics = _object(path / "metrics.json", _SCORES[kind])
     evaluation, notes = _object(path / EVALUATION, ("scene_sha256", "lpips", "views")), ()
@@ -78,7 +78,12 @@ def digest(file: Path) -> str | None:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _config(file: Path) -> dict[str, Any]:
+def read_config(file: Path) -> dict[str, Any]:
+    """The settings of a run.
+
+    Raises:
+        ValueError: they are none.
+    """
     try:
         config = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -29,8 +29,9 @@ class Options:
     """What `gsjax view` is told."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE.ply")]
-    """Folder of a run of `gsjax fit`, `gsjax track` or `gsjax parts`; of a field (`gsjax distill`), which can
-    then be asked, as can that of a fit; or a PLY file of Gaussians."""
+    """Folder of a run of `gsjax fit`, `gsjax track`, `gsjax parts` or `gsjax deform`; of a field (`gsjax
+    distill`); or a PLY file of Gaussians. A field, a fit with one and a deforming scene with names can be
+    asked."""
     host: str = "127.0.0.1"
     """Address to listen on. Only this machine can look unless it is another than the default."""
     port: int | None = None
@@ -110,7 +111,7 @@ def in_words(scene: Viewable) -> str:
     if scene.shots is not None:
         told.append(f"{len(scene.shots.names)} {'cameras' if scene.num_frames > 1 else 'photographs'}")
     if scene.asking is not None:
-        told.append("a field to be asked")
+        told.append("can be asked")
     return ", ".join(told)
 
 

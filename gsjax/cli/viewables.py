@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from gsjax.cli.deform_file import NAME as DEFORMATION
+from gsjax.cli.deform_view import viewable_deformation
 from gsjax.cli.editing import Filmed, camera_names, editing_of
 from gsjax.cli.field_file import NAME
 from gsjax.cli.field_run import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
@@ -46,6 +48,9 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     if (path / NAME).is_file():
         return _of_field(path, notes, now), path
     expect_run(path)
+    if (path / DEFORMATION).is_file():
+        _expect_only((), now, f"{path} is a run that deforms")
+        return viewable_deformation(path, notes), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
@@ -56,7 +61,7 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
             _expect_only((), now, f"{path} is a run that moves")
             if (field := field_of(path)) is not None:
                 notes.warn(
-                    f"a scene that moves cannot be asked; gsjax view {field} shows what its field is of"
+                    f"its field is not asked while it moves; gsjax view {field} shows what its field is of"
                 )
             return of_run(path, notes), path
     return _of_fit(path, notes, now), path

@@ -1,12 +1,14 @@
-"""Masks of surgical tools, in black and white: which of the two is the tool is for the user to say."""
+"""Masks of surgical tools: in black and white, where which of the two is the tool is for the user to say; and
+in label maps, by what classes are called."""
 
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from gsjax.data.errors import DataError, DataWarning
 
@@ -17,11 +19,35 @@ TISSUE, TOOL = 0, 1
 LABEL_NAMES = {TOOL: "tool"}
 _FOLDERS = ("masks", "gt_masks")  # in EndoNeRF's releases
 _FRAMES_LOOKED_AT = 64
+_CALLED = re.compile(
+    r"\b(tool|instrument|shaft|wrist|clasper|probe|forceps|driver|sealer|retractor|scissors|grasper|stapler|"
+    r"needle|thread|clamp|clip|suction|hook|trocar|other)s?\b",
+    re.IGNORECASE,
+)
 
 
 def find_masks(root: Path) -> Path | None:
     """The folder of masks in a folder, or None."""
     return next((root / name for name in _FOLDERS if (root / name).is_dir()), None)
+
+
+def is_tool(value: int, names: Mapping[int, str]) -> bool:
+    """Whether a value of a label map is of a tool: all but 0, where it has no name; else by its name.
+
+    Args:
+        value: of a pixel.
+        names: of values, "suturing-needle" say, a tool, or "kidney-parenchyma", none.
+    """
+    if value <= TISSUE:
+        return False
+    return value not in names or _CALLED.search(re.sub(r"[-_]", " ", names[value])) is not None
+
+
+def tools_in(
+    labels: Int[np.ndarray, "height width"], names: Mapping[int, str]
+) -> Bool[np.ndarray, "height width"]:
+    """Where a label map has tools."""
+    return np.isin(labels, [v for v in np.unique(labels).tolist() if is_tool(v, names)])
 
 
 def tool_labels(mask: Int[np.ndarray, "height width"], tool: str) -> Int[np.ndarray, "height width"]:

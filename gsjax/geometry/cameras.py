@@ -1,9 +1,11 @@
 """Pinhole cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 # nerfstudio, Blender and OpenGL look along -z with +y up; one sign flip of two axes leads to OpenCV.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -84,6 +86,44 @@ def project(
     z = local[..., 2]
     homogeneous = jnp.matmul(local, K.T, precision="highest")
     return homogeneous[..., :2] / jnp.maximum(z, 1e-6)[..., None], z
+
+
+class PixelsOf(NamedTuple):
+    """The pixels on which points fall.
+
+    Attributes:
+        columns, rows: of the pixel; 0 of a point outside.
+        depths: z in the camera's frame, metres.
+        inside: before the camera and in the picture.
+    """
+
+    columns: Int[np.ndarray, "n"]
+    rows: Int[np.ndarray, "n"]
+    depths: Float[np.ndarray, "n"]
+    inside: Bool[np.ndarray, "n"]
+
+
+def pixels_of(
+    points: Float[np.ndarray, "n 3"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+    width: int,
+    height: int,
+) -> PixelsOf:
+    """Which pixel of a picture each point falls on, on the host; whether it is seen there, a depth tells.
+
+    Args:
+        points: world, metres.
+        viewmat, K: of the camera.
+        width, height: of the picture, pixels.
+    """
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depths = local[:, 2]
+    ahead = np.where(depths > 0, depths, np.inf)
+    xy = (local @ K.T)[:, :2] / ahead[:, None]
+    inside = np.isfinite(ahead) & (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)
+    columns, rows = np.where(inside[:, None], xy, 0).astype(int).T
+    return PixelsOf(columns, rows, depths, inside)
 
 
 def unproject(

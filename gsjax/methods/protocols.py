@@ -1,14 +1,17 @@
-"""What methods ask of others: who says what belongs together, what a pixel is like, where it moves, and what
-words mean.
+"""What methods ask of others: who says what belongs together, what a pixel is like, where it moves, what
+words mean, and what the answer to a question is.
 
 `gsjax.perception` has a default without weights for each, and adapters of foundation models. Nobody needs to
 inherit: whatever can be called like this fits. All of them work on the host, in numpy.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int, Num
+
+if TYPE_CHECKING:
+    from gsjax.methods.surgical import Answer, SceneFacts
 
 
 @runtime_checkable
@@ -98,4 +101,30 @@ class LanguageEncoder(Protocol):
         Raises:
             ValueError: the text says nothing that this encoder knows; the message says what it does know.
         """
+        ...
+
+
+@runtime_checkable
+class Answerer(Protocol):
+    """What is the answer to a question on a scene; `gsjax.methods.surgical` has the default."""
+
+    def __call__(self, question: str, facts: "SceneFacts") -> "Answer":
+        """A sentence, and a value where it comes to one.
+
+        Args:
+            question: in plain English.
+            facts: what was measured of the scene.
+
+        Raises:
+            ValueError: it cannot be answered; the message says what can be asked.
+        """
+        ...
+
+
+@runtime_checkable
+class LanguageModel(Protocol):
+    """A text that goes on from another; gsjax has none, its user gives the function."""
+
+    def __call__(self, prompt: str) -> str:
+        """The model's text."""
         ...

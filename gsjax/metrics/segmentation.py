@@ -1,6 +1,6 @@
 """Overlap of predicted and true label pictures, with pixels pooled over frames and cameras."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import cv2
@@ -19,6 +19,7 @@ class LabelOverlap:
     as the whole object in the next.
 
         IoU = sum |P and T| / sum |P or T|        Dice = 2 sum |P and T| / (sum |P| + sum |T|)
+        precision = sum |P and T| / sum |P|       recall = sum |P and T| / sum |T|
 
     Attributes:
         intersections, predicted, true: pixels per label.
@@ -58,9 +59,28 @@ class LabelOverlap:
         both = self.intersections.get(label, 0)
         return _ratio(2 * both, self.predicted.get(label, 0) + self.true.get(label, 0))
 
+    def f1(self, label: int) -> float:
+        """Harmonic mean of precision and recall of one label, which for pixels is Dice by another name; NaN
+        where it never occurred."""
+        both = self.intersections.get(label, 0)
+        if not both:
+            return 0.0 if label in self.labels else float("nan")
+        precision, recall = both / self.predicted[label], both / self.true[label]
+        return 2 * precision * recall / (precision + recall)
+
+    @property
+    def accuracy(self) -> float:
+        """Share of the pixels that have their true label; NaN without pixels."""
+        return _ratio(sum(self.intersections.values()), sum(self.true.values()))
+
     def mean_iou(self, labels: Iterable[int] | None = None) -> float:
         """Mean IoU over `labels` (all that occurred unless told), those that never occurred left out."""
-        values = [self.iou(label) for label in (self.labels if labels is None else labels)]
+        return self.mean(self.iou, labels)
+
+    def mean(self, score: Callable[[int], float], labels: Iterable[int] | None = None) -> float:
+        """The same of another score of one label: `dice`, `f1`. Dice of means is no mean of Dice: of classes
+        that differ, 2 mean IoU / (1 + mean IoU) is more."""
+        values = [score(label) for label in (self.labels if labels is None else labels)]
         values = [value for value in values if not np.isnan(value)]
         return float(np.mean(values)) if values else float("nan")
 

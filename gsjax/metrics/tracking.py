@@ -8,12 +8,11 @@ frame than 0 is counted from there, its anchor. In float64, on the host.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Integer
 from scipy.spatial import cKDTree
 
-from gsjax.geometry.cameras import project
+from gsjax.geometry.cameras import pixels_of
 
 UNKNOWN_LABEL = -1
 _ORTHONORMALITY = 1e-3
@@ -86,9 +85,7 @@ def _seen_by(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mask's value at each point, and the gap to the depth there (infinite outside or without depth)."""
     height, width = depth.shape
-    pixels, z = map(np.asarray, project(*(jnp.asarray(array, float) for array in (points, viewmat, K))))
-    inside = (z > 0) & np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
-    columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
+    columns, rows, z, inside = pixels_of(points, viewmat, K, width, height)
     there = depth[rows, columns]
     valid = inside & np.isfinite(there) & (there > 0)
     return mask[rows, columns], np.where(valid, np.abs(there - z), np.inf)

@@ -235,6 +235,11 @@ def deform_by_nodes(
         time: 0 to 1.
         nodes: of these Gaussians.
     """
+    return deform(gaussians, _by_nodes(gaussians, field, time, nodes))
+
+
+def _by_nodes(gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes) -> Offsets:
+    """What changes of the Gaussians whose blends `nodes` has."""
     features = None if gaussians.features is None else gaussians.features[nodes.rows]
     offsets = field(gaussians.means[nodes.rows], time, features)
 
@@ -243,7 +248,35 @@ def deform_by_nodes(
         found = interpolated(flat, nodes.weights[:, None], nodes.indices[:, None])
         return found.reshape(-1, *values.shape[1:])
 
-    return deform(gaussians, jax.tree.map(blended, offsets))
+    return jax.tree.map(blended, offsets)
+
+
+def features_at(
+    gaussians: Gaussians,
+    field: DeformationField | None,
+    times: Float[Array, "T"],
+    rows: Int[Array, "n"],
+    nodes: Nodes | None = None,
+) -> Float[Array, "T n D"]:
+    """Features of some Gaussians at some times; the field is asked only if it changes them.
+
+    Args:
+        gaussians: canonical, with features.
+        field: what moves them; None moves nothing.
+        times: 0 to 1.
+        rows: which Gaussians.
+        nodes: that the field is asked about; None: it is asked about the Gaussians themselves.
+    """
+    some = jax.tree.map(lambda leaf: leaf[rows], gaussians)
+    still = jnp.broadcast_to(some.features, (len(times), *some.features.shape))
+    if field is None or not field.config.feature:
+        return still
+    if nodes is None:
+        changes = jax.vmap(lambda time: field(some.means, time, some.features).features)(times)
+    else:
+        blends = nodes._replace(indices=nodes.indices[rows], weights=nodes.weights[rows])
+        changes = jax.vmap(lambda time: _by_nodes(gaussians, field, time, blends).features)(times)
+    return still + changes
 
 
 def deform_rows(

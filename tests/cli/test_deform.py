@@ -8,6 +8,7 @@ import pytest
 
 from gsjax.cli import learning, main
 from gsjax.cli.deform_file import read_deformation
+from gsjax.cli.deform_scores import OVER_TIME
 from gsjax.io.ply import read_ply
 
 SCENE = "simulated:tissue?width=64&height=52&frames=10"
@@ -36,6 +37,7 @@ def test_what_a_run_writes(deformed):
     assert found["test"]["psnr_masked"] > 15
     assert found["test"]["fps"] > 0
     assert found["tracks"]["points"] > 50
+    assert found["memory_mb"]["process"] > 100
     for frame in (1, 9):
         picture = cv2.imread(str(deformed / "test" / f"{frame:06d}.png"))
         assert picture.shape == (52, 64, 3)
@@ -47,6 +49,26 @@ def test_what_a_run_writes(deformed):
     assert not (deformed / "resume").exists()
     assert [row["step"] for row in found["curve"]] == [10, 20, 30]
     assert found["curve"][-1]["structure"] is not None  # the graph counts in the end
+
+
+def test_scores_over_time_and_of_classes(deformed):
+    found = metrics(deformed)
+    test = found["test"]
+    assert test["ms_ssim"] is None  # the picture is too small
+    assert 0.5 < test["t_ssim"] <= 1
+    assert 0.5 < test["flow_warp_share"] <= 1
+    for name in OVER_TIME:
+        assert test[f"{name}_gap"] == pytest.approx(abs(test[name] - test[f"{name}_true"]))
+    assert [one["class"] for one in found["classes"]] == found["names"]
+    for one in found["classes"]:
+        assert one["dice"] == pytest.approx(2 * one["iou"] / (1 + one["iou"]))
+    for name in ("iou", "dice", "f1"):
+        assert test[name] == pytest.approx(np.mean([one[name] for one in found["classes"]]))
+    assert 0.5 < test["accuracy"] <= 1
+    assert test["f_psnr"] > 6  # 6.0 dB: a code at random, four channels
+    report = (deformed / "report.html").read_text()
+    assert "t-SSIM" in report
+    assert "Dice" in report
 
 
 def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
@@ -77,6 +99,7 @@ def test_a_recipe_by_its_name(gsjax, tmp_path):
     assert code == 0, said
     assert read_deformation(run / "deformation.npz").scene.field.config.rotation == "add"
     assert metrics(run)["names"] == []
+    assert {metrics(run)["test"][name] for name in ("iou", "dice", "f1", "accuracy", "f_psnr")} == {None}
     assert metrics(run)["size"] == [32, 26]
 
 
@@ -96,18 +119,3 @@ def test_what_is_asked_is_checked(gsjax, tmp_path, told, words):
     assert code == 2
     assert words in said
     assert not (tmp_path / "run").exists()
-
-
-def test_a_recording_without_depth(gsjax, tmp_path):
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    for i in range(4):
-        picture = np.random.default_rng(i).integers(0, 255, (48, 64, 3), np.uint8)
-        cv2.imwrite(str(frames / f"{i:03d}.png"), picture)
-    writer = cv2.VideoWriter(str(tmp_path / "clip.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
-    for i in range(4):
-        writer.write(cv2.imread(str(frames / f"{i:03d}.png")))
-    writer.release()
-    code, said = gsjax("deform", tmp_path / "clip.mp4", "--out", tmp_path / "run")
-    assert code == 2
-    assert "expected frames with depth, found none" in said

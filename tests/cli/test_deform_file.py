@@ -27,7 +27,15 @@ def stored(kind="hexplane", nodes=0, features=0, moves=True):
     scene = DeformingScene(gaussians, field)
     names, book = (("tissue", "tool"), np.eye(2, features)) if features else ((), None)
     moving = nodes_of(gaussians, nodes) if nodes else None
-    return StoredDeformation(scene, moving, names, book, np.linspace(0, 1, 4), np.arange(4) + 7)
+    cameras = {"viewmats": np.tile(np.eye(4), (4, 1, 1)), "Ks": np.tile(np.diag([60.0, 60, 1]), (4, 1, 1))}
+    frames = {"times": np.linspace(0, 1, 4), "frame_ids": np.arange(4) + 7, "seconds": 2.5}
+    seen = {"size": (64, 52), "near": 0.02, "held_out": np.array([1])}
+    return StoredDeformation(scene, moving, names, book, **frames, **cameras, **seen)
+
+
+def leaves_of(given):
+    """What the file has of it."""
+    return (given.scene.gaussians, given.scene.field, given.moving, given.viewmats, given.Ks)
 
 
 @pytest.mark.parametrize(
@@ -45,12 +53,12 @@ def test_what_is_written_is_what_is_read(given, tmp_path):
     write_deformation(tmp_path / "deformation.npz", first)
     again = read_deformation(tmp_path / "deformation.npz")
     assert again.names == first.names
-    for one, other in (
-        (first.codebook, again.codebook),
-        (first.times, again.times),
-        (first.frame_ids, again.frame_ids),
-    ):
-        np.testing.assert_array_equal(one, other)
+    for name in ("codebook", "times", "frame_ids", "viewmats", "Ks", "held_out"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name), err_msg=name)
+    for name in ("seconds", "size", "near", "meaning_changes"):
+        assert getattr(first, name) == getattr(again, name)
+    camera = again.camera(2)
+    assert (camera.viewmat.shape, camera.width, camera.height, camera.near) == ((1, 4, 4), 64, 52, 0.02)
     for time in (0.0, 0.4):
         jax.tree.map(np.testing.assert_array_equal, first.at(time), again.at(time))
     assert jax.tree.structure(first.scene) == jax.tree.structure(again.scene)
@@ -78,21 +86,30 @@ def test_a_file_that_is_none(tmp_path):
 def test_a_file_with_what_no_scene_has(spoil, match, tmp_path):
     path, first = tmp_path / "deformation.npz", stored(nodes=8)
     write_deformation(path, first)
-    saved = (first.scene.gaussians, first.scene.field, first.moving)
-    (gaussians, field, nodes), about = load_checkpoint(path, saved)
+    saved = leaves_of(first)
+    (gaussians, field, nodes, *cameras), about = load_checkpoint(path, saved)
     if "finite" in match:
         gaussians = gaussians.__class__(**vars(gaussians) | {"means": spoil(saved)})
     else:
         nodes = nodes._replace(indices=spoil(saved))
-    save_checkpoint(path, (gaussians, field, nodes), about)
+    save_checkpoint(path, (gaussians, field, nodes, *cameras), about)
     with pytest.raises(ValueError, match=match):
         read_deformation(path)
 
 
-def test_a_codebook_of_other_names(tmp_path):
+@pytest.mark.parametrize(
+    ("told", "match"),
+    [
+        ({"names": ["tissue"]}, "a code for each name"),
+        ({"held_out": [1, 4]}, "held-out frames of these"),
+        ({"size": [64, 0]}, "a size of pictures"),
+        ({"size": [64]}, "expected what `gsjax deform` writes"),
+        ({"seconds": float("nan")}, "finite"),
+    ],
+)
+def test_a_file_that_tells_what_cannot_be(told, match, tmp_path):
     path, first = tmp_path / "deformation.npz", stored(features=3)
     write_deformation(path, first)
-    saved = (first.scene.gaussians, first.scene.field, first.moving)
-    save_checkpoint(path, saved, load_metadata(path) | {"names": ["tissue"]})
-    with pytest.raises(ValueError, match="a code for each name"):
+    save_checkpoint(path, leaves_of(first), load_metadata(path) | told)
+    with pytest.raises(ValueError, match=match):
         read_deformation(path)

@@ -4,9 +4,10 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-from gsjax.cli.machine import describe, in_words, keep_to_cores, name
+from gsjax.cli.machine import describe, in_words, keep_to_cores, name, peak_memory_mb, resident_mb
 
 needs_affinity = pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores"
@@ -68,3 +69,13 @@ def test_a_system_without_a_choice_says_so(monkeypatch):
     monkeypatch.delattr(os, "sched_setaffinity", raising=False)
     with pytest.raises(ValueError, match=r"--cores 1: .* does not let a process choose its cores; leave it"):
         keep_to_cores(1)
+
+
+def test_the_peak_of_memory_outlives_what_was_held():
+    held = np.ones(25_000_000)  # 200 MB
+    now = resident_mb()
+    del held
+    peak = peak_memory_mb()
+    assert peak["process"] > 0.99 * now
+    assert peak["process"] >= resident_mb()
+    assert peak["device"] is None or peak["device"] > 0

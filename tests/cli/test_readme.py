@@ -27,7 +27,10 @@ def test_it_fits_one_screen_and_its_picture_is_there():
 @pytest.mark.parametrize(
     "page",
     [
-        *(pytest.param(page, marks=pytest.mark.slow) for page in ("rasterizer.md", "fields.md", "deform.md")),
+        *(
+            pytest.param(page, marks=pytest.mark.slow)
+            for page in ("rasterizer.md", "fields.md", "deform.md", "composition.md")
+        ),
         "data.md",
         "fit.md",
     ],

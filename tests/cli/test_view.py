@@ -240,12 +240,12 @@ def test_a_fit_is_asked_by_its_field(fitted, asked, notes):
     assert scene.asking is not None
     assert scene.shots is not None
     assert scene.asking.hint == "One of: can, table"
-    found = scene.asking.ask("can")
+    found = scene.asking.ask("can", 0)
     np.testing.assert_array_equal(found.scores > found.threshold, np.arange(30) % 2 == 1)
-    found = scene.asking.like(4)
+    found = scene.asking.like(4, 0)
     np.testing.assert_array_equal(found.scores > found.threshold, np.arange(30) % 2 == 0)
     with pytest.raises(ValueError, match="no class 'spoon'"):
-        scene.asking.ask("spoon")
+        scene.asking.ask("spoon", 0)
     assert not any("field" in note for note in notes.all)
 
 
@@ -269,7 +269,7 @@ def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_pa
     assert "--scene names it" in said
     code, said = view(mine, "--port", 0, "--scene", tmp_path / "moved.ply")
     assert code == 130, said
-    assert "a field to be asked" in said
+    assert "can be asked" in said
     scene, folder = open_viewable(mine, notes, Whereabouts(tmp_path / "moved.ply"))
     assert folder == mine
     np.testing.assert_array_equal(scene.labels, np.arange(30) % 3)
@@ -278,7 +278,7 @@ def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_pa
 def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, monkeypatch):
     write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3)
     asking, selected = open_viewable(fitted, notes)[0].asking, np.arange(30) < 4
-    paths = [asking.save(selected, "The Can, object") for _ in range(2)]
+    paths = [asking.save(selected, "The Can, object", 0) for _ in range(2)]
     assert [path.name for path in paths] == ["the_can_object.ply", "the_can_object_2.ply"]
     gaussians, report = read_ply(paths[1])
     np.testing.assert_array_equal(gaussians.means, some().means[:4])
@@ -287,9 +287,9 @@ def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, m
     def full(*args, **options):
         raise OSError("no space")
 
-    monkeypatch.setattr("gsjax.cli.field_view.write_ply", full)
+    monkeypatch.setattr("gsjax.cli.selected.write_ply", full)
     with pytest.raises(OSError, match="no space"):
-        asking.save(selected, "x")
+        asking.save(selected, "x", 0)
     assert sorted(asked.joinpath("extracted").iterdir()) == paths
 
 
@@ -301,7 +301,7 @@ def test_who_reads_texts_is_loaded_once(fitted, asked, notes, monkeypatch):
     asking = open_viewable(fitted, notes)[0].asking
     assert not loaded
     for text in ("can", "table", "can"):
-        asking.ask(text)
+        asking.ask(text, 0)
     assert len(loaded) == 1
 
 
@@ -320,7 +320,7 @@ def test_what_can_be_asked_for_is_said(fitted, notes, source, hint):
     assert asking.hint.startswith(hint)
     if source.kind == "files":
         with pytest.raises(ValueError, match="--weights names its folder"):
-            asking.ask("can")
+            asking.ask("can", 0)
         assert open_viewable(fitted, notes, Whereabouts(weights=Path("x")))[0].asking.hint == "Any words"
 
 

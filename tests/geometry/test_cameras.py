@@ -10,6 +10,7 @@ from gsjax.geometry.cameras import (
     intrinsics,
     look_at,
     pixel_grid,
+    pixels_of,
     project,
     unproject,
     viewmat_from_opengl,
@@ -34,6 +35,28 @@ def test_project_is_finite_behind_the_camera():
     pixels, depths = project(jnp.array([[0.0, 0.0, -1.0], [1.0, 1.0, 0.0]]), jnp.eye(4), SKEWED)
     assert np.isfinite(pixels).all()
     np.testing.assert_array_equal(depths, [-1.0, 0.0])
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_pixels_of_points_are_where_they_project():
+    K, viewmat = np.asarray(SKEWED, np.float64), look_at(EYE, TARGET)
+    points = np.random.default_rng(1).normal(size=(2000, 3)) * 2  # some behind the camera, some outside
+    columns, rows, depths, inside = pixels_of(points, viewmat, K, 60, 44)
+    pixels, z = map(np.asarray, project(*(jnp.asarray(a) for a in (points, viewmat, K))))
+    shown = (z > 0) & (pixels >= 0).all(1) & (pixels < [60, 44]).all(1)
+    assert 100 < shown.sum() < len(points) - 100
+    np.testing.assert_array_equal(inside, shown)
+    np.testing.assert_allclose(depths, z, atol=1e-12)
+    np.testing.assert_array_equal(np.stack([columns, rows], 1), np.where(shown[:, None], pixels // 1, 0))
+
+
+def test_a_picture_holds_its_left_and_upper_edge_and_not_the_others():
+    K = intrinsics(1.0, 2, 2)
+    corners = np.array([[-1, -1, 1.0], [1, -1, 1], [-1, 1, 1], [0.999, 0.999, 1], [0, 0, 0], [0, 0, -1]])
+    found = pixels_of(corners, np.eye(4), K, 2, 2)
+    np.testing.assert_array_equal(found.inside, [True, False, False, True, False, False])
+    np.testing.assert_array_equal(found.columns, [0, 0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(found.rows, [0, 0, 0, 1, 0, 0])
 
 
 def test_look_at_sees_its_target_in_the_middle_with_up_above():

@@ -140,6 +140,7 @@ def test_splitting_takes_more_slots_as_it_needs_them_up_to_the_cap(views):
     assert slots == sorted(slots)
 
 
+@pytest.mark.slow
 def test_exposure_is_learned_where_photographs_differ_in_it(views):
     gains = np.linspace(0.6, 1.0, len(views))
     dimmed = [
@@ -169,6 +170,7 @@ def seen_as(model: Model, view: View, number: int) -> np.ndarray:
     )[0]
 
 
+@pytest.mark.slow
 def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
     random = np.random.default_rng(3)
     twists = np.concatenate([random.normal(size=(8, 3)) * 0.02, random.normal(size=(8, 3)) * 0.01], axis=1)

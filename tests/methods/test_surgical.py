@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +32,8 @@ from gsjax.methods.surgical import (
 )
 from gsjax.methods.surgical.start import known_depth
 from gsjax.metrics.image import psnr
-from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.deformation import DeformationConfig, init_deformation
+from gsjax.scene.initialize import gaussians_from_points
 from gsjax.scene.render import render
 
 CODES = np.eye(2, 4)
@@ -218,6 +220,43 @@ class TestLearning:
         fall = 0.5 * (1 + np.cos(np.pi * 3 / 6))
         np.testing.assert_allclose(steps[3] / steps[0], fall, rtol=0.02)
 
+    def test_those_that_moved_farthest_go_on_deforming(self, looks, tmp_path):
+        told = replace(CONFIG, nodes=0, warmup=2, iterations=12, moving_share=0.25)
+        problem, first = begin_surgical(looks, told)
+        gate = 2 + 3
+        for found in reconstruct(problem, first):
+            state = found.state
+            if state.step == gate:
+                before = jax.tree.map(jnp.copy, state.scene)
+            if state.step == 9:
+                save_checkpoint(tmp_path / "state.npz", jax.device_get(state))
+        rows, count = np.asarray(state.moving), before.gaussians.num
+        assert len(rows) == round(count / 4)
+        far = np.max(
+            [np.linalg.norm(before.at(b.time).means - before.gaussians.means, axis=1) for b in problem.batches],
+            axis=0,
+        )
+        assert far[rows].min() >= np.delete(far, rows).max()
+        at = state.scene.at(jnp.asarray(0.7), state.moving).means
+        still = np.delete(np.arange(count), rows)
+        np.testing.assert_array_equal(at[still], state.scene.gaussians.means[still])
+        assert np.abs(np.asarray(at - state.scene.gaussians.means))[rows].max() > 0
+        # What was saved goes on to the same bits.
+        _, again = begin_surgical(looks, told)
+        again, _ = load_checkpoint(tmp_path / "state.npz", of_step(problem, again, 9))
+        for found in reconstruct(problem, again):
+            again = found.state
+        for one, other in zip(jax.tree.leaves(state.scene), jax.tree.leaves(again.scene), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_what_cannot_be_drawn_is_left_out(self, looks):
+        given = start_gaussians(looks[:1], 0, 2.0)
+        spoilt = eqx.tree_at(lambda g: g.means, given, given.means.at[:3].set(jnp.nan))
+        _, state = begin_surgical(looks, CONFIG, gaussians=spoilt)
+        assert state.scene.gaussians.num == given.num - 3
+        with pytest.raises(ValueError, match="gaussians: expected some"):
+            begin_surgical(looks, CONFIG, gaussians=eqx.tree_at(lambda g: g.means, given, given.means * jnp.nan))
+
     def test_what_was_given_is_kept(self, looks):
         given = start_gaussians(looks[:1], 0, 2.0)
         problem, state = begin_surgical(looks, replace(CONFIG, warmup=1, iterations=0), gaussians=given)
@@ -302,6 +341,25 @@ class TestGraph:
         others = np.setdiff1d(np.arange(len(features)), nodes)
         assert (np.asarray(slope)[others] == 0).all()
         assert (np.asarray(slope)[nodes] != 0).any()
+
+
+@pytest.mark.parametrize("kind", ["all", "rows", "nodes"])
+@pytest.mark.parametrize("changes", [True, False])
+def test_features_of_some_at_times_are_those_of_the_scene_there(kind, changes):
+    points = np.random.default_rng(0).uniform(0, 1, (20, 3)).astype(np.float32)
+    gaussians = gaussians_from_points(points, points)
+    values = jax.random.normal(jax.random.key(1), (20, 3))
+    gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
+    config = DeformationConfig(resolution=4, time_resolution=3, levels=1, channels=2, hidden=5, feature=changes)
+    field = init_deformation(jax.random.key(2), config, np.array([[0, 0, 0], [1, 1, 1]]), 3)
+    field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(3), leaf.shape), field)
+    scene = DeformingScene(gaussians, field)
+    moving = {"all": None, "rows": jnp.array([1, 4, 7, 20]), "nodes": nodes_of(gaussians, 6)}[kind]
+    times, some = jnp.array([0.0, 0.3, 1.0]), jnp.array([4, 0, 9])
+    found = scene.features_at(times, some, moving)
+    wanted = jnp.stack([scene.at(time, moving).features[some] for time in times])
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    assert (np.ptp(found, axis=0).max() > 1e-3) == changes
 
 
 def test_a_scene_without_a_field_stands_still(looks):

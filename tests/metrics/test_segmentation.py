@@ -28,6 +28,34 @@ def test_dice_follows_from_iou():
         assert overlap.dice(label) == pytest.approx(2 * iou / (1 + iou))
 
 
+def test_f1_is_dice_and_accuracy_is_the_share_that_is_right():
+    rng = np.random.default_rng(1)
+    predicted, true = rng.integers(-1, 4, (2, 30, 30))
+    overlap = LabelOverlap()
+    overlap.add(predicted, true)
+    predicted, true = predicted[true >= 0], true[true >= 0]
+    told = []
+    for label in range(4):
+        precision, recall = (
+            (true[predicted == label] == label).mean(),
+            (predicted[true == label] == label).mean(),
+        )
+        told.append(2 / (1 / precision + 1 / recall))
+        assert overlap.f1(label) == pytest.approx(told[-1])
+        assert overlap.dice(label) == pytest.approx(told[-1])
+    assert overlap.mean(overlap.f1, range(5)) == pytest.approx(np.mean(told))  # there is no label 4
+    assert overlap.accuracy == pytest.approx((predicted == true).mean())
+
+
+def test_f1_of_a_label_that_is_never_hit_or_never_there():
+    overlap = LabelOverlap()
+    assert math.isnan(overlap.accuracy)
+    overlap.add(np.array([1, 2]), np.array([2, 3]))
+    assert [overlap.f1(label) for label in (1, 2, 3)] == [0, 0, 0]
+    assert math.isnan(overlap.f1(4))
+    assert overlap.accuracy == 0
+
+
 def test_unknown_pixels_and_labels_never_seen_score_nothing():
     overlap = LabelOverlap()
     overlap.add(np.array([[1, 2]], np.uint8), np.array([[1, -1]]))

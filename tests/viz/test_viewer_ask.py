@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from gsjax.scene.gaussians import concatenate
-from gsjax.viz.viewer import Asking, Found, Viewable, open_viewer
+from gsjax.viz.viewer import Asking, Found, Viewable, moved, open_viewer
 from gsjax.viz.viewer.ask_folder import heat_of
+from gsjax.viz.viewer.viewable import redone
 from tests.viz.test_viewer_edit import GREEN, RED, ball, rising
 from tests.viz.test_viewer_page import browser, color_share, until
 
@@ -20,7 +21,8 @@ HEAT, ONLY, WITHOUT, SCENE = "heat of the scores", "only what was found", "all b
 
 
 class Answers:
-    """`green` means the second half of the Gaussians, by 0.9; others are refused."""
+    """`green` means the second half of the Gaussians, by 0.9, and from frame 2 on the first; others are
+    refused."""
 
     def __init__(self):
         self.asked, self.saved = [], []
@@ -28,22 +30,23 @@ class Answers:
     def asking(self):
         return Asking("One of: green", self.ask, self.like, self.save)
 
-    def ask(self, text):
+    def ask(self, text, frame):
         self.asked.append(text)
         if text != "green":
             raise ValueError(f"no class <{text}>")
-        return Found(text, np.repeat([0.1, 0.9], 150), 0.5, "better than each negative", 0.02)
+        scores = np.repeat([0.1, 0.9] if frame < 2 else [0.9, 0.1], 150)
+        return Found(text, scores, 0.5, "better than each negative", 0.02)
 
-    def like(self, row):
+    def like(self, row, frame):
         self.asked.append(row)
         return Found(
             f"like {row}", np.repeat([0.9, 0.1] if row < 150 else [0.1, 0.9], 150), 0.5, "Otsu", 0.01
         )
 
-    def save(self, selected, name):
+    def save(self, selected, name, frame):
         if self.saved:
             raise OSError("no space")
-        self.saved.append((np.flatnonzero(selected), name))
+        self.saved.append((np.flatnonzero(selected), name, frame))
         return Path("extracted") / f"{name}.ply"
 
 
@@ -83,7 +86,7 @@ def test_a_question_is_answered_shown_and_kept(scene, answers):
         # It is kept once; then the disk is full, which is said.
         folder._keep("object")
         assert "kept as" in folder._kept.content
-        rows, name = answers.saved[0]
+        rows, name, _ = answers.saved[0]
         np.testing.assert_array_equal(rows, np.arange(150, 300))
         assert name == "green object"
         folder._keep("rest")
@@ -109,10 +112,10 @@ def test_an_answer_that_comes_late_does_not_replace_a_newer_one(scene, answers):
     begun, go_on = threading.Event(), threading.Event()
     ask = answers.ask
 
-    def slow(text):
+    def slow(text, frame=0):
         begun.set()
         assert go_on.wait(30)
-        return ask(text)
+        return ask(text, frame)
 
     answers.ask = slow
     scene = replace(scene, asking=answers.asking())
@@ -157,6 +160,46 @@ def test_what_is_picked_is_asked_for_by_its_row_in_the_whole_scene(scene, answer
         folder._picked = lambda: 7
         folder._like()
         assert answers.asked[-1] == 157
+
+
+def test_what_moves_is_asked_too(scene, answers):
+    """An answer is shown in all frames, and moves along; another frame may have another answer."""
+    moving = replace(rising(scene.gaussians, 4), labels=scene.labels, asking=answers.asking())
+    with open_viewer(moving, port=0) as viewer, browser(viewer, moving) as (page, _):
+        folder = page._questions
+        folder._text.value = "green"
+        until(lambda: "150 of 300" in folder._count.content)
+        until(lambda: max(color_share(page._picture, GREEN).values()) < 0.001)  # heat in its place
+        folder._showing.value = ONLY
+        until(lambda: "all 150 Gaussians" in page._status.content)
+        until(lambda: max(color_share(page._picture, GREEN).values()) > 0.02)
+        assert page._now.scene.num_frames == 4
+        np.testing.assert_array_equal(page._now.scene.labels, 2)
+        page._slider.value = 3
+        until(lambda: page._splats._nodes["moving"].centers[:, 2].mean() * page._splats._scale > 1.1)
+        until(lambda: color_share(page._picture, GREEN)["above"] > 0.02)
+        assert max(color_share(page._picture, RED).values()) < 0.001
+        folder._keep("object")
+        np.testing.assert_array_equal(answers.saved[0][0], np.arange(150, 300))
+        assert answers.saved[0][2] == 3
+        # Asked again in this frame, it is the other ball.
+        folder._ask()
+        until(lambda: max(color_share(page._picture, RED).values()) > 0.02)
+        assert page._slider.value == 3
+        folder._showing.value = SCENE
+        until(lambda: page._now.scene is moving)
+
+
+def test_a_part_of_a_scene_of_which_some_moves(scene):
+    """Those that move stay the first ones."""
+    means = np.asarray(scene.gaussians.means)[None, :100] + np.array([0.0, 1.0])[:, None, None]
+    quats = np.tile(np.asarray(scene.gaussians.quats)[None, :100], (2, 1, 1))
+    some = replace(scene, motion=moved(scene.gaussians, means.astype(np.float32), quats))
+    part = redone(some, lambda gaussians: gaussians, np.arange(300) % 3 == 0)
+    assert (part.num_frames, part.num_moving, part.gaussians.num) == (2, 34, 100)
+    np.testing.assert_allclose(
+        part.at(1).means - part.at(0).means, (np.arange(100) < 34)[:, None] * np.ones(3)
+    )
 
 
 def test_heat_is_bright_where_meant_and_grey_elsewhere(scene):

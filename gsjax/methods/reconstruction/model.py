@@ -5,11 +5,11 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.methods.reconstruction.config import FitConfig
+from gsjax.methods.twisted import twisted
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
 
@@ -56,12 +56,7 @@ def refined(
 ) -> Float[Array, "c 4 4"]:
     """View matrices of cameras that were turned about their centres and shifted. On average over photographs
     neither turned nor shifted, for else the scene could move along."""
-    twist = (twists - twists.mean(0))[view]
-    turn = jaxlie.SO3.exp(twist[:3]).as_matrix()
-    rotations = jnp.matmul(viewmats[:, :3, :3], turn.T, precision="highest")
-    centers = -jnp.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3]) + radius * twist[3:]
-    shifts = -jnp.einsum("cij,cj->ci", rotations, centers)
-    return viewmats.at[:, :3, :3].set(rotations).at[:, :3, 3].set(shifts)
+    return twisted(viewmats, (twists - twists.mean(0))[view], radius)
 
 
 def with_degree(model: Model, degree: int) -> Model:

@@ -2,22 +2,38 @@
 
 config      what can be set; the two papers' recipes
 start       the first Gaussians, of depth over time
+poses       where cameras stood, where that is refined
 nodes       which places the deformation is asked about
 graph       what the teacher says of nodes, and what it asks of their features
 step        deform, draw colours and features, compare, descend
 train       the host loop
 query       which Gaussians a prompt means
+facts       what can be said of a scene in numbers
+questions   what is asked in plain English
+answers     what is said to it, from facts
 """
 
+from gsjax.methods.surgical.answers import Answer, PromptedAnswerer, TemplatedAnswerer, question_prompt
 from gsjax.methods.surgical.config import (
     PRESETS,
     SurgicalConfig,
     SurgicalRatesConfig,
     SurgicalWeightsConfig,
 )
-from gsjax.methods.surgical.graph import FrameGraph, GraphConfig, frame_graphs, graph_loss, graph_nodes
+from gsjax.methods.surgical.facts import SceneFacts, Sight, facts_of_sights, scene_facts
+from gsjax.methods.surgical.graph import (
+    FrameGraph,
+    GraphConfig,
+    frame_graphs,
+    graph_loss,
+    graph_nodes,
+    graph_of,
+    seen_ids,
+)
 from gsjax.methods.surgical.nodes import nodes_of
+from gsjax.methods.surgical.poses import refined_viewmats
 from gsjax.methods.surgical.query import prompt_probabilities
+from gsjax.methods.surgical.questions import QUESTIONS, Question, QuestionType, parse_question, rows_of
 from gsjax.methods.surgical.start import Look, start_gaussians
 from gsjax.methods.surgical.step import (
     Batch,
@@ -40,28 +56,44 @@ from gsjax.methods.surgical.train import (
 
 __all__ = [
     "PRESETS",
+    "QUESTIONS",
     "Advanced",
+    "Answer",
     "Batch",
     "DeformingScene",
     "FrameGraph",
     "GraphConfig",
     "Look",
     "Moving",
+    "PromptedAnswerer",
+    "Question",
+    "QuestionType",
+    "SceneFacts",
+    "Sight",
     "SurgicalConfig",
     "SurgicalProblem",
     "SurgicalRatesConfig",
     "SurgicalState",
     "SurgicalWeightsConfig",
+    "TemplatedAnswerer",
     "begin_surgical",
     "compiled_step",
+    "facts_of_sights",
     "feature_loss",
     "frame_graphs",
     "graph_loss",
     "graph_nodes",
+    "graph_of",
     "nodes_of",
     "of_step",
+    "parse_question",
     "prompt_probabilities",
+    "question_prompt",
     "reconstruct",
+    "refined_viewmats",
+    "rows_of",
+    "scene_facts",
+    "seen_ids",
     "start_gaussians",
     "surgical_loss",
     "surgical_step",

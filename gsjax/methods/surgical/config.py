@@ -31,6 +31,8 @@ class SurgicalRatesConfig:
     """Of what stands at the vertices of the field's planes or voxels."""
     layers: float = 1e-3
     """Of the field's network."""
+    twists: float = 1e-3
+    """Of poses, where they are refined: turns in radians, shifts in radii of the scene."""
 
     def __post_init__(self):
         expect(self, "rates.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -67,11 +69,19 @@ class SurgicalConfig:
     """Steps after these, in which scene and deformation learn together."""
     start_pixels: float = 1.3
     """Edge of the cubes that are thinned to one of the first Gaussians, in pixels."""
+    plane_depth: float = 1.0
+    """Without depth the scene begins on a plane, so far before the first camera, in the unit of the poses; of
+    no matter for a camera that stands still."""
     warmup_frames: Literal["first", "all"] = "first"
     """What the canonical scene learns from: the frame at which it begins, or all."""
+    refine_poses: bool = False
+    """Let cameras be turned and shifted from where they are said to be, all but the first look's."""
     nodes: int = 2048
     """Places that the field is asked about, whose answers Gaussians blend; 0: it is asked about every
     Gaussian, as the papers have it."""
+    moving_share: float = 1.0
+    """Without nodes, the share of the Gaussians that go on deforming after a quarter of the steps with
+    deformation: those that moved farthest until then. The others stand still and cost the field nothing."""
     optimizer: Literal["adam", "adamw"] = "adam"
     """Adam, or AdamW, which also shrinks all numbers by 1e-5 of a rate."""
     schedule: Literal["exponential", "cosine"] = "exponential"
@@ -91,9 +101,16 @@ class SurgicalConfig:
             warmup=(0, np.inf),
             iterations=(0, np.inf),
             start_pixels=(0.25, np.inf),
+            plane_depth=(1e-6, np.inf),
             channels=(1, 4096),
             nodes=(0, np.inf),
+            moving_share=(1e-3, 1),
         )
+        if self.nodes and self.moving_share < 1:
+            raise ValueError(
+                f"moving_share: expected 1 with nodes, of which there are few anyway, found {self.moving_share}; "
+                "set nodes to 0"
+            )
 
 
 PRESETS = MappingProxyType(

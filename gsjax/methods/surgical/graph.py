@@ -1,8 +1,9 @@
-"""The graph over a deforming scene: what the teacher says of nodes, and what it asks of their features.
+"""The graph over a scene that moves: what the teacher says of nodes, and what it asks of their features.
 
-Nodes are Gaussians far from each other, the same in all frames, for the scene is one and deforms. At a look a
+Nodes are Gaussians far from each other, the same in all frames, for the scene is one and moves. At a look a
 node is there if the look shows it: it falls on a pixel that counts, and lies at the depth that is seen there.
-A step has the graph of its look and of those around it, which is made once, on the host.
+A step has the graph of its look and of those around it. Where all looks are known it is made once, on the
+host (`frame_graphs`); where they come one by one, within the step (`seen_ids`, `graph_of`).
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.geometry.cameras import Camera, pixels_of, project
 from gsjax.losses.graph import (
     Edges,
     Matching,
@@ -122,7 +124,7 @@ def frame_graphs(
     teacher, valid = (np.stack(column) for column in zip(*said, strict=True))
     times = np.array([look.time for look in looks])
     width = min(2 * config.window + 1, len(looks))
-    build = jax.jit(_graph, static_argnums=(0, 1))
+    build = jax.jit(graph_of, static_argnums=(0, 1))
     graphs = []
     for i in range(len(looks)):
         first = int(np.clip(i - config.window, 0, len(looks) - width))
@@ -133,22 +135,88 @@ def frame_graphs(
     return graphs
 
 
+def graph_of(
+    config: GraphConfig,
+    radius: float,
+    nodes: Int[Array, "n"],
+    times: Float[Array, "T"],
+    places: Float[Array, "T n 3"],
+    teacher: Float[Array, "T n c"],
+    valid: Bool[Array, "T n"],
+) -> FrameGraph:
+    """The graph of T looks; a pure function of its arrays.
+
+    Args:
+        config: of the graph.
+        radius: of the scene, metres.
+        nodes, times, teacher, valid: as `FrameGraph` has them.
+        places: of nodes at each look, metres.
+    """
+    if config.kind == "similarity":
+        edges = (
+            similar_edges(teacher, config.neighbors, 0, valid),
+            similar_edges(teacher, config.matches, config.window, valid),
+        )
+        return FrameGraph(nodes, times, teacher, valid, edges, None, None)
+    both = spatial_edges(places, config.neighbors, valid)
+    both |= temporal_edges(teacher, config.matches, config.window, valid, _MATCHING)
+    wanted = edge_affinities(teacher, both, valid, _MATCHING)
+    span = jnp.maximum(times[-1] - times[0], 1e-6)
+    weights = edge_weights(places, teacher, times, both, config.tau_x * radius, config.tau_t * span)
+    return FrameGraph(nodes, times, teacher, valid, (both,), wanted, weights)
+
+
+def seen_ids(
+    places: Float[Array, "n 3"],
+    cameras: Camera,
+    ids: Int[Array, "C h w"],
+    depths: Float[Array, "C height width"],
+) -> Int[Array, "n"]:
+    """Which row of the codebook the teacher gives each place, in the first of C cameras that sees it; -1
+    where none does. A pure function of its arrays: what `frame_graphs` works out on the host, within a step.
+
+    Args:
+        places: metres.
+        cameras: that look at them, viewmat [C,4,4] and K [C,3,3].
+        ids: of the teacher's pixels, a grid of any size over each picture; -1 for none.
+        depths: what is seen, metres; 0 where unknown, and there nothing hides a place.
+    """
+    (high, wide), (height, width) = ids.shape[1:], depths.shape[1:]
+
+    def one(viewmat, K, ids, depth):
+        pixels, z = project(places, viewmat, K)
+        x, y = pixels.T
+        inside = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        column, row = (jnp.where(inside, axis, 0).astype(jnp.int32) for axis in (x, y))
+        seen = depth[row, column]
+        unhidden = (seen == 0) | (jnp.abs(seen - z) < _NEAR * seen)
+        return jnp.where(inside & unhidden, ids[row * high // height, column * wide // width], -1)
+
+    said = jax.vmap(one)(cameras.viewmat, cameras.K, ids, depths)
+    return jnp.take_along_axis(said, jnp.argmax(said >= 0, axis=0)[None], axis=0)[0]
+
+
 def graph_nodes(means: Float[Array, "n 3"], count: int) -> Int[np.ndarray, "count"]:
     """Rows of Gaussians that lie far from each other."""
     sample = jax.jit(farthest_points, static_argnums=1)(means, min(count, len(means)))
     return np.asarray(sample.indices)[np.asarray(sample.valid)]
 
 
-def graph_loss(features: Float[Array, "n c"], graph: FrameGraph, config: GraphConfig) -> dict[str, Array]:
+def graph_loss(
+    features: Float[Array, "N c"] | Float[Array, "T n c"], graph: FrameGraph, config: GraphConfig
+) -> dict[str, Array]:
     """What the graph asks of the nodes' features, by name; each times what it counts.
 
     Args:
-        features: of all Gaussians, the same at all times.
+        features: of all Gaussians, the same at all times; or of the nodes at the graph's times, where they
+            change (`features_at`).
         graph: of a look.
         config: of the graph.
     """
-    one = features[graph.nodes]
-    mine = jnp.broadcast_to(one, (len(graph.times), *one.shape))
+    mine = features
+    if features.ndim == 2:
+        one = features[graph.nodes]
+        mine = jnp.broadcast_to(one, (len(graph.times), *one.shape))
     if config.kind == "matching":
         assert graph.wanted is not None
         (edges,) = graph.edges
@@ -167,35 +235,16 @@ def graph_loss(features: Float[Array, "n c"], graph: FrameGraph, config: GraphCo
 _MATCHING = Matching(derivative="implicit")  # rows are off by 3e-7 at this temperature
 
 
-def _graph(config: GraphConfig, radius: float, nodes, times, places, teacher, valid) -> FrameGraph:
-    if config.kind == "similarity":
-        edges = (
-            similar_edges(teacher, config.neighbors, 0, valid),
-            similar_edges(teacher, config.matches, config.window, valid),
-        )
-        return FrameGraph(nodes, times, teacher, valid, edges, None, None)
-    both = spatial_edges(places, config.neighbors, valid)
-    both |= temporal_edges(teacher, config.matches, config.window, valid, _MATCHING)
-    wanted = edge_affinities(teacher, both, valid, _MATCHING)
-    span = jnp.maximum(times[-1] - times[0], 1e-6)
-    weights = edge_weights(places, teacher, times, both, config.tau_x * radius, config.tau_t * span)
-    return FrameGraph(nodes, times, teacher, valid, (both,), wanted, weights)
-
-
 def _said(
     places: Float[np.ndarray, "n 3"], look: Look, codebook: Float[np.ndarray, "k c"]
 ) -> tuple[Float[np.ndarray, "n c"], Bool[np.ndarray, "n"]]:
     """What the teacher says of places in a look, and where it says something of them and not of what is
     before or behind them."""
     height, width = look.image.shape[:2]
-    local = places @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
-    ahead = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    x, y = ((local @ look.K.T)[:, :2] / ahead[:, None]).T
-    inside = np.isfinite(ahead) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    column, row = (np.where(inside, a, 0).astype(int) for a in (x, y))
+    column, row, z, inside = pixels_of(places, look.viewmat, look.K, width, height)
     depth = known_depth(look)[row, column]
-    unhidden = (depth == 0) | (np.abs(depth - local[:, 2]) < _NEAR * depth)
-    counted = np.ones(len(x), bool) if look.counts is None else look.counts[row, column]
+    unhidden = (depth == 0) | (np.abs(depth - z) < _NEAR * depth)
+    counted = np.ones(len(z), bool) if look.counts is None else look.counts[row, column]
     assert look.ids is not None
     high, wide = look.ids.shape
     ids = look.ids[row * high // height, column * wide // width]

@@ -1,10 +1,26 @@
 """Which Gaussians of a deforming scene a prompt means (papers/003, section 2.4; papers/004, section 3.4)."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 _LEAST_NORM = 1e-6
+_LITTLE = 0.5  # of a pixel's light that the scene must send, on average
+
+
+class Prompt(NamedTuple):
+    """What is asked, and what it is told apart from.
+
+    Attributes:
+        vectors: in the scene's channels, a row a candidate.
+        row: which of them is asked for.
+    """
+
+    vectors: Float[np.ndarray, "k c"]
+    row: int
 
 
 def prompt_probabilities(
@@ -28,3 +44,46 @@ def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
     squared = jnp.sum(features**2, axis=-1, keepdims=True)
     there = squared > _LEAST_NORM**2
     return jnp.where(there, features / jnp.sqrt(jnp.where(there, squared, 1.0)), 0.0)
+
+
+def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
+    """Without a prompt: the most likely of all; -1 where all are as likely."""
+    apart = probabilities.max(axis=-1) > probabilities.min(axis=-1)
+    return np.where(apart, probabilities.argmax(axis=-1), -1)
+
+
+def region_feature(
+    drawn: Float[np.ndarray, "height width c"],
+    alphas: Float[np.ndarray, "height width"],
+    box: tuple[float, float, float, float],
+) -> Float[np.ndarray, "c"]:
+    """The mean of the features rendered in a box; of the pixel, where both of its corners lie in one.
+
+    Args:
+        drawn: features, composited as colours are.
+        alphas: of the picture.
+        box: x0, y0, x1, y1 in pixels; those that it touches count.
+
+    Raises:
+        ValueError: it does not lie in the picture, or there is nothing of the scene in it.
+    """
+    height, width = alphas.shape
+    x0, y0, x1, y1 = box
+    if not (0 <= x0 <= x1 < width and 0 <= y0 <= y1 < height):
+        raise ValueError(
+            f"expected 0 <= X < {width} and 0 <= Y < {height}, the first corner left of and above the "
+            f"second, found {x0:g},{y0:g} to {x1:g},{y1:g}"
+        )
+    region = np.s_[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1]
+    if alphas[region].mean() < _LITTLE:
+        raise ValueError("expected something of the scene, found nothing there")
+    return drawn[region].mean(axis=(0, 1))
+
+
+def like_feature(feature: Float[np.ndarray, "c"], codebook: Float[np.ndarray, "k c"]) -> Prompt:
+    """A prompt for what has a feature, in place of the code that is the most like it: the others are what it
+    is told apart from."""
+    probabilities = np.asarray(prompt_probabilities(jnp.asarray(feature), jnp.asarray(codebook)))
+    row, vectors = int(probabilities.argmax()), np.array(codebook)
+    vectors[row] = feature
+    return Prompt(vectors, row)

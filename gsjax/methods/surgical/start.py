@@ -1,4 +1,4 @@
-"""The first Gaussians of a deforming scene: depth of what no tool hides, over time. On the host."""
+"""The first Gaussians of a deforming scene: depth over time where no tool is, or a plane. On the host."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from gsjax.geometry.cameras import NEAR
+from gsjax.geometry.cameras import NEAR, pixels_of
 from gsjax.geometry.neighbors import voxel_thin
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
@@ -81,16 +81,38 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
 _NEAR_PX = 2.0
 
 
+def on_plane(looks: Sequence[Look], first: int, depth: float) -> list[Look]:
+    """The looks as if all that they saw were painted on a plane that the first one faces: something to begin
+    with where depth is not known.
+
+    Args:
+        looks: over time.
+        first: which of them faces it.
+        depth: how far before it the plane lies, in the unit of the poses.
+    """
+    facing = looks[first].viewmat
+    normal = facing[2, :3]  # n . x = offset in the world
+    offset = depth - facing[2, 3]
+
+    def of(look: Look) -> Look:
+        height, width = look.image.shape[:2]
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(look.K).T
+        rotation, shift = look.viewmat[:3, :3], look.viewmat[:3, 3]
+        towards = rays @ (rotation @ normal)  # how much nearer the plane a ray comes a unit of depth
+        away = offset + (rotation.T @ shift) @ normal
+        reached = np.where(np.abs(towards) > 1e-6, away / np.where(towards == 0, 1.0, towards), 0.0)
+        return look._replace(depth=np.maximum(reached, 0.0).astype(np.float32))
+
+    return [of(look) for look in looks]
+
+
 def _in_other_pixels(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
     """Which points fall outside of a look, or where it does not count or has no depth."""
     known = known_depth(look) > 0
     height, width = known.shape
-    local = points @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
-    ahead = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    x, y = ((local @ look.K.T)[:, :2] / ahead[:, None]).T
-    inside = np.isfinite(ahead) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    column, row = (np.where(inside, np.floor(a), 0).astype(int) for a in (x, y))
-    return ~inside | ~known[row, column]
+    at = pixels_of(points, look.viewmat, look.K, width, height)
+    return ~at.inside | ~known[at.rows, at.columns]
 
 
 def known_depth(look: Look) -> Float[np.ndarray, "h w"]:

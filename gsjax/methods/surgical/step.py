@@ -14,9 +14,10 @@ from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.losses.regularization import plane_variation, second_differences
 from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, graph_loss
+from gsjax.methods.twisted import twisted
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.plan import Plan
-from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows
+from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows, features_at
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
@@ -31,10 +32,13 @@ class DeformingScene(eqx.Module):
     Attributes:
         gaussians: canonical; features are semantic.
         field: what moves them; None in the warm-up, and of a static scene.
+        twists: of each look's camera, a turn (radians) and a shift (radii of the scene), in the world's axes;
+            None: cameras stand as given.
     """
 
     gaussians: Gaussians
     field: DeformationField | None = None
+    twists: Float[Array, "looks 6"] | None = None
 
     def at(self, time: Float[Array, ""], moving: "Moving" = None) -> Gaussians:
         """The scene at a time, 0 to 1.
@@ -48,6 +52,16 @@ class DeformingScene(eqx.Module):
         if isinstance(moving, Nodes):
             return deform_by_nodes(self.gaussians, self.field, time, moving)
         return deform_rows(self.gaussians, self.field, time, moving)
+
+    def features_at(
+        self, times: Float[Array, "T"], rows: Int[Array, "n"], moving: "Moving" = None
+    ) -> Float[Array, "T n c"]:
+        """Features of some Gaussians at some times, as `at` has them."""
+        if moving is None or isinstance(moving, Nodes):
+            return features_at(self.gaussians, self.field, times, rows, moving)
+        found = features_at(self.gaussians, self.field, times, rows)
+        still = features_at(self.gaussians, None, times, rows)
+        return jnp.where(jnp.isin(rows, moving)[:, None], found, still)
 
 
 Moving = Nodes | Int[Array, "M"] | None
@@ -68,6 +82,8 @@ class Batch(NamedTuple):
         moving: what the field is asked about.
         graph: of the look and those around it; None without.
         plan: to draw with.
+        look: which row of the scene's twists the camera has; -1 of the one that stands as given. None where
+            none is refined.
     """
 
     image: UInt8[Array, "1 height width 3"]
@@ -80,6 +96,7 @@ class Batch(NamedTuple):
     moving: Moving
     graph: FrameGraph | None
     plan: Plan
+    look: Int[Array, ""] | None = None
 
 
 def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
@@ -90,7 +107,7 @@ def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
 
     def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
         there = scene.at(batch.time, batch.moving)
-        drawn = render(there, batch.camera, batch.plan)
+        drawn = render(there, _seen_from(scene, batch, radius), batch.plan)
         target = batch.image.astype(drawn.colors.dtype) / 255
         # What does not count is as it was photographed: no slope, no edge.
         image = jnp.where(batch.counts[..., None], drawn.colors, target)
@@ -105,7 +122,8 @@ def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
             assert drawn.features is not None
             terms["feature"] = weights.feature * feature_loss(drawn.features[0], batch.codebook, batch.ids)
         if batch.graph is not None and scene.gaussians.features is not None:
-            terms |= graph_loss(scene.gaussians.features, batch.graph, config.graph)
+            meanings = scene.features_at(batch.graph.times, batch.graph.nodes, batch.moving)
+            terms |= graph_loss(meanings, batch.graph, config.graph)
         if scene.field is not None and isinstance(scene.field.encoding, HexPlane):
             space, time = scene.field.encoding.space, scene.field.encoding.time
             terms["planes"] = (
@@ -119,6 +137,14 @@ def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
         return sum(terms.values()), terms | told
 
     return loss
+
+
+def _seen_from(scene: DeformingScene, batch: Batch, radius: float) -> Camera:
+    """The look's camera, refined where cameras are."""
+    if scene.twists is None or batch.look is None:
+        return batch.camera
+    twist = jnp.where(batch.look >= 0, scene.twists[batch.look], 0.0)
+    return eqx.tree_at(lambda c: c.viewmat, batch.camera, twisted(batch.camera.viewmat, twist, radius))
 
 
 def feature_loss(
@@ -155,6 +181,8 @@ def surgical_step(config: SurgicalConfig, radius: float) -> Step:
             inner = {"hexplane": ("space", "time"), "mlp": (), "voxels": ("grid",)}
             rates |= dict.fromkeys(inner[scene.field.config.kind], told["planes"])
             rates["layers"] = told["layers"]
+        if scene.twists is not None:
+            rates["twists"] = told["twists"]
         made = 0 if scene.field is None else config.warmup  # by the optimizer before this one
         falling = {name: _falling(rate, fall, made) for name, rate in rates.items()}
         decay = _DECAY if config.optimizer == "adamw" else 0.0

@@ -16,17 +16,20 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
-from gsjax.methods.surgical.start import Look, known_depth, start_gaussians
+from gsjax.methods.surgical.poses import refined_looks
+from gsjax.methods.surgical.start import Look, known_depth, on_plane, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
 from gsjax.methods.turns import whose_turn
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.deformation import init_deformation
-from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.gaussians import Gaussians, cull_invalid
 from gsjax.scene.render import plan_render
 
 _HEADROOM = 1.3
 _OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
+_GATE_AFTER = 0.25  # of the steps with deformation: until then it is seen who moves
+_THIN = 0.2  # radii: a scene is taken to reach so far along an axis at least, as a plane's does not
 _MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
 
 
@@ -104,23 +107,31 @@ def begin_surgical(
     """A reconstruction before its first step.
 
     Args:
-        looks: what a camera saw over time, all of one size.
+        looks: what a camera saw over time, all of one size. Where none has depth, it begins on a plane.
         config: how.
         codebook: what the teacher says of the rows that looks name, in `config.channels` numbers.
-        first: the look that the canonical scene is like; the first with depth where a pixel counts, unless
-            given.
-        gaussians: canonical scene to begin with; made of depth unless given.
+        first: the look that the canonical scene is like; unless given the first with depth where a pixel
+            counts, or where one counts if none has depth.
+        gaussians: canonical scene to begin with, less what cannot be drawn; made of depth, or on the plane,
+            unless given.
 
     Raises:
-        ValueError: looks differ in size, no pixel counts, there is no depth, or the teacher says what the
-            codebook has not.
+        ValueError: looks differ in size, no pixel counts, depth is nowhere known, or the teacher says what
+            the codebook has not.
     """
     _check(looks, config, codebook)
+    flat = all(look.depth is None for look in looks)
     if first is None:
-        first = next((i for i, look in enumerate(looks) if known_depth(look).any()), 0)
+        first = next((i for i, look in enumerate(looks) if _begins(look, flat)), 0)
     if gaussians is None:
-        gaussians = start_gaussians(looks, first, config.start_pixels)
-    scene = DeformingScene(jax.tree.map(jnp.array, gaussians))  # copies, for steps give buffers away
+        seen = on_plane(looks, first, config.plane_depth) if flat else looks
+        gaussians = start_gaussians(seen, first, config.start_pixels)
+    twists = jnp.zeros((len(looks), 6)) if config.refine_poses else None
+    gaussians, _ = cull_invalid(gaussians)
+    if not gaussians.num:
+        raise ValueError("gaussians: expected some that can be drawn, found none")
+    own = jax.tree.map(jnp.array, gaussians)  # copies, for steps give buffers away
+    scene = DeformingScene(own, None, twists)
     if codebook is not None:
         features = jnp.zeros((scene.gaussians.num, config.channels))
         scene = eqx.tree_at(
@@ -132,13 +143,25 @@ def begin_surgical(
     if not radius > 0:
         raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
     batches = [_batch(look, codebook) for look in looks]
+    if config.refine_poses:
+        rows = (-1 if i == first else i for i in range(len(looks)))
+        batches = [
+            batch._replace(look=jnp.asarray(row, jnp.int32)) for batch, row in zip(batches, rows, strict=True)
+        ]
     plan = _plan_of(scene.gaussians, batches)
     low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
-    room = _MARGIN * np.maximum(high - low, 1e-3 * radius)
+    room = _MARGIN * np.maximum(high - low, _THIN * radius)
     bounds = np.stack([low - room, high + room])
     problem = SurgicalProblem(looks, codebook, batches, first, config, radius, bounds, plan)
     state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, None, 0, plan.capacity)
     return problem, state
+
+
+def _begins(look: Look, flat: bool) -> bool:
+    """Whether a scene can begin with a look: something counts, and has depth where any has."""
+    if flat:
+        return look.counts is None or bool(look.counts.any())
+    return bool(known_depth(look).any())
 
 
 def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Advanced]:
@@ -153,6 +176,8 @@ def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Adva
     for i in range(state.step, config.warmup + config.iterations):
         if i == config.warmup and scene.field is None:
             scene, optimizer, moving = with_field(problem, scene)
+        if i == _gate_from(config) and config.moving_share < 1 and moving is None:
+            moving = farthest_moved(scene, problem.batches, config.moving_share)
         if i == _graph_from(config) and graphs is None:
             graphs = _graphs(problem, scene, moving)
         begun, programs = perf_counter(), advance._cache_size()
@@ -179,6 +204,8 @@ def of_step(problem: SurgicalProblem, state: SurgicalState, step: int) -> Surgic
     """
     if step > problem.config.warmup:
         scene, optimizer, moving = with_field(problem, state.scene)
+        if step > _gate_from(problem.config) and problem.config.moving_share < 1:
+            moving = jnp.arange(_share(scene.gaussians.num, problem.config.moving_share), dtype=jnp.int32)
         graphs = _graphs(problem, scene, moving) if step > _graph_from(problem.config) else None
         state = SurgicalState(scene, optimizer, moving, graphs, step, state.capacity)
     return state
@@ -189,6 +216,23 @@ def _graph_from(config: SurgicalConfig) -> int:
     return config.warmup + round(config.graph.after * config.iterations)
 
 
+def _gate_from(config: SurgicalConfig) -> int:
+    """The step before which it is settled who deforms."""
+    return config.warmup + round(_GATE_AFTER * config.iterations)
+
+
+def farthest_moved(scene: DeformingScene, batches: Sequence[Batch], share: float) -> Int[Array, "M"]:
+    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any look's time."""
+    at = jax.jit(lambda scene, time: jnp.linalg.norm(scene.at(time).means - scene.gaussians.means, axis=-1))
+    farthest = np.max([np.asarray(at(scene, batch.time)) for batch in batches], axis=0)
+    order = np.argsort(-farthest, kind="stable")
+    return jnp.asarray(np.sort(order[: _share(len(farthest), share)]), jnp.int32)
+
+
+def _share(count: int, share: float) -> int:
+    return max(1, round(share * count))
+
+
 def with_field(problem: SurgicalProblem, scene: DeformingScene) -> tuple[DeformingScene, Any, Moving]:
     """The scene with a field that moves nothing yet, an optimizer that knows nothing yet, and what the field
     is asked about."""
@@ -196,7 +240,7 @@ def with_field(problem: SurgicalProblem, scene: DeformingScene) -> tuple[Deformi
     size = 0 if gaussians.features is None else gaussians.features.shape[1]
     key = jax.random.fold_in(jax.random.key(config.seed), config.warmup)
     field = init_deformation(key, config.deformation, problem.bounds, size)
-    scene = DeformingScene(gaussians, field)
+    scene = DeformingScene(gaussians, field, scene.twists)
     moving = nodes_of(gaussians, config.nodes) if config.nodes else None
     return scene, surgical_step(config, problem.radius).init(scene), moving
 
@@ -209,7 +253,10 @@ def _graphs(problem: SurgicalProblem, scene: DeformingScene, moving: Moving) -> 
     nodes = graph_nodes(scene.gaussians.means, config.nodes)
     at = jax.jit(lambda scene, time: scene.at(time, moving).means[nodes])
     places = np.stack([np.asarray(at(scene, batch.time)) for batch in problem.batches])
-    return frame_graphs(places, nodes, problem.looks, problem.codebook, config, problem.radius)
+    looks = problem.looks
+    if scene.twists is not None:
+        looks = refined_looks(looks, scene.twists, problem.radius)
+    return frame_graphs(places, nodes, looks, problem.codebook, config, problem.radius)
 
 
 @lru_cache(maxsize=4)

@@ -3,7 +3,6 @@
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -11,12 +10,11 @@ from jaxtyping import Bool, Float, Int
 
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.selection import only
 from gsjax.viz.colors import heat
 from gsjax.viz.viewer import words
 from gsjax.viz.viewer.drawing import recolored
 from gsjax.viz.viewer.newest import Newest
-from gsjax.viz.viewer.viewable import Asking, Found, Showing, Viewable
+from gsjax.viz.viewer.viewable import Asking, Found, Showing, Viewable, redone
 
 _TYPED_S = 0.7  # without a key pressed
 _SETTLE_S, _PATIENCE_S = 0.05, 0.3  # of the threshold, while it slides
@@ -36,6 +34,7 @@ class AskFolder:
         asking: who answers.
         show: called with what is to be shown in place of the scene, or None: the scene itself.
         picked: which Gaussian of what is shown was clicked on last, or None.
+        frame: that is looked at.
         in_colour: has Gaussians shown in their colours, which heat is one of.
     """
 
@@ -46,10 +45,11 @@ class AskFolder:
         asking: Asking,
         show: Callable[[Viewable | None], None],
         picked: Callable[[], int | None],
+        frame: Callable[[], int],
         in_colour: Callable[[], None],
     ):
         self._scene, self._asking, self._show, self._picked = scene, asking, show, picked
-        self._in_colour = in_colour
+        self._frame, self._in_colour = frame, in_colour
         self._lock, self._asked = threading.Lock(), 0  # questions so far
         self._found: Found | None = None
         self._rows: Int[np.ndarray, "shown"] | None = None  # of the scene, that are shown; None: all
@@ -81,12 +81,13 @@ class AskFolder:
 
     def _ask(self) -> None:
         text = self._text.value.strip()
-        self._answer((lambda: self._asking.ask(text)) if text else None, self._asking.hint)
+        self._answer((lambda: self._asking.ask(text, self._frame())) if text else None, self._asking.hint)
 
     def _like(self) -> None:
         shown = self._picked()
         row = shown if shown is None or self._rows is None else int(self._rows[shown])
-        self._answer(None if row is None else (lambda: self._asking.like(row)), _PICK_FIRST)
+        like = None if row is None else (lambda: self._asking.like(row, self._frame()))
+        self._answer(like, _PICK_FIRST)
 
     def _answer(self, ask: Callable[[], Found] | None, otherwise: str) -> None:
         """Ask, and show the heat of the answer, unless another question came meanwhile; runs in a thread of
@@ -144,16 +145,14 @@ class AskFolder:
             elif showing == _HEAT:
                 self._rows = None
                 colors = heat_of(self._scene.gaussians, found, selected)
-                self._show(replace(self._scene, gaussians=recolored(self._scene.gaussians, colors)))
+                self._show(redone(self._scene, lambda gaussians: recolored(gaussians, colors)))
             else:
                 kept = selected if showing == _ONLY else ~selected
                 if not kept.any():
                     self._count.content = words.lines(["nothing is left to be shown"], _RED)
                     return
-                labels = None if self._scene.labels is None else self._scene.labels[kept]
                 self._rows = np.flatnonzero(kept)
-                part = only(self._scene.gaussians, kept)
-                self._show(replace(self._scene, gaussians=part, labels=labels))
+                self._show(redone(self._scene, lambda gaussians: gaussians, kept))
         except Exception as error:  # in a thread of its own nobody else would hear of it
             self._count.content = words.lines([f"{error}"], _RED)
 
@@ -167,7 +166,7 @@ class AskFolder:
             selected = selected if which == "object" else ~selected
             if not selected.any():
                 raise ValueError("nothing is left to be saved")
-            path = self._asking.save(selected, f"{self._found.what} {which}")
+            path = self._asking.save(selected, f"{self._found.what} {which}", self._frame())
             self._kept.content = words.lines([f"kept as {path}"], _GREEN)
         except Exception as error:  # nobody else would hear of it
             self._kept.content = words.lines([f"{error}"], _RED)

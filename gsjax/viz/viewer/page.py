@@ -125,8 +125,8 @@ class Page:
             shared = self._shared
             self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
         self._questions = None
-        if scene.asking is not None and scene.num_frames == 1:
-            touched = (self._show, self._picked_row, self._in_colour)
+        if scene.asking is not None and self._edits is None:
+            touched = (self._show, self._picked_row, lambda: self._frame, self._in_colour)
             self._questions = AskFolder(gui, scene, scene.asking, *touched)
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)

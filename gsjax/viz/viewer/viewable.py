@@ -1,7 +1,7 @@
 """What a viewer shows: Gaussians, where they go, their names, who photographed them, and how to edit them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gsjax.scene.gaussians import Gaussians, take, valid_rows
+from gsjax.scene.selection import only
 
 # Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
 
@@ -140,15 +141,16 @@ class Asking:
 
     Attributes:
         hint: what can be asked for.
-        ask: text -> the answer.
-        like: row of a Gaussian -> the answer to "what is like it".
-        save: (which Gaussians [N], a name) -> where they are kept as a PLY file; none is written over.
+        ask: (text, frame) -> the answer. Only what means something else in each frame looks at the frame.
+        like: (row of a Gaussian, frame) -> the answer to "what is like it".
+        save: (which Gaussians [N], a name, frame) -> where they are kept as a PLY file, as they are in that
+            frame; none is written over.
     """
 
     hint: str
-    ask: Callable[[str], Found]
-    like: Callable[[int], Found]
-    save: Callable[[Bool[np.ndarray, "n"], str], Path]
+    ask: Callable[[str, int], Found]
+    like: Callable[[int, int], Found]
+    save: Callable[[Bool[np.ndarray, "n"], str, int], Path]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +170,7 @@ class Viewable:
         antialiased: whether it was fitted with `rasterize_mode="antialiased"`.
         unit: of lengths, as in "m"; empty where only their proportions are known.
         editing: how it can be edited.
-        asking: how it can be asked, where nothing moves.
+        asking: how it can be asked, where it cannot be edited.
 
     Raises:
         ValueError: shapes disagree, there is no Gaussian, or one holds a number that is not finite.
@@ -233,6 +235,31 @@ class Viewable:
             return None
         label = int(self.labels[index])
         return self.names.get(label, "background" if label == 0 else f"object {label}")
+
+
+def redone(
+    scene: Viewable, change: Callable[[Gaussians], Gaussians], kept: Bool[np.ndarray, "n"] | None = None
+) -> Viewable:
+    """A scene with something done to its Gaussians in each frame.
+
+    Args:
+        scene: to be changed.
+        change: what is done; it does not change how many there are.
+        kept: which are left of them afterwards; all unless given.
+    """
+
+    def done(gaussians: Gaussians) -> Gaussians:
+        gaussians = change(gaussians)
+        return gaussians if kept is None else only(gaussians, kept)
+
+    labels, motion = scene.labels, scene.motion
+    if kept is not None and labels is not None:
+        labels = labels[kept]
+    if motion is not None:
+        moving = motion.num_moving if kept is None else int(kept[: motion.num_moving].sum())
+        at = motion.at
+        motion = Motion(motion.num_frames, moving, lambda frame: done(at(frame)))
+    return replace(scene, gaussians=done(scene.gaussians), labels=labels, motion=motion)
 
 
 class Preview(NamedTuple):

@@ -1,0 +1,215 @@
+"""Object tracker, feature distillation and graph in one jitted step: what is the graph worth?"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from fields import codebook_of, true_labels
+from one_step import composed, empty_memory
+from recordings import recorded
+from timing import CALLS, jitted, timed
+
+import gsjax
+from gsjax.data.photographs import photographs_of
+from gsjax.methods.object_tracker import (
+    PRESETS,
+    StartConfig,
+    TrackerBatch,
+    TrackerState,
+    first_pose,
+    first_state,
+    object_tracker,
+    place,
+    plan_tracker,
+    start_scene,
+)
+from gsjax.methods.surgical import GraphConfig, nodes_of
+from gsjax.metrics.segmentation import LabelOverlap
+from gsjax.scene.frame import Frame, part_of
+from gsjax.scene.render import plan_render, render
+
+RECORDING = "tabletop_1"
+CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, 2, 6
+TRACKER = replace(PRESETS["fast"], start=StartConfig(object_pixels=2.5, background_pixels=6.0, iterations=60))
+SHRINK = 4  # of the pictures that features are drawn in, and of the teacher's grid
+NODES, CHANNELS, RADIUS = 16, 8, 0.5  # nodes of each group; metres
+WARM = 10  # frames after which all classes have been learned, whatever the noise
+PATCH = 16  # pixels of the picture
+GRAPHS = {
+    "none": GraphConfig(kind="none"),
+    "SurstSplat's": GraphConfig(kind="matching"),
+    "its node loss alone": GraphConfig(kind="matching", structure=0.0),
+    "GaussianClin's": GraphConfig(kind="similarity"),
+}
+
+
+class Problem(NamedTuple):
+    """The recording, and all that stands still while it is followed."""
+
+    frames: list[Frame]
+    masks: np.ndarray  # [T,C,h,w], on the teacher's grid
+    scene: Any
+    nodes: Any
+    codebook: np.ndarray
+    truth: np.ndarray  # the class of each Gaussian
+    held_out: list[tuple[Any, np.ndarray]]  # camera and true mask of every sixth frame
+    plan: Any  # of the tracker
+    first: TrackerState
+
+
+@cache
+def problem() -> Problem:
+    """Made once for all cells."""
+    recording = gsjax.open_sequence(recorded(RECORDING))
+    seen = recording.select(cameras=CAMERAS)
+    frames = [seen.frame(t) for t in range(seen.num_frames)]
+    grid = slice(SHRINK // 2, None, SHRINK)
+    masks = np.array([[seen.mask(t, c) for c in range(len(CAMERAS))] for t in range(seen.num_frames)])
+    scene = start_scene(frames[0], seen.mask(0, MASK_CAMERA), MASK_CAMERA, TRACKER)
+    at_first = photographs_of(recording.select(frames=slice(0, 1)))
+    _, codes = codebook_of(at_first)
+    _, _, axes = np.linalg.svd(codes, full_matrices=False)
+    codebook = np.zeros((len(codes), CHANNELS), np.float32)
+    codebook[:, : len(axes)] = codes @ axes.T  # lengths and angles as they were
+    nodes = nodes_of(scene.gaussians, NODES, np.asarray(scene.labels))
+    pose = first_pose(scene)
+    plan = plan_tracker(scene, pose, frames[0], TRACKER)
+    alone = recording.select(cameras=(HELD_OUT,))
+    held_out = [(alone.frame(t).cameras, alone.mask(t, 0)) for t in range(0, seen.num_frames, EVERY)]
+    return Problem(
+        frames,
+        masks[:, :, grid, grid].astype(np.int32),
+        scene,
+        nodes,
+        codebook,
+        true_labels(scene.gaussians, at_first),
+        held_out,
+        plan,
+        first_state(scene, pose, frames[0], TRACKER, plan),
+    )
+
+
+@cache
+def stepper(graph: str) -> tuple[Callable, Callable]:
+    """The jitted step of a kind of graph, and its first state at a rate of Adam."""
+    p, config = problem(), GRAPHS[graph]
+    tracker = object_tracker(TRACKER, p.scene.num_objects, TrackerBatch(p.scene, p.frames[0], p.plan))
+    views = part_of(p.frames[0], shrink=SHRINK).cameras
+    plan = plan_render(p.scene.gaussians, views, headroom=2.0)
+    adam = optax.inject_hyperparams(optax.adam)(learning_rate=1.0)  # no program of its own for each rate
+    _, init, step = composed(tracker, p.nodes, jnp.asarray(p.codebook), RADIUS, adam, config, plan)
+
+    def first(rate: float):
+        features = jnp.zeros((len(p.nodes.rows), CHANNELS))
+        learning = init(features)
+        learning.hyperparams["learning_rate"] = jnp.float32(rate)
+        memory = empty_memory(2 * config.window + 1, len(p.nodes.rows))
+        return first_pose(p.scene), p.first, features, learning, memory
+
+    return jitted(step), first
+
+
+def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator) -> np.ndarray:
+    """A teacher's labels of a picture: a simulated stand-in for a model that errs anew in every picture.
+
+    Args:
+        mask: true labels [h,w], 0 the background, on the teacher's grid.
+        kind: what is mislabelled as one: "things", each class in a picture, or "patches" of 16 pixels.
+        share: how many of those have another's label.
+        random: its generator.
+    """
+    count = int(problem().masks.max()) + 1
+    if kind == "things":
+        wrong = np.where(random.random(count) < share, random.integers(1, count, count), 0)[mask]
+    else:
+        edge = PATCH // SHRINK
+        grid = tuple(-(-size // edge) for size in mask.shape)
+        coarse = np.where(random.random(grid) < share, random.integers(1, count, grid), 0)
+        wrong = np.kron(coarse, np.ones((edge, edge), int))[: mask.shape[0], : mask.shape[1]]
+    return ((mask + wrong) % count).astype(np.int32)
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """The recording followed and learned once, a step a frame; labels against truth after every one."""
+    p, (step, first) = problem(), stepper(options["graph"])
+    random = np.random.default_rng(seed)
+    taught = [[noisy(one, options["wrong"], options["share"], random) for one in pair] for pair in p.masks]
+    views = part_of(p.frames[0], shrink=SHRINK).cameras
+    state, in_space, overlap = first(options["rate"]), [], LabelOverlap()
+    for t in range(1, len(p.frames)):
+        batch = TrackerBatch(p.scene, p.frames[t], p.plan)
+        given = batch, views, jnp.asarray(np.stack(taught[t])), jnp.float32(t / 10)
+        state, told = step(state, *given)
+        assert not bool(told["skipped"] | told["overflow"].any())
+        labels = labels_of_gaussians(state[2])
+        in_space.append(of_gaussians(labels, p.truth))
+        if t % EVERY == 0 and t >= WARM:
+            camera, true = p.held_out[t // EVERY]
+            overlap.add(drawn_labels(state[0], labels, camera), true)
+    assert step._cache_size() == 1  # nothing is compiled between frames
+    ms, without_ms = durations(options["graph"], given)
+    things = range(1, len(p.codebook))
+    late = in_space[WARM - 1 :]
+    return {
+        "iou": overlap.mean_iou(things),
+        "iou_3d": np.mean(late),
+        "least_iou_3d": min(late),
+        "early_iou_3d": np.mean(in_space[: WARM - 1]),
+        "step_ms": ms,
+        "times_without": ms / without_ms,
+        "losses": [f"{k}: {np.asarray(v).mean():.4f}" for k, v in told.items() if k != "overflow"],
+        "over_time": [f"{value:.3f}" for value in in_space],
+        "things": [f"{k}: {overlap.iou(k):.2f}" for k in things],
+    }
+
+
+def durations(graph: str, given: tuple) -> tuple[float, float]:
+    """Milliseconds of a step with this graph, and of one without a graph: medians, taken in turns."""
+    steps = [stepper(kind) for kind in (graph, "none")]
+    took = [[timed(step, first(0.03), *given)[1] for step, first in steps] for _ in range(CALLS + 1)]
+    ours, without = np.median(took[1:], axis=0)  # the first may compile
+    return float(ours), float(without)
+
+
+def labels_of_gaussians(features: jax.Array) -> np.ndarray:
+    """The class that each Gaussian's blended feature is nearest to."""
+    p = problem()
+    blended = np.einsum("nk,nkc->nc", np.asarray(p.nodes.weights), np.asarray(features)[p.nodes.indices])
+    return (blended @ p.codebook.T).argmax(axis=1)
+
+
+def of_gaussians(labels: np.ndarray, truth: np.ndarray) -> float:
+    """Mean IoU over all classes but the background, of Gaussians whose class is known."""
+    overlap = LabelOverlap()
+    overlap.add(labels, truth)
+    return overlap.mean_iou(range(1, int(truth.max()) + 1))
+
+
+@jax.jit
+def _shares(scene, pose, camera, plan, classes):
+    drawn = render(place(scene, pose), camera, plan, features=classes)
+    assert drawn.features is not None
+    return drawn.features[0]
+
+
+@cache
+def _held_out_plan():
+    p = problem()
+    return plan_render(p.scene.gaussians, p.held_out[0][0], headroom=2.0)
+
+
+def drawn_labels(pose: Any, labels: np.ndarray, camera: Any) -> np.ndarray:
+    """Which class most of each pixel of the held-out camera is."""
+    p = problem()
+    classes = jax.nn.one_hot(labels, len(p.codebook))
+    shares = _shares(p.scene, pose, camera, _held_out_plan(), classes)
+    return np.asarray(shares.argmax(axis=-1))

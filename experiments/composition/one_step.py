@@ -1,0 +1,73 @@
+"""Three methods as one jitted step: the object tracker (papers/000), a teacher's features distilled into what
+is tracked (papers/002 to 004), and the graph of SurstSplat or GaussianClin over them (papers/003, 004).
+docs/composition.md has `composed` as it stands here."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from gsjax.methods.object_tracker import TrackerBatch, place
+from gsjax.methods.surgical import feature_loss, graph_loss, graph_of, seen_ids
+from gsjax.optim.step import gradient_step
+from gsjax.scene.render import render
+
+
+class Memory(NamedTuple):
+    """Of the last T frames: when, where each node was, and what the teacher said of it (-1: nothing)."""
+
+    times: Float[Array, "T"]
+    places: Float[Array, "T n 3"]
+    ids: Int[Array, "T n"]
+
+
+def empty_memory(frames: int, nodes: int) -> Memory:
+    """Before the first frame."""
+    return Memory(jnp.zeros(frames), jnp.zeros((frames, nodes, 3)), jnp.full((frames, nodes), -1, jnp.int32))
+
+
+def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
+    """The losses of a frame, the optimizer's first state, and the step.
+
+    Args:
+        tracker: a `Step`, from `object_tracker`.
+        nodes: Gaussians that have features, of which the others blend theirs (`nodes_of`).
+        codebook: what the teacher may say, a row a class.
+        radius: of the scene, metres.
+        optimizer: of features.
+        config: `GraphConfig`.
+        plan: to draw features with.
+    """
+
+    def spread(features):
+        return jnp.einsum("nk,nkc->nc", nodes.weights, features[nodes.indices])
+
+    def loss(features, batch, *, step, key):
+        gaussians, views, ids, graph = batch
+        drawn = render(gaussians, views, plan, features=spread(features))
+        of_views = jax.vmap(feature_loss, (0, None, 0))(drawn.features, codebook, ids)
+        terms = {"feature": of_views.mean()}
+        if graph is not None:
+            terms |= graph_loss(spread(features), graph, config)
+        return sum(terms.values()), terms | {"overflow": drawn.meta.overflow.any()}
+
+    learner = gradient_step(loss, optimizer)
+
+    def step(state, batch: TrackerBatch, views, ids, time):
+        pose, tracking, features, learning, memory = state
+        pose, tracking, tracked = tracker.update(pose, tracking, batch, step=0, key=None)
+        gaussians, graph = place(batch.scene, pose), None
+        if config.kind != "none":
+            places = gaussians.means[nodes.rows]
+            new = Memory(time, places, seen_ids(places, batch.frame.cameras, ids, batch.frame.depths))
+            memory = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), memory, new)
+            said = codebook[jnp.maximum(memory.ids, 0)]
+            graph = graph_of(config, radius, nodes.rows, *memory[:2], said, memory.ids >= 0)
+        given = gaussians, views, ids, graph
+        features, learning, told = learner.update(features, learning, given, step=0, key=None)
+        told |= {"tracker": tracked["residual"], "lost": tracked["lost"]}
+        told["overflow"] |= tracked["overflow"]
+        return (pose, tracking, features, learning, memory), told
+
+    return loss, learner.init, step

@@ -1,0 +1,161 @@
+"""Does a deforming scene stay finite where it should not be asked to work at all?"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gsjax
+from gsjax.cli.deform_scores import draw
+from gsjax.methods.surgical import (
+    GraphConfig,
+    Look,
+    SurgicalConfig,
+    SurgicalRatesConfig,
+    SurgicalWeightsConfig,
+    begin_surgical,
+    reconstruct,
+    start_gaussians,
+)
+from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.gaussians import Gaussians
+
+DATA = "simulated:tissue?width=64&height=52&frames=6"
+BASE = SurgicalConfig(
+    warmup=5,
+    iterations=25,
+    start_pixels=1.0,
+    nodes=64,
+    channels=4,
+    deformation=DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16),
+    graph=GraphConfig(after=0.2, nodes=32, neighbors=3, matches=2, window=1),
+)
+CODES = np.eye(2, 4)
+FAR_TIMES = (-1e9, 0.0, 0.5, 1.0, 1e9)
+
+
+class Given(NamedTuple):
+    """What a reconstruction is given."""
+
+    looks: list[Look]
+    config: SurgicalConfig
+    codes: np.ndarray
+    gaussians: Gaussians | None = None
+
+
+def _config(**settings: Any) -> Callable[[Given], Given]:
+    return lambda given: given._replace(config=replace(given.config, **settings))
+
+
+def _field(**settings: Any) -> Callable[[Given], Given]:
+    return _config(deformation=replace(BASE.deformation, **settings))
+
+
+def _graph(**settings: Any) -> Callable[[Given], Given]:
+    return _config(graph=replace(BASE.graph, **settings))
+
+
+def _looks(change: Callable[[Look], Look]) -> Callable[[Given], Given]:
+    return lambda given: given._replace(looks=[change(look) for look in given.looks])
+
+
+def _start(change: Callable[[Gaussians], Gaussians]) -> Callable[[Given], Given]:
+    def changed(given: Given) -> Given:
+        return given._replace(gaussians=change(start_gaussians(given.looks, 0, given.config.start_pixels)))
+
+    return changed
+
+
+def _larger(factor: float) -> Callable[[Look], Look]:
+    """The same scene in another unit of length."""
+
+    def of(look: Look) -> Look:
+        viewmat = look.viewmat.copy()
+        viewmat[:3, 3] *= factor
+        return look._replace(viewmat=viewmat, depth=look.depth * factor, near=look.near * factor)
+
+    return of
+
+
+def _one_pixel(look: Look) -> Look:
+    counts = np.zeros_like(look.counts)
+    counts[20:22, 20:22] = True
+    return look._replace(counts=counts)
+
+
+def _with(name: str, value: Callable[[Any], Any]) -> Callable[[Gaussians], Gaussians]:
+    return lambda gaussians: eqx.tree_at(lambda g: getattr(g, name), gaussians, replace_fn=value)
+
+
+CASES: dict[str, Callable[[Given], Given]] = {
+    "as it is": lambda given: given,
+    "GaussianClin's turns and pairs": lambda given: _graph(kind="similarity")(_field(rotation="add")(given)),
+    "sines": _field(kind="mlp"),
+    "sines of 2^20 half periods": _field(kind="mlp", frequencies=20),
+    "voxels": _field(kind="voxels"),
+    "two vertices an axis and of time": _field(resolution=2, time_resolution=2),
+    "all that can change over time": _field(color=True, opacity=True, feature=True, semantic=True),
+    "one node": _config(nodes=1),
+    "more nodes than Gaussians": _config(nodes=100_000),
+    "no nodes, one Gaussian in a hundred deforms": _config(nodes=0, moving_share=0.01),
+    "rates a thousand times as high": _config(
+        rates=SurgicalRatesConfig(*(1e3 * rate for rate in vars(SurgicalRatesConfig()).values()))
+    ),
+    "weights 1e9": _config(weights=SurgicalWeightsConfig(depth=1e9, feature=1e9, plane_tv=1e9)),
+    "two nodes in the graph": _graph(nodes=2),
+    "a graph whose edges end at 1e-6 radii": _graph(tau_x=1e-6, tau_t=1e-6),
+    "a graph of weight 1e9": _graph(node=1e9, structure=1e9),
+    "codes of length 1e6": lambda given: given._replace(codes=1e6 * CODES),
+    "codes of length 1e-6": lambda given: given._replace(codes=1e-6 * CODES),
+    "codes all alike": lambda given: given._replace(codes=np.ones_like(CODES)),
+    "four pixels count": _looks(_one_pixel),
+    "one look": lambda given: given._replace(looks=given.looks[:1]),
+    "all looks at one time": _looks(lambda look: look._replace(time=0.5)),
+    "in micrometres": _looks(_larger(1e6)),
+    "in kilometres": _looks(_larger(1e-3)),
+    "a Gaussian 1000 km away": _start(_with("means", lambda a: a.at[0].set(jnp.array([1e6, 0.0, 0.0])))),
+    "ten Gaussians without a place": _start(_with("means", lambda a: a.at[:10].set(jnp.nan))),
+    "all scales 1e-12": _start(_with("log_scales", lambda a: jnp.full_like(a, np.log(1e-12)))),
+    "quaternions of length 1e-5": _start(_with("quats", lambda a: 1e-5 * a)),
+}
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """Thirty steps of one case, and the scene long before, during and long after the recording."""
+    given = CASES[options["case"]](_given(seed))
+    problem, state = begin_surgical(given.looks, given.config, given.codes, gaussians=given.gaussians)
+    rows = []
+    for found in reconstruct(problem, state):
+        state = found.state
+        rows.append(jax.device_get(found.info))
+    losses = np.array([float(row["loss"]) for row in rows])
+    pictures, plan = [], problem.plan_for(state)
+    for time in FAR_TIMES:
+        seen = draw(state.scene, state.moving, given.looks[0]._replace(time=time), plan)
+        pictures.append(np.isfinite(seen.colors).all() and np.isfinite(seen.depths).all())
+    leaves = jax.tree.leaves(state.scene.field)
+    return {
+        "finite_losses": float(np.isfinite(losses).mean()),
+        "skipped": sum(bool(row["skipped"]) for row in rows),
+        "first_psnr": float(rows[0]["psnr"]),
+        "last_psnr": float(rows[-1]["psnr"]),
+        "finite_field": float(np.mean([np.isfinite(leaf).all() for leaf in leaves])),
+        "finite_pictures": float(np.mean(pictures)),
+    }
+
+
+def _given(seed: int) -> Given:
+    seen = gsjax.open_sequence(DATA)
+    last = seen.num_frames - 1
+    looks = []
+    for t in range(seen.num_frames):
+        mask = seen.mask(t, 0)
+        cameras = (seen.viewmats[t, 0], seen.Ks[t, 0], t / last)
+        ids = (np.arange(seen.width) > seen.width // 2)[None].repeat(seen.height, 0).astype(np.int32)
+        looks.append(Look(seen.image(t, 0), mask == 0, seen.depth(t, 0), *cameras, ids, seen.near))
+    return Given(looks, replace(BASE, seed=seed), CODES)

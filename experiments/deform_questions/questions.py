@@ -1,0 +1,153 @@
+"""How often are ten types of question on a deforming scene answered as the simulation's truth has it?"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
+
+import jax.numpy as jnp
+import numpy as np
+from deform_regions import with_errors
+from deform_truth import NAMES, Truth, built_in
+from deforming import Dataset, Reconstructed, dataset, learned, summary
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.surgical import (
+    PRESETS,
+    QUESTIONS,
+    GraphConfig,
+    Question,
+    SceneFacts,
+    TemplatedAnswerer,
+    parse_question,
+    scene_facts,
+)
+
+CONFIG = replace(
+    PRESETS["surst"],
+    warmup=100,
+    iterations=300,
+    start_pixels=2.2,
+    channels=8,
+    graph=GraphConfig(kind="none"),
+)
+WRONG = {"labels all right": 0.0, "labels 30 % wrong": 0.3}
+ASKED = 120  # of each type, but when
+FIRST = 0.25  # of the recording: the frame that the canonical scene is like, with the tool in view
+WITHIN = {"depth": 1.0, "distance": 2.0, "motion": 0.5, "when": 2}  # mm, and frames
+EVENTS = ("first seen", "fastest", "nearest", "touch")
+
+
+class Asked(NamedTuple):
+    """A question, and its true answer."""
+
+    text: str
+    meant: Question
+    true: Any
+
+
+def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
+    """Questions on five regions of the tissue and the tool, answered from a scene, or by the one answer to
+    each type that is right most often."""
+    data, truth = _data(options["scene"], seed)
+    asked = questions(truth)
+    if options["answers"] == "blind":
+        return _blind(asked)
+    found = _learned(data, truth, WRONG[options["answers"]], seed)
+    facts = _facts(data, found)
+    answer = TemplatedAnswerer()
+    right = [_right(one.meant.kind, answer(one.text, facts).value, one.true) for one in asked]
+    tool = [NAMES.index("tool") in one.meant.things for one in asked]
+    shares, of_tool, of_tissue = {}, {}, {}
+    for kind in QUESTIONS:
+        of_kind = [one.meant.kind == kind.name for one in asked]
+        shares[kind.name] = _share(right, of_kind)
+        of_tool[f"{kind.name}_tool"] = _share(right, [a and b for a, b in zip(of_kind, tool, strict=True)])
+        of_tissue[f"{kind.name}_tissue"] = _share(right, [a > b for a, b in zip(of_kind, tool, strict=True)])
+    out = [bool(one.meant.frames) and set(one.meant.frames) <= set(truth.data.test) for one in asked]
+    return {
+        **shares,
+        "all": float(np.mean(list(shares.values()))),
+        "held_out": _share(right, out),
+        "all_tissue": float(np.mean(list(of_tissue.values()))),
+        "all_tool": float(np.mean(list(of_tool.values()))),
+        **of_tissue,
+        **of_tool,
+        "questions": len(asked),
+        **summary(found),
+    }
+
+
+def _data(scene: str, seed: int) -> tuple[Dataset, Truth]:
+    """What is learned from, and what is true: tissue_0 is learned at half of its width and height."""
+    if scene == "tissue_0":
+        return dataset(scale=0.5), Truth(dataset())
+    data = built_in(seed)
+    return data, Truth(data)
+
+
+def questions(truth: Truth) -> list[Asked]:
+    """The same for all that answer."""
+    rng, things, texts = np.random.default_rng(0), NAMES[1:], []
+    for kind in QUESTIONS:
+        if kind.name == "when":
+            texts += [f"when is {one} {event}?" for one in things for event in EVENTS[:-1]]
+            texts += [f"when do {one} and tool first touch?" for one in things[:-1]]
+            continue
+        for _ in range(ASKED):
+            one, other = rng.choice(things, 2, replace=False)
+            f, g = rng.choice(truth.count, 2, replace=False)
+            given = {"X": one, "Y": other, "F": str(f), "G": str(g)}
+            texts.append(" ".join(given.get(word.rstrip("?,"), word) for word in kind.example.split()))
+    meant = [parse_question(text, NAMES) for text in texts]
+    return [Asked(text, q, truth.answer(q)) for text, q in zip(texts, meant, strict=True)]
+
+
+def _learned(data: Dataset, truth: Truth, wrong: float, seed: int) -> Reconstructed:
+    """The scene with its tool, of all frames that are not held out, and a teacher that errs."""
+    rng, config = np.random.default_rng(seed), replace(CONFIG, seed=seed)
+    codes, step = np.eye(len(NAMES), config.channels), truth.data.sequence.width // data.sequence.width
+    labels = truth.labels[:, step // 2 :: step, step // 2 :: step]
+    taught = {t: with_errors(labels[t], wrong, rng, classes=len(NAMES)) for t in data.train}
+    looks = [data.look(t, ids=ids, tools=True) for t, ids in taught.items()]
+    return learned(looks, config, codes, first=round(FIRST * len(looks)))
+
+
+def _facts(data: Dataset, found: Reconstructed) -> SceneFacts:
+    """Of all frames."""
+    frames = range(data.sequence.num_frames)
+    looks = [data.look(t) for t in frames]
+    height, width = looks[0].image.shape[:2]
+    viewmats, Ks = (
+        jnp.asarray(np.stack([getattr(look, name) for look in looks]), jnp.float32)
+        for name in ("viewmat", "K")
+    )
+    times = np.array([look.time for look in looks])
+    codes = np.eye(len(NAMES), found.problem.config.channels)
+    cameras = Camera(viewmats, Ks, width, height, looks[0].near)
+    return scene_facts(found.state.scene, found.state.moving, times, cameras, codes, NAMES, frames)
+
+
+def _right(kind: str, answer: Any, true: Any) -> bool:
+    """Whether an answer is the true one: a number within what is stated, anything else to the letter."""
+    if kind not in WITHIN or answer is None or true is None:
+        return answer == true
+    return abs(answer - true) <= WITHIN[kind]
+
+
+def _blind(asked: list[Asked]) -> dict[str, float]:
+    """Of the one answer to all questions of a type that is right most often."""
+    shares = {}
+    for kind in QUESTIONS:
+        true = [one.true for one in asked if one.meant.kind == kind.name]
+        shares[kind.name] = max(
+            100 * float(np.mean([_right(kind.name, guess, value) for value in true])) for guess in true
+        )
+    return {**shares, "all": float(np.mean(list(shares.values()))), "questions": len(asked)}
+
+
+def _share(right: list[bool], which: list[bool]) -> float:
+    """Per cent of those that are right."""
+    return 100 * float(np.mean(np.array(right)[which]))

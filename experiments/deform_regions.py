@@ -1,0 +1,83 @@
+"""Meanings on simulated tissue: regions that deform with it, and a teacher that errs.
+
+It stands in for a foundation model: what a pixel shows is taken from the simulation's truth, and then made
+wrong in a known share of blocks.
+"""
+
+import numpy as np
+from deforming import Dataset, Reconstructed
+from jaxtyping import Int
+from scipy.spatial import cKDTree
+
+from gsjax.cli.deform_scores import draw
+from gsjax.metrics.features import feature_psnr
+from gsjax.metrics.segmentation import LabelOverlap
+
+BACKGROUND = 0
+REGIONS = 5  # of the tissue, beside the background
+_SEEDS_UV = np.array([[0.2, 0.25], [0.75, 0.2], [0.5, 0.5], [0.2, 0.8], [0.8, 0.75]])
+_NEAREST = 4  # vertices, between which a pixel's place on the tissue lies
+CLASSES = REGIONS + 1
+BLOCK_PX = 16
+
+
+def region_map(data: Dataset, t: int) -> Int[np.ndarray, "h w"]:
+    """What the left eye sees: 0 the background, 1 to 5 regions of the tissue by where on it they lie (the
+    nearest of five places on its own map, uv), -1 the tool."""
+    look = data.look(t)
+    height, width = look.image.shape[:2]
+    high, wide = data.truth["seg"][t].shape
+    seg = data.truth["seg"][t][
+        np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)
+    ]
+    y, x = np.nonzero((seg == 1) & (look.depth > 0))
+    depth = look.depth[y, x].astype(np.float64)
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(look.K).T
+    camera_to_world = np.linalg.inv(look.viewmat)
+    points = (rays * depth[:, None]) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    apart, which = cKDTree(data.truth["verts"][t]).query(points, k=_NEAREST)
+    weights = 1 / np.maximum(apart, 1e-9) ** 2
+    uv = (data.truth["uv"][which] * weights[..., None]).sum(axis=1) / weights.sum(axis=1, keepdims=True)
+    regions = np.full((height, width), -1, np.int32)
+    regions[seg == 0] = BACKGROUND
+    regions[y, x] = 1 + np.linalg.norm(uv[:, None] - _SEEDS_UV, axis=-1).argmin(axis=1)
+    return regions
+
+
+def with_errors(
+    regions: Int[np.ndarray, "h w"],
+    share: float,
+    rng: np.random.Generator,
+    block: int = BLOCK_PX,
+    classes: int = CLASSES,
+) -> Int[np.ndarray, "h w"]:
+    """Regions with the label of a share of blocks replaced by another one, as a segmenter that errs does: in
+    whole patches, and in each frame in others."""
+    height, width = regions.shape
+    rows, columns = -(-height // block), -(-width // block)
+    wrong = rng.random((rows, columns)) < share
+    added = rng.integers(1, classes, (rows, columns))
+    spread = np.kron(np.where(wrong, added, 0), np.ones((block, block), int))[:height, :width]
+    return np.where(regions < 0, regions, (regions + spread) % classes).astype(np.int32)
+
+
+def meanings(found: Reconstructed, data: Dataset, codes: np.ndarray) -> dict[str, float]:
+    """Of held-out frames: f-PSNR against what the teacher would say without errors, IoU of classes (a mean
+    over classes, pooled over frames), how it varies from frame to frame, and the share of right pixels."""
+    state, overlap, each, psnrs, right = found.state, LabelOverlap(), [], [], []
+    for t in data.test:
+        true = region_map(data, t)
+        features = draw(state.scene, state.moving, data.look(t), found.problem.plan_for(state)).features
+        psnrs.append(feature_psnr(features, codes[np.maximum(true, 0)], true >= 0))
+        named = (features @ codes.T).argmax(axis=-1).astype(np.int32)
+        overlap.add(named, true)
+        one = LabelOverlap()
+        one.add(named, true)
+        each.append(one.mean_iou(range(CLASSES)))
+        right.append((named == true)[true >= 0].mean())
+    return {
+        "f_psnr": float(np.mean(psnrs)),
+        "iou": overlap.mean_iou(range(CLASSES)),
+        "iou_spread": float(np.std(each)),
+        "accuracy": float(np.mean(right)),
+    }

@@ -1,0 +1,263 @@
+"""`gsjax query` on a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of
+them are, at every time."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from rich.console import Console
+
+from gsjax.cli.deform_file import StoredDeformation
+from gsjax.cli.deform_pictures import draw, draw_labels, probabilities_of
+from gsjax.cli.messages import Notes
+from gsjax.cli.recording import parse_frames
+from gsjax.cli.run_folder import OF_QUERY, replaced_folder
+from gsjax.cli.selected import Changes, write_scenes, write_selection
+from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.ply import write_ply
+from gsjax.methods.surgical.query import (
+    Prompt,
+    like_feature,
+    most_likely,
+    region_feature,
+)
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import render_with_room
+from gsjax.viz.colors import INVALID, label_color
+from gsjax.viz.viewer.drawing import recolored
+
+EVEN = 0.5
+"""The probability above which a Gaussian is meant: more likely than all else together."""
+RULE = "a probability among names"
+
+
+@dataclass(frozen=True)
+class DeformQuestion:
+    """What is asked of a deforming scene: one of text, point and box; without any, what everything is.
+
+    Attributes:
+        text: one of the scene's names.
+        point: x, y in pixels of a frame, as the scene was learned.
+        box: x0, y0, x1, y1, likewise.
+        frame: what the recording calls the frame in which point and box lie, and whose Gaussians are written;
+            the first unless given.
+        frames: of which pictures are made, as Python slices them; the held-out ones unless given.
+        threshold: of the probability.
+    """
+
+    text: str | None = None
+    point: tuple[float, float] | None = None
+    box: tuple[float, float, float, float] | None = None
+    frame: int | None = None
+    frames: str | None = None
+    threshold: float = EVEN
+
+    @property
+    def region(self) -> tuple[float, float, float, float] | None:
+        """The box; a point is one without extent."""
+        return self.box if self.point is None else self.point * 2
+
+    @property
+    def words(self) -> str:
+        """What was asked, in short."""
+        if self.point is not None:
+            return "what is at {:g},{:g}".format(*self.point)
+        if self.box is not None:
+            return "what is in {:g},{:g} to {:g},{:g}".format(*self.box)
+        return "what is what" if self.text is None else repr(self.text)
+
+
+def answer_deformation(
+    path: Path,
+    stored: StoredDeformation,
+    question: DeformQuestion,
+    changes: Changes,
+    folder: Path,
+    notes: Notes,
+    console: Console,
+) -> dict[str, Any]:
+    """Ask, and write what is found into a folder; returns what query.json says.
+
+        query/
+          query.json          what was asked, how many Gaussians are meant, where, how large; pixels by frame
+          selection.npz       as a field's, of the frame that was asked about (rows of the run's scene.ply)
+          object.ply          what was found, in that frame; without.ply the scene without it, recolored.ply
+                              with it in another colour, moved.ply with it elsewhere
+          masks/FRAME.png     255 where a pixel's own features mean it
+          frames/FRAME.png    the scene, what was found alone, the scene without it, recoloured, perhaps moved
+          video.mp4           the scene and the scene without it, in all frames
+
+    Without a prompt: selection.npz has labels [N] and probabilities [N,k], recolored.ply the Gaussians in the
+    colours of their labels, masks/FRAME.png are label maps, and the film has these over it. Label 1 is the
+    first of the names; 0 is nothing.
+
+    Args:
+        path: of the run.
+        stored: what it learned.
+        question: what is asked.
+        changes: what is done with what is found.
+        folder: for it, in place of an earlier answer, which stays until this one is whole.
+        notes: told of what is odd.
+        console: shows how far it is.
+
+    Raises:
+        ValueError: the question cannot be understood, or means nothing of the scene.
+        FileExistsError: something is in the folder that is no answer.
+    """
+    t = _frame(stored, question.frame)
+    shown = sorted({t, *_pictured(stored, question)})
+    there = stored.at(stored.times[t])
+    if stored.codebook is None or there.features is None:
+        raise ValueError(
+            f"{path}: expected a scene that knows what is what in it, found none with features: there "
+            "was one class among the pixels that counted; reconstruct it with --tools draw"
+        )
+    everything = question.text is None and question.region is None
+    prompt = Prompt(stored.codebook, 0) if everything else prompt_of(stored, question, t, there)
+    vectors = jnp.asarray(prompt.vectors, jnp.float32)
+    jax.block_until_ready(probabilities_of(there.features, vectors))  # what compiles is no answer's time
+    begun = perf_counter()
+    said = np.asarray(probabilities_of(there.features, vectors))
+    about = {
+        "text": question.text,
+        "point": question.point,
+        "box": question.box,
+        "meant": None if everything else stored.names[prompt.row],
+        "features": "classes",
+        "names": stored.names,
+        "frame": int(stored.frame_ids[t]),
+        "of": there.num,
+        "query_seconds": perf_counter() - begun,
+    }
+    if everything:
+        with replaced_folder(folder, OF_QUERY) as new:
+            found = _write_labels(new, stored, there, said)
+            told = about | found | {"shares": draw_labels(new, stored, shown, console), "notes": notes.all}
+            write_json(new / "query.json", told)
+        return told
+    scores = said[:, prompt.row]
+    selected = scores > question.threshold
+    _check_count(question, selected, scores, about["frame"], notes)
+    with replaced_folder(folder, OF_QUERY) as new:
+        every, scenes = np.arange(there.num), changes.of(there, selected)
+        write_selection(new / "selection.npz", there, selected, scores, every, there.num)
+        write_scenes(new, there, selected, scenes)
+        asked = (vectors, prompt.row, question.threshold)
+        pixels = draw(new, stored, shown, *asked, changes, console)
+        means = np.asarray(there.means)[selected]
+        told = about | {
+            "against": [name for row, name in enumerate(stored.names) if row != prompt.row],
+            "threshold": question.threshold,
+            "rule": RULE,
+            "gaussians": int(selected.sum()),
+            "best_score": float(scores.max()),
+            "center": means.mean(axis=0),
+            "size": np.ptp(means, axis=0),
+            "pixels": pixels,
+            "notes": notes.all,
+        }
+        write_json(new / "query.json", told)
+    return told
+
+
+def _check_count(
+    question: DeformQuestion,
+    selected: Bool[np.ndarray, "n"],
+    scores: Float[np.ndarray, "n"],
+    frame: int,
+    notes: Notes,
+) -> None:
+    """Raises a ValueError where nothing is meant, and says where all is."""
+    if not selected.any():
+        raise ValueError(
+            f"{question.words} means nothing of this scene in frame {frame}: the best probability is "
+            f"{scores.max():.3f}, and more than {question.threshold:g} is asked for; try a lower --threshold"
+        )
+    if selected.all():
+        words = f"{question.words} means all {len(selected)} Gaussians"
+        notes.warn(f"{words}; a higher --threshold would tell them apart")
+
+
+def _write_labels(
+    folder: Path, stored: StoredDeformation, there: Gaussians, said: Float[np.ndarray, "n k"]
+) -> dict[str, Any]:
+    """Writes what all Gaussians most likely are; returns how many are what, and in which colour they stand in
+    recolored.ply."""
+    labels = 1 + most_likely(said)
+    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": said, "names": stored.names})
+    colors = {name: label_color(label) for label, name in enumerate(stored.names, 1)}
+    shades = np.array([INVALID, *colors.values()], np.float32) / 255
+    write_ply(folder / "recolored.ply", recolored(there, shades[labels]), labels=labels)
+    counts = {name: int((labels == label).sum()) for label, name in enumerate(stored.names, 1)}
+    return {"classes": counts, "colors": colors}
+
+
+def prompt_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Prompt:
+    """The prompt that a text, a point or a box is; its row has the name that it means or is the most like.
+
+    Raises:
+        ValueError: the text is none of the names, or nothing of the scene lies there.
+    """
+    assert stored.codebook is not None
+    if question.region is not None:
+        drawn, _ = render_with_room(there, stored.camera(t))
+        assert drawn.features is not None
+        try:
+            feature = region_feature(
+                np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region
+            )
+        except ValueError as error:
+            option = "--point" if question.box is None else "--box"
+            raise ValueError(f"{option}: {error} (frame {stored.frame_ids[t]})") from None
+        return like_feature(feature.astype(np.float64), stored.codebook)
+    assert question.text is not None
+    return Prompt(stored.codebook, row_of(stored, question.text))
+
+
+def row_of(stored: StoredDeformation, text: str) -> int:
+    """Which row of the codebook has a name.
+
+    Raises:
+        ValueError: none has.
+    """
+    known, wanted = [_plain(name) for name in stored.names], _plain(text)
+    if wanted not in known:
+        raise ValueError(
+            f"no class {text!r}; this scene knows names alone, and there are: {', '.join(known)}"
+        )
+    return known.index(wanted)
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.replace("_", " ").casefold().split())
+
+
+def _frame(stored: StoredDeformation, frame: int | None) -> int:
+    """The position of a frame.
+
+    Raises:
+        ValueError: the run had none that is called so.
+    """
+    known = stored.frame_ids.tolist()
+    if frame is None:
+        return 0
+    if frame not in known:
+        raise ValueError(f"--frame: expected one of {known[0]} to {known[-1]}, found {frame}")
+    return known.index(frame)
+
+
+def _pictured(stored: StoredDeformation, question: DeformQuestion) -> list[int]:
+    """Positions of the frames that pictures are made of."""
+    if question.frames is None:
+        return stored.held_out.tolist()
+    chosen = list(range(len(stored.times))[parse_frames(question.frames)])
+    if not chosen:
+        raise ValueError(
+            f"--frames: {question.frames} holds no frame of the run, which has {len(stored.times)}"
+        )
+    return chosen

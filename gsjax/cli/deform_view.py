@@ -1,0 +1,92 @@
+"""A run of `gsjax deform` in the viewer: over time, and how it is asked."""
+
+from pathlib import Path
+from time import perf_counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gsjax.cli.deform_file import NAME, StoredDeformation, read_deformation
+from gsjax.cli.deform_pictures import probabilities_of
+from gsjax.cli.deform_query import EVEN, RULE, row_of
+from gsjax.cli.messages import Notes, describe
+from gsjax.cli.run_files import reopen
+from gsjax.cli.selected import EXTRACTED, keep_part
+from gsjax.methods.surgical.query import Prompt, like_feature, most_likely
+from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
+
+_AGAIN = "reconstruct it again with this version of gsjax"
+
+
+def viewable_deformation(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
+    can be asked if it knows what is what.
+
+    Raises:
+        ValueError: the file of the scene is damaged.
+    """
+    stored = read_deformation(path / NAME)
+    first, labels = stored.at(0.0), None
+    if stored.codebook is not None and first.features is not None:
+        said = probabilities_of(first.features, jnp.asarray(stored.codebook, jnp.float32))
+        labels = 1 + most_likely(np.asarray(said))
+    return Viewable(
+        path.absolute().name,
+        first,
+        labels,
+        dict(enumerate(stored.names, 1)),
+        motion=Motion(len(stored.times), first.num, lambda frame: stored.at(stored.times[frame])),
+        times=stored.times * stored.seconds,
+        shots=_shots(path, stored, notes),
+        asking=None if labels is None else asking_of(path, stored),
+    )
+
+
+def asking_of(path: Path, stored: StoredDeformation) -> Asking:
+    """How the page asks it; what it saves goes to `extracted/` in the run's folder. Where features change
+    over time, an answer is of the frame that is looked at."""
+    assert stored.codebook is not None
+    book = stored.codebook
+
+    def features_in(frame: int) -> jax.Array:
+        features = stored.at(stored.times[frame] if stored.meaning_changes else 0.0).features
+        assert features is not None
+        return features
+
+    def answer(words: str, prompt: Prompt, features: Float[jax.Array, "n c"]) -> Found:
+        vectors = jnp.asarray(prompt.vectors, jnp.float32)
+        jax.block_until_ready(probabilities_of(features, vectors))  # what compiles is no answer's time
+        begun = perf_counter()
+        scores = np.asarray(probabilities_of(features, vectors))[:, prompt.row]
+        return Found(words, scores, EVEN, RULE, perf_counter() - begun)
+
+    def ask(text: str, frame: int) -> Found:
+        return answer(text, Prompt(book, row_of(stored, text)), features_in(frame))
+
+    def like(row: int, frame: int) -> Found:
+        features = features_in(frame)
+        prompt = like_feature(np.asarray(features[row], np.float64), book)
+        return answer(f"like Gaussian {row} ({stored.names[prompt.row]})", prompt, features)
+
+    def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
+        there, called = stored.at(stored.times[frame]), f"{name} frame {stored.frame_ids[frame]}"
+        return keep_part(path / EXTRACTED, called, there, selected)
+
+    return Asking("One of: " + ", ".join(sorted(stored.names)), ask, like, save)
+
+
+def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
+    """The cameras of all frames, with what they saw if that is still there."""
+    load = None
+    try:
+        sequence = reopen(path / "config.yml", _AGAIN)[0].judged
+        found = (sequence.num_frames, sequence.width, sequence.height)
+        if found != (wanted := (len(stored.times), *stored.size)):
+            raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
+        load = lambda t, _: sequence.image(t, 0)  # noqa: E731
+    except (ValueError, OSError) as error:
+        notes.warn(f"its photographs are not shown: {describe(error)}")
+    sizes = np.array([stored.size])
+    return Shots(("camera",), stored.viewmats[:, None], stored.Ks[:, None], sizes, load_image=load)

@@ -1,0 +1,53 @@
+"""Photographs that one camera took one after the other, as a recording: those of a video that structure from
+motion placed, say."""
+
+import numpy as np
+
+from gsjax.data.errors import DataError
+from gsjax.data.photographs import Photographs
+from gsjax.data.sequence import Sequence
+from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
+
+DEFAULT_RATE_HZ = 30.0
+"""Of photographs, where the data do not say when they were taken."""
+
+
+def in_order(photographs: Photographs) -> Sequence:
+    """The photographs in order of their times, or else of their names, as frames of camera 0. What masks
+    leave out counts as tool. Lengths stay in the photographs' unit.
+
+    Raises:
+        DataError: they differ in size.
+    """
+    times, names = photographs.times, photographs.names
+    ranks = np.array(names) if times is None else np.asarray(times)
+    order = np.argsort(ranks, kind="stable").tolist()
+    width, height = (int(side) for side in photographs.sizes[order[0]])
+    other = next((i for i in order if tuple(photographs.sizes[i]) != (width, height)), None)
+    if other is not None:
+        found = "{}x{} in {}".format(*photographs.sizes[other], names[other])
+        advice = "A recording is by one camera; leave out the others."
+        raise DataError(photographs.name, f"frames of {width}x{height} as the first", found, advice)
+
+    def mask(t: int, c: int) -> np.ndarray:
+        counts = photographs.mask(order[t])
+        return np.full((height, width), TISSUE) if counts is None else np.where(counts, TISSUE, TOOL)
+
+    seconds = np.arange(len(order)) / DEFAULT_RATE_HZ if times is None else np.asarray(times)[order]
+    masked, deep, locate = photographs.load_mask, photographs.load_depth, photographs.locate
+    return Sequence(
+        name=photographs.name,
+        camera_ids=(0,),
+        width=width,
+        height=height,
+        times=seconds,
+        frame_ids=tuple(range(len(order))),
+        Ks=photographs.Ks[order][:, None],
+        viewmats=photographs.viewmats[order][:, None],
+        load_image=lambda t, c: photographs.image(order[t]),
+        load_mask=mask if masked else None,
+        load_depth=(lambda t, c: photographs.depth(order[t])) if deep else None,
+        label_names=LABEL_NAMES if masked else {},
+        near=photographs.near,
+        locate=locate and (lambda kind, t, c: locate(kind, order[t])),
+    )

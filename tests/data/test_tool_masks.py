@@ -1,0 +1,40 @@
+"""Which values of a label map are tools."""
+
+import numpy as np
+import pytest
+
+from gsjax.data.endovis import INSTRUMENTS, PARTS
+from gsjax.data.tool_masks import is_tool, tools_in
+
+# Of EndoVis 2018's labels.json.
+SCENE = {
+    0: "background-tissue",
+    1: "instrument-shaft",
+    2: "instrument-clasper",
+    4: "kidney-parenchyma",
+    5: "covered-kidney",
+    6: "thread",
+    8: "suturing-needle",
+    9: "suction-instrument",
+    10: "small-intestine",
+    11: "ultrasound-probe",
+}
+
+
+def test_by_their_names():
+    tools = {value for value in SCENE if is_tool(value, SCENE)}
+    assert tools == {1, 2, 6, 8, 9, 11}
+    assert all(is_tool(value, INSTRUMENTS) for value in INSTRUMENTS)
+    assert all(is_tool(value, PARTS) for value in PARTS)
+    assert is_tool(1, {1: "tool"})
+
+
+@pytest.mark.parametrize(("value", "tool"), [(-1, False), (0, False), (1, True), (7, True)])
+def test_what_has_no_name_is_a_tool_but_for_nothing(value, tool):
+    assert is_tool(value, {}) is tool
+
+
+def test_in_a_picture():
+    labels = np.array([[0, 1, 4], [-1, 8, 10]], np.int32)
+    np.testing.assert_array_equal(tools_in(labels, SCENE), [[0, 1, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(tools_in(labels, {}), [[0, 1, 1], [0, 1, 1]])

@@ -1,0 +1,189 @@
+"""Tracker, feature distillation and graph as one jitted step, as docs/composition.md has it."""
+
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jaxtyping import Array, Int
+
+from gsjax.geometry.cameras import unproject
+from gsjax.methods.object_tracker import (
+    PRESETS,
+    AlignConfig,
+    TrackerBatch,
+    first_pose,
+    first_state,
+    object_tracker,
+    place,
+    plan_tracker,
+)
+from gsjax.methods.surgical import GraphConfig, graph_of, nodes_of, seen_ids
+from gsjax.scene.deformation import Nodes
+from gsjax.scene.render import plan_render
+
+ROOT = Path(__file__).resolve().parents[2]
+CODES = jnp.eye(7, 8)
+RADIUS = 0.5
+
+
+def page_names() -> dict:
+    """What the first program of the page defines."""
+    page = (ROOT / "docs/composition.md").read_text(encoding="utf-8")
+    names: dict = {}
+    exec(compile(page.split("```python\n")[1].split("```")[0], "composition.md", "exec"), names)
+    return names
+
+
+class Small(NamedTuple):
+    config: Any
+    plan: Any
+    batches: list[TrackerBatch]
+    ids: Int[Array, "t c h w"]
+    nodes: Nodes
+
+
+@pytest.fixture(scope="module")
+def small(table, started):
+    """Three frames of a table, a tracker that looks nowhere but where things were, and nodes."""
+    sequence, frames, _ = table()
+    align = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
+    config = replace(PRESETS["fast"], align=align)
+    plan = plan_tracker(started, first_pose(started), frames[0], config)
+    batches = [TrackerBatch(started, frame, plan) for frame in frames[:3]]
+    ids = np.stack([[sequence.mask(t, c) for c in (0, 1)] for t in range(3)])
+    nodes = nodes_of(started.gaussians, 8, np.asarray(started.labels))
+    return Small(config, plan, batches, jnp.asarray(ids, jnp.int32), nodes)
+
+
+@pytest.fixture(scope="module")
+def composed(small):
+    """composed(kind of graph) -> loss, init, step of the page, and the tracker in it."""
+    page = page_names()
+    scene, cameras = small.batches[0].scene, small.batches[0].frame.cameras
+    plan = plan_render(scene.gaussians, cameras, headroom=2.0)
+    tracker = object_tracker(small.config, scene.num_objects, small.batches[0])
+
+    def make(kind):
+        how = (RADIUS, optax.adam(0.1), graph_config(kind), plan)
+        return *page["composed"](tracker, small.nodes, CODES, *how), tracker
+
+    return make
+
+
+def graph_config(kind: str) -> GraphConfig:
+    return GraphConfig(kind=kind, neighbors=3, matches=2, window=1)
+
+
+class TestOneStep:
+    def test_a_gradient_reaches_features_and_poses(self, small, composed):
+        loss, *_ = composed("none")
+        batch = small.batches[1]
+
+        def of(features, pose):
+            given = place(batch.scene, pose), batch.frame.cameras, small.ids[1], None
+            return loss(features, given, step=0, key=None)[0]
+
+        features = 0.1 * jax.random.normal(jax.random.key(0), (len(small.nodes.rows), 8))
+        to_features, to_pose = jax.jit(jax.grad(of, argnums=(0, 1)))(features, first_pose(batch.scene))
+        assert (jnp.abs(to_features).sum(axis=1) > 0).mean() > 0.5
+        assert jnp.isfinite(to_pose.means).all()
+        assert (jnp.abs(to_pose.means).sum(axis=1) > 0).mean() > 0.5
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("kind", ["matching", "similarity"])
+    def test_it_is_the_separate_steps_one_after_the_other(self, small, composed, kind):
+        loss, init, step, tracker = composed(kind)
+        scene, frame, *_ = small.batches[0]
+        features, nodes, pose = jnp.zeros((len(small.nodes.rows), 8)), small.nodes.rows, first_pose(scene)
+        tracking = first_state(scene, pose, frame, small.config, small.plan)
+        memory = page_names()["empty_memory"](3, len(nodes))
+        state = pose, tracking, features, init(features), memory
+        step, tracks = jax.jit(step), jax.jit(partial(tracker.update, step=0, key=None))
+        for t in (1, 2):
+            batch = small.batches[t]
+            before = state
+            state, told = step(state, batch, batch.frame.cameras, small.ids[t], jnp.float32(t))
+            assert not told["skipped"]
+            assert not told["overflow"].any()
+            pose, tracking, tracked = tracks(pose, tracking, batch)
+            np.testing.assert_allclose(state[0].means, pose.means, atol=1e-5)
+            np.testing.assert_allclose(told["tracker"], tracked["residual"], rtol=1e-3, atol=1e-5)
+        assert step._cache_size() == 1
+        # The last step of the features by hand: of the graph of what its memory holds.
+        memory, config = state[4], graph_config(kind)
+        np.testing.assert_array_equal(memory.ids[:2], before[4].ids[1:])
+        said = CODES[jnp.maximum(memory.ids, 0)]
+        graph = graph_of(config, RADIUS, nodes, *memory[:2], said, memory.ids >= 0)
+        given = place(batch.scene, state[0]), batch.frame.cameras, small.ids[2], graph
+        value, terms = loss(before[2], given, step=0, key=None)
+        np.testing.assert_allclose(told["loss"], value, rtol=1e-4)
+        assert set(terms) - {"overflow"} <= set(told)
+
+
+class TestSeenIds:
+    def test_they_are_those_of_the_pixels_that_show_a_place(self, small, table):
+        sequence, _, _ = table()
+        batch = small.batches[0]
+        frame, ids = batch.frame, small.ids[0]
+        # Points of camera 1's own depth: it sees all of them, and has its mask's ids for them.
+        rows, columns = np.nonzero(np.asarray(frame.depths[1]) > 0)
+        places = _unprojected(frame, 1, rows, columns)
+        alone = jax.tree.map(lambda a: a[1:], frame.cameras)
+        found = seen_ids(places, alone, ids[1:], frame.depths[1:])
+        np.testing.assert_array_equal(found, sequence.mask(0, 1)[rows, columns])
+        # A teacher's grid of half the size has that of the pixel at the same share of the picture.
+        half = seen_ids(places, alone, ids[1:, ::2, ::2], frame.depths[1:])
+        np.testing.assert_array_equal(half, np.asarray(ids)[1, ::2, ::2][rows // 2, columns // 2])
+
+    def test_what_is_hidden_or_outside_has_none_and_the_next_camera_is_asked(self, small):
+        frame, ids = small.batches[0].frame, small.ids[0]
+        rows, columns = (np.array([40, 41]), np.array([40, 50]))
+        places = _unprojected(frame, 1, rows, columns)
+        nearer = frame.depths.at[1].multiply(0.5)
+        alone = jax.tree.map(lambda a: a[1:], frame.cameras)
+        assert (seen_ids(places, alone, ids[1:], nearer[1:]) == -1).all()
+        assert (seen_ids(places + 100.0, frame.cameras, ids, frame.depths) == -1).all()
+        both = jax.tree.map(lambda a: a[::-1], frame.cameras)
+        turned = seen_ids(places, both, ids[::-1], frame.depths.at[1].multiply(0.5)[::-1])
+        first = jax.tree.map(lambda a: a[:1], frame.cameras)
+        np.testing.assert_array_equal(turned, seen_ids(places, first, ids[:1], frame.depths[:1]))
+
+
+def _unprojected(frame, c, rows, columns):
+    pixels = jnp.asarray(np.stack([columns, rows], axis=1) + 0.5, jnp.float32)
+    depths = jnp.asarray(np.asarray(frame.depths[c])[rows, columns])
+    return unproject(pixels, depths, frame.cameras.viewmat[c], frame.cameras.K[c])
+
+
+def test_nodes_of_groups_are_blended_within_their_groups(small, started):
+    groups = np.asarray(started.labels)
+    nodes = nodes_of(started.gaussians, 8, groups)
+    of_nodes = groups[np.asarray(nodes.rows)]
+    weights, indices = np.asarray(nodes.weights), np.asarray(nodes.indices)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-5)
+    assert (of_nodes[indices] == groups[:, None])[weights > 0].all()
+    assert (np.bincount(of_nodes) <= 8).all()
+    # One group is as no groups.
+    alone = nodes_of(started.gaussians, 8, np.zeros_like(groups))
+    plain = nodes_of(started.gaussians, 8)
+    np.testing.assert_array_equal(alone.rows, plain.rows)
+    np.testing.assert_array_equal(alone.weights, plain.weights)
+
+
+def test_the_page_has_what_the_experiment_runs():
+    """`composed` stands in both, letter for letter."""
+    page, experiment = (
+        (ROOT / path)
+        .read_text(encoding="utf-8")
+        .split("\ndef composed")[1]
+        .split("    return loss, learner.init")[0]
+        for path in ("docs/composition.md", "experiments/composition/one_step.py")
+    )
+    assert page == re.sub(r'    """.*?"""\n\n', "", experiment, flags=re.DOTALL)
