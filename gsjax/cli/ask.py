@@ -62,7 +62,7 @@ def run(options: Options) -> int:
     asked = parse_question(options.question, stored.names)
     rows = rows_of(asked, stored.frame_ids.tolist())
     with stage(Console(stderr=True, highlight=False), f"looking at frames {_in_words(stored, rows)}"):
-        facts = facts_of_run(stored, rows, _is_metric(options.run))
+        facts = facts_of_run(stored, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
         told = {
@@ -77,35 +77,22 @@ def run(options: Options) -> int:
     return 0
 
 
-def facts_of_run(stored: StoredDeformation, rows: list[int], metric: bool) -> SceneFacts:
-    """Facts of some of a run's frames.
+def facts_of_run(stored: StoredDeformation, rows: list[int]) -> SceneFacts:
+    """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
 
     Args:
         stored: a scene with a codebook.
         rows: of its frames, 0 to T - 1.
-        metric: as for `scene_facts`.
     """
     assert stored.codebook is not None
+    if not stored.metric and 0 not in rows:
+        rows = [0, *rows]
     viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (stored.viewmats, stored.Ks))
     cameras = Camera(viewmats, Ks, *stored.size, stored.near)
     frames = stored.frame_ids[rows].tolist()
     times = stored.times[rows]
     told = (times, cameras, stored.codebook, stored.names, frames)
-    return scene_facts(stored.scene, stored.moving, *told, metric=metric)
-
-
-def _is_metric(run: Path) -> bool:
-    """Whether a run's lengths are in metres; they are unless it began on a plane."""
-    file = run / "metrics.json"
-    try:
-        return bool(json.loads(file.read_text(encoding="utf-8"))["depth"]["metric"])
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-    ):  # killed before it was written, or of an earlier version
-        return True
+    return scene_facts(stored.scene, stored.moving, *told, metric=stored.metric)
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:

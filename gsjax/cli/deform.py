@@ -22,11 +22,11 @@ from gsjax.cli.deform_scores import judge
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.recording import expect_scale, located, open_recording, parse_frames
+from gsjax.cli.recording import located, open_recording
 from gsjax.cli.run_folder import RunFolder, expect_dataset
 from gsjax.data import Photographs
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
-from gsjax.data.ordered import in_order
+from gsjax.data.ordered import open_in_time
 from gsjax.io.ply import write_ply
 from gsjax.methods.surgical import (
     PRESETS,
@@ -36,7 +36,6 @@ from gsjax.methods.surgical import (
     of_step,
     reconstruct,
 )
-from gsjax.scene.deformation import Nodes
 
 HELP = (
     " As in `gsjax deform DATASET --out RUN`. Masks say where tools are, which are left out unless --tools "
@@ -68,6 +67,8 @@ class Options:
     tools: Tools = "leave-out"
     """What masks call a tool, by the names of their values, or without names all but 0: leave out, or draw it
     too."""
+    tool_values: Annotated[tuple[int, ...], tyro.conf.arg(metavar="VALUE")] = ()
+    """Mask values that are tools, in place of what their names say."""
     depth: Depth = "auto"
     """Where depth is from: data (files), stereo (camera to learn from and the next one are matched) or plane
     (none: the scene begins on one, and its depth is of no unit). auto: the first of these that there is."""
@@ -108,7 +109,7 @@ def run(options: Options) -> int:
         expect_dataset(options.dataset)
         deep = _recording(options, notes)
         told = (options.test_every, options.tools, options.features, options.deform.channels)
-        data = deform_data(deep.sequence, *told, notes, console)
+        data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
@@ -124,7 +125,7 @@ def run(options: Options) -> int:
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
         learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
         data, refined = as_refined(folder, problem, learning.state.scene, data, notes)
-        write_scene(folder, learning.state, data)
+        write_scene(folder, learning.state, data, deep.metric)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
         if learning.skipped:
@@ -158,15 +159,11 @@ def run(options: Options) -> int:
 
 def _recording(options: Options, notes: Notes) -> Deep:
     """The recording, the camera that is learned from first, with its depth."""
+    told = (options.frames, options.read, options.scale)
+    whole = open_recording(options.dataset, (), (), *told, opened=open_in_time).judged
     if is_of_photographs(options.dataset) and not is_recording(options.dataset):
-        expect_scale(options.scale)
-        photographs = open_photographs(
-            options.dataset, options.read
-        )  # what `gsjax poses` made of a video, say
-        whole = in_order(photographs).select(frames=parse_frames(options.frames)).scaled(options.scale)
+        photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
-    else:
-        whole = open_recording(options.dataset, (), (), options.frames, options.read, options.scale).judged
     first = options.cameras[0] if options.cameras else whole.camera_ids[0]
     if first not in whole.camera_ids:
         raise ValueError(f"--cameras: {whole.name} has no camera {first}; it has {list(whole.camera_ids)}")
@@ -185,9 +182,8 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
     )
 
 
-def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData) -> None:
+def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metric: bool = True) -> None:
     """Writes deformation.npz, and scene.ply, the scene as it was at the first frame."""
-    assert state.moving is None or isinstance(state.moving, Nodes)
     seen = data.sequence
     stored = StoredDeformation(
         state.scene,
@@ -202,6 +198,7 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData) -> No
         (seen.width, seen.height),
         seen.near,
         np.array(data.test, int),
+        metric,
     )
     write_deformation(folder.path / NAME, stored)
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))

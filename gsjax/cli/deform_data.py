@@ -1,7 +1,7 @@
 """What `gsjax deform` learns from: frames of one camera, what counts in them, and what masks call things."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,7 @@ from rich.progress import track
 
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
-from gsjax.data.tool_masks import TISSUE, is_tool, tools_in
+from gsjax.data.tool_masks import TISSUE, is_tool
 from gsjax.methods.surgical import Look
 from gsjax.perception.codebook import ClassCodebook
 
@@ -30,6 +30,7 @@ class DeformData:
         looks: what the camera saw in the former.
         names: what masks call things, by their value.
         codebook: what the teacher says of each, in the scene's channels; None without a teacher.
+        tool_values: what masks call tools; told by names where there is none.
     """
 
     sequence: Sequence
@@ -38,6 +39,7 @@ class DeformData:
     looks: list[Look]
     names: dict[int, str]
     codebook: Float[np.ndarray, "k channels"] | None
+    tool_values: tuple[int, ...] = ()
 
     @property
     def times(self) -> Float[np.ndarray, "t"]:
@@ -53,15 +55,26 @@ class DeformData:
                     found.update(np.ascontiguousarray(value).tobytes())
         return found.hexdigest()
 
-    def classes(self, t: int) -> Int[np.ndarray, "h w"] | None:
-        """Which row of the codebook each pixel of the camera that is learned from has by its mask, -1 for
-        none; None without a teacher."""
-        rows = {value: row for row, value in enumerate(self.names)}
-        return _ids(self.sequence.mask(t, 0), rows) if rows else None
+    def classes(self, mask: Int[np.ndarray, "h w"] | None) -> Int[np.ndarray, "h w"] | None:
+        """Which row of the codebook each pixel of a mask has, -1 for none; None without a teacher."""
+        if self.codebook is None:
+            return None
+        ids = np.full((self.sequence.height, self.sequence.width), -1, np.int32)
+        if mask is not None:
+            for row, value in enumerate(self.names):
+                ids[mask == value] = row
+        return ids
 
-    def look(self, t: int, camera: int, tools: Tools) -> Look:
-        """What a camera saw at a frame, without a teacher."""
-        return _look(self.sequence, t, camera, tools, None)
+    def look(self, t: int, camera: int, tools: Tools, mask: Int[np.ndarray, "h w"] | None = None) -> Look:
+        """What a camera saw at a frame, without a teacher; its mask is read unless given."""
+        seen, counts = self.sequence, None
+        if tools == "leave-out" and seen.has_masks:
+            mask = seen.mask(t, camera) if mask is None else mask
+            if mask is not None:
+                gone = [v for v in np.unique(mask).tolist() if _is_tool(v, seen, self.tool_values)]
+                counts = ~np.isin(mask, gone)
+        pose = (seen.viewmats[t, camera], seen.Ks[t, camera], float(unit_times(seen)[t]))
+        return Look(seen.image(t, camera), counts, seen.depth(t, camera), *pose, near=seen.near)
 
 
 def deform_data(
@@ -70,6 +83,7 @@ def deform_data(
     tools: Tools,
     features: Features,
     channels: int,
+    tool_values: tuple[int, ...],
     notes: Notes,
     console: Console,
 ) -> DeformData:
@@ -81,11 +95,12 @@ def deform_data(
         tools: whether what masks call a thing is left out.
         features: whether the masks' classes are learned.
         channels: of a Gaussian's feature.
+        tool_values: what masks call tools; told by names where there is none.
         notes: told what is odd.
         console: that shows how it goes on.
 
     Raises:
-        ValueError: there are too many classes, or too few that classes are asked for.
+        ValueError: there are too many classes, or too few that classes are asked for; or no frame has a mask.
         DataError: a file is bad.
     """
     count = sequence.num_frames
@@ -96,11 +111,27 @@ def deform_data(
     learns = features == "classes" or (features == "auto" and sequence.has_masks)
     if learns and not sequence.has_masks:
         raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")
-    shown = track(train, "reading", console=console, transient=True, disable=not console.is_terminal)
-    seen = [(t, sequence.mask(t, 0)) for t in shown] if learns else [(t, None) for t in train]
-    values = sorted({int(v) for _, mask in seen if mask is not None for v in np.unique(mask)})
-    names = sequence.names_of_labels
-    counted = [v for v in values if v >= TISSUE and (tools == "draw" or not is_tool(v, names))]
+    frames = range(count) if sequence.has_masks else range(0)
+    shown = track(frames, "reading", console=console, transient=True, disable=not console.is_terminal)
+    masks = {t: sequence.mask(t, 0) for t in shown}
+    if tools == "leave-out":
+        unknown = [t for t, mask in masks.items() if mask is None]
+        train, test = ([t for t in some if t not in unknown] for some in (train, test))
+        if unknown:
+            numbers = ", ".join(str(sequence.frame_ids[t]) for t in unknown)
+            notes.warn(f"frames {numbers} have no mask to tell where tools are, and are left out")
+        if not train:
+            raise ValueError(
+                f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"
+            )
+    values = sorted({int(v) for t in train if masks.get(t) is not None for v in np.unique(masks[t])})
+    names = {TISSUE: "tissue"} | sequence.names_of_labels
+    called = {value: names.get(value, f"object {value}") for value in values if value >= TISSUE}
+    gone = [v for v in called if tools == "leave-out" and _is_tool(v, sequence, tool_values)]
+    if gone:
+        kept = ", ".join(name for value, name in called.items() if value not in gone) or "nothing"
+        notes.add(f"Left out as tools: {', '.join(called[v] for v in gone)}; kept: {kept} (--tool-values).")
+    counted = {value: name for value, name in called.items() if value not in gone}
     if learns and len(counted) < 2:
         if features == "classes":
             raise ValueError(
@@ -108,16 +139,10 @@ def deform_data(
                 f"{len(counted)}; --tools draw counts tools too"
             )
         learns = False
-    called = {TISSUE: "tissue"} | names
-    names = {value: called.get(value, f"object {value}") for value in counted}
-    codebook = None
-    rows: dict[int, int] = {}
-    if learns:
-        codebook = _codebook(names, channels)
-        rows = {value: row for row, value in enumerate(names)}
-    taught = ((t, _ids(mask, rows) if learns and mask is not None else None) for t, mask in seen)
-    looks = [_look(sequence, t, 0, tools, ids) for t, ids in taught]
-    return DeformData(sequence, train, test, looks, names if learns else {}, codebook)
+    codebook = _codebook(counted, channels) if learns else None
+    found = DeformData(sequence, train, test, [], counted if learns else {}, codebook, tool_values)
+    looks = [found.look(t, 0, tools, masks.get(t))._replace(ids=found.classes(masks.get(t))) for t in train]
+    return replace(found, looks=looks)
 
 
 def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
@@ -126,25 +151,8 @@ def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
     return since / max(since[-1], 1e-12)
 
 
-def _look(sequence: Sequence, t: int, camera: int, tools: Tools, ids: np.ndarray | None) -> Look:
-    mask = sequence.mask(t, camera) if tools == "leave-out" and sequence.has_masks else None
-    return Look(
-        sequence.image(t, camera),
-        None if mask is None else ~tools_in(mask, sequence.names_of_labels),
-        sequence.depth(t, camera),
-        sequence.viewmats[t, camera],
-        sequence.Ks[t, camera],
-        float(unit_times(sequence)[t]),
-        ids,
-        sequence.near,
-    )
-
-
-def _ids(mask: Int[np.ndarray, "h w"], rows: dict[int, int]) -> Int[np.ndarray, "h w"]:
-    ids = np.full(mask.shape, -1, np.int32)
-    for value, row in rows.items():
-        ids[mask == value] = row
-    return ids
+def _is_tool(value: int, sequence: Sequence, given: tuple[int, ...]) -> bool:
+    return value in given if given else is_tool(value, sequence.names_of_labels)
 
 
 def _codebook(names: dict[int, str], channels: int) -> Float[np.ndarray, "k channels"]:

@@ -25,9 +25,14 @@ class Deep:
     source: Literal["data", "stereo", "plane"]
 
     @property
+    def metric(self) -> bool:
+        """Whether lengths are metres, as far as the data's are."""
+        return self.source != "plane"
+
+    @property
     def found(self) -> dict[str, object]:
         """What metrics.json says of it."""
-        return {"source": self.source, "metric": self.source != "plane"}
+        return {"source": self.source, "metric": self.metric}
 
 
 def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> Deep:
@@ -110,4 +115,5 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> Deep:
             f"about how far with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
-    return Deep(replace(alone, load_depth=None, truth=None), "plane")
+    names = alone.names_of_labels  # some of which truth may have told
+    return Deep(replace(alone, load_depth=None, truth=None, label_names=names), "plane")

@@ -13,12 +13,12 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
-from gsjax.methods.surgical import DeformingScene
+from gsjax.methods.surgical import DeformingScene, Moving
 from gsjax.scene.deformation import DeformationConfig, Nodes, init_deformation
 from gsjax.scene.gaussians import Gaussians
 
 NAME = "deformation.npz"
-_FORMAT = 2  # 1 had no cameras
+_FORMAT = 3  # 1 had no cameras, 2 neither rows nor units
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -28,7 +28,7 @@ class StoredDeformation:
 
     Attributes:
         scene: canonical Gaussians, and the field that moves them; None of a scene that stands still.
-        moving: what the field is asked about.
+        moving: what the field is asked about: nodes, some Gaussians, or all.
         names: of what there is in it, in the order of the codebook; none without features.
         codebook: the feature of each; None without.
         times: of the recording's frames, 0 to 1.
@@ -39,10 +39,11 @@ class StoredDeformation:
         size: width and height of its pictures, pixels.
         near: what is nearer to it is not drawn, metres.
         held_out: which of the frames nothing was learned from.
+        metric: whether lengths are metres.
     """
 
     scene: DeformingScene
-    moving: Nodes | None
+    moving: Moving
     names: tuple[str, ...]
     codebook: Float[np.ndarray, "k channels"] | None
     times: Float[np.ndarray, "T"]
@@ -53,6 +54,7 @@ class StoredDeformation:
     size: tuple[int, int]
     near: float
     held_out: Int[np.ndarray, "held"]
+    metric: bool = True
 
     def at(self, time: float) -> Gaussians:
         """The scene at a time, 0 to 1."""
@@ -70,18 +72,20 @@ class StoredDeformation:
 
 
 @jax.jit
-def _at(scene: DeformingScene, moving: Nodes | None, time: Float[Array, ""]) -> Gaussians:
+def _at(scene: DeformingScene, moving: Moving, time: Float[Array, ""]) -> Gaussians:
     return scene.at(time, moving)
 
 
 def write_deformation(path: Path, stored: StoredDeformation) -> None:
     """Writes it; atomic."""
-    gaussians, field, nodes = stored.scene.gaussians, stored.scene.field, stored.moving
+    gaussians, field, moving = stored.scene.gaussians, stored.scene.field, stored.moving
+    nodes = moving if isinstance(moving, Nodes) else None
     about: dict[str, Any] = {
         "format": _FORMAT,
         "gaussians": {name: list(leaf.shape) for name, leaf in vars(gaussians).items() if leaf is not None},
         "field": None if field is None else {"config": asdict(field.config), "bounds": field.bounds},
         "nodes": None if nodes is None else [len(nodes.rows), nodes.indices.shape[1]],
+        "rows": None if moving is None or nodes is not None else len(moving),
         "names": stored.names,
         "codebook": None if stored.codebook is None else stored.codebook.tolist(),
         "times": stored.times.tolist(),
@@ -90,9 +94,10 @@ def write_deformation(path: Path, stored: StoredDeformation) -> None:
         "size": stored.size,
         "near": stored.near,
         "held_out": stored.held_out.tolist(),
+        "metric": stored.metric,
     }
     cameras = tuple(np.asarray(a, np.float64) for a in (stored.viewmats, stored.Ks))
-    save_checkpoint(path, (*jax.device_get((gaussians, field, nodes)), *cameras), about)
+    save_checkpoint(path, (*jax.device_get((gaussians, field, moving)), *cameras), about)
 
 
 def read_deformation(path: Path) -> StoredDeformation:
@@ -113,10 +118,10 @@ def read_deformation(path: Path) -> StoredDeformation:
         codebook = None if book is None else np.array(book, np.float64)
         times, frame_ids = np.array(about["times"], float), _whole(about["frame_ids"])
         seconds, near, held_out = float(about["seconds"]), float(about["near"]), _whole(about["held_out"])
-        width, height = _whole(about["size"]).tolist()
+        (width, height), metric = _whole(about["size"]).tolist(), bool(about["metric"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected what `gsjax deform` writes, found {error!r}; {_AGAIN}") from error
-    (gaussians, field, nodes, viewmats, Ks), _ = load_checkpoint(path, like)
+    (gaussians, field, moving, viewmats, Ks), _ = load_checkpoint(path, like)
     scene = DeformingScene(gaussians, field)
     fits = codebook is None or (
         gaussians.features is not None and codebook.shape == (len(names), gaussians.features.shape[1])
@@ -125,13 +130,14 @@ def read_deformation(path: Path) -> StoredDeformation:
         raise ValueError(f"{path}: expected a code for each name and a time for each frame; {_AGAIN}")
     if min(width, height) < 1 or not set(held_out) <= set(range(len(times))):
         raise ValueError(f"{path}: expected a size of pictures, and held-out frames of these; {_AGAIN}")
-    numbers = (scene, nodes, viewmats, Ks, times, np.array([seconds, near]))
+    numbers = (scene, moving, viewmats, Ks, times, np.array([seconds, near]))
     for leaf in jax.tree.leaves(eqx.filter(numbers, eqx.is_inexact_array)):
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{path}: expected finite numbers, found others; {_AGAIN}")
-    _check_nodes(path, nodes, gaussians.num)
+    _check_moving(path, moving, gaussians.num)
     cameras = (viewmats, Ks, (width, height), near)
-    return StoredDeformation(scene, nodes, names, codebook, times, frame_ids, seconds, *cameras, held_out)
+    told = (names, codebook, times, frame_ids, seconds)
+    return StoredDeformation(scene, moving, *told, *cameras, held_out, metric)
 
 
 def _whole(values: list[int]) -> Int[np.ndarray, "n"]:
@@ -150,7 +156,8 @@ def _like(about: Mapping[str, Any]) -> Any:
             config = DeformationConfig(**about["field"]["config"])
             field = init_deformation(jax.random.key(0), config, np.array(about["field"]["bounds"]), features)
         if nodes is None:
-            return gaussians, field, None
+            rows = about["rows"]
+            return gaussians, field, None if rows is None else jnp.zeros(int(rows), jnp.int32)
         places, blended = map(int, nodes)
         whole = jnp.zeros((shapes["means"][0], blended), jnp.int32)
         rows = jnp.zeros(places, jnp.int32)
@@ -160,9 +167,12 @@ def _like(about: Mapping[str, Any]) -> Any:
     return (*eqx.filter_eval_shape(made), np.zeros((frames, 4, 4)), np.zeros((frames, 3, 3)))
 
 
-def _check_nodes(path: Path, nodes: Nodes | None, count: int) -> None:
-    if nodes is None:
+def _check_moving(path: Path, moving: Moving, count: int) -> None:
+    if moving is None:
         return
-    for name, array, most in (("rows", nodes.rows, count), ("indices", nodes.indices, len(nodes.rows))):
+    asked = {"rows": (moving.rows if isinstance(moving, Nodes) else moving, count)}
+    if isinstance(moving, Nodes):
+        asked["indices"] = (moving.indices, len(moving.rows))
+    for name, (array, most) in asked.items():
         if array.min() < 0 or array.max() >= most:
-            raise ValueError(f"{path}: nodes' {name}: expected 0 to {most - 1}, found others; {_AGAIN}")
+            raise ValueError(f"{path}: {name}: expected 0 to {most - 1}, found others; {_AGAIN}")

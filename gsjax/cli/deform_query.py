@@ -26,6 +26,7 @@ from gsjax.methods.surgical.query import (
     most_likely,
     region_feature,
 )
+from gsjax.methods.surgical.questions import plain_words
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
 from gsjax.viz.colors import INVALID, label_color
@@ -225,16 +226,12 @@ def row_of(stored: StoredDeformation, text: str) -> int:
     Raises:
         ValueError: none has.
     """
-    known, wanted = [_plain(name) for name in stored.names], _plain(text)
+    known, wanted = [plain_words(name) for name in stored.names], plain_words(text)
     if wanted not in known:
         raise ValueError(
             f"no class {text!r}; this scene knows names alone, and there are: {', '.join(known)}"
         )
     return known.index(wanted)
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.replace("_", " ").casefold().split())
 
 
 def _frame(stored: StoredDeformation, frame: int | None) -> int:

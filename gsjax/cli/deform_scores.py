@@ -32,6 +32,7 @@ OVER_TIME = ("t_ssim", "flow_warp_error", "warped_ssim")
 """Scores of a frame and its neighbour, as `temporal_scores` names them; beside each stand NAME_true, that of
 the recording, and NAME_gap, how far apart the two are."""
 _OF_FRAMES = ("psnr_masked", "ssim", "depth_mm", "psnr_other", "ms_ssim", "f_psnr", "flow_warp_share")
+_OF_FRAMES += tuple(f"{name}{end}" for name in OVER_TIME for end in ("", "_true", "_gap"))
 _SHOWN = 8  # frames in the report
 _TIMED = 12  # frames drawn to say how many a second
 _SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
@@ -62,7 +63,7 @@ def judge(
             beside = data.look(neighbor, 0, tools)
             pair = [(drawn.colors, look), (draw(scene, moving, beside, plan).colors, beside)]
             row |= over_time(pair if neighbor > t else pair[::-1])
-        if data.sequence.num_cameras > 1:
+        if _other_counts(data, t, tools):
             other = data.look(t, 1, tools)
             there = draw(scene, moving, other, plan).colors
             row["psnr_other"] = psnr(there, other.image / 255.0, other.counts)
@@ -72,7 +73,7 @@ def judge(
             write_png(panels, side_by_side(look.image, drawn.colors, difference, captions=PANELS))
             row["picture"] = str(panels.relative_to(folder.path))
         rows.append(row)
-    test = mean_scores(rows, _OF_FRAMES) | _means_over_time(rows)
+    test = mean_scores(rows, _OF_FRAMES)
     test |= _means_of_classes(overlap, len(data.names))
     return {
         "judged_by": "held out" if data.test else "learned",
@@ -82,6 +83,14 @@ def judge(
         "memory_mb": memory,
         "scores": rows,
     }
+
+
+def _other_counts(data: DeformData, t: int, tools: Tools) -> bool:
+    """Whether another camera can judge: one without masks shows tools that were left out."""
+    seen = data.sequence
+    if seen.num_cameras < 2:
+        return False
+    return tools == "draw" or not seen.has_masks or seen.mask(t, 1) is not None
 
 
 class Drawn(NamedTuple):
@@ -143,7 +152,7 @@ def _filled(colors: np.ndarray, look: Look) -> Float[np.ndarray, "h w 3"]:
 
 def _of_classes(drawn: Drawn, look: Look, data: DeformData, t: int, overlap: LabelOverlap) -> dict[str, Any]:
     """f-PSNR of a frame; what its pixels that count are, by the nearest code, is added to `overlap`."""
-    true = data.classes(t)
+    true = data.classes(data.sequence.mask(t, 0))
     if true is None or data.codebook is None or drawn.features is None:
         return {"f_psnr": None}
     if look.counts is not None:
@@ -196,16 +205,11 @@ def over_time(pair: list[tuple[np.ndarray, Look]]) -> dict[str, Any]:
     masks = np.stack(counts) if counts else None
     found, wanted = (temporal_scores(video, masks=masks, optical_flow=DisFlow()) for video in (ours, true))
     row = {name: found[name] for name in (*OVER_TIME, "flow_warp_share")}
-    return row | {f"{name}_true": wanted[name] for name in OVER_TIME}
-
-
-def _means_over_time(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Means over pairs, of the scene and of the recording, and how far they are apart."""
-    means = mean_scores(rows, [f"{name}{end}" for name in OVER_TIME for end in ("", "_true")])
     for name in OVER_TIME:
-        ours, true = means[name], means[f"{name}_true"]
-        means[f"{name}_gap"] = None if ours is None or true is None else abs(ours - true)
-    return means
+        ours, wants = found[name], wanted[name]
+        row[f"{name}_true"] = wants
+        row[f"{name}_gap"] = None if ours is None or wants is None else abs(ours - wants)
+    return row
 
 
 def _difference(colors: np.ndarray, look: Look) -> np.ndarray:

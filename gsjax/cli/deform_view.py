@@ -14,6 +14,7 @@ from gsjax.cli.deform_query import EVEN, RULE, row_of
 from gsjax.cli.messages import Notes, describe
 from gsjax.cli.run_files import reopen
 from gsjax.cli.selected import EXTRACTED, keep_part
+from gsjax.data.ordered import open_in_time
 from gsjax.methods.surgical.query import Prompt, like_feature, most_likely
 from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
 
@@ -40,6 +41,7 @@ def viewable_deformation(path: Path, notes: Notes) -> Viewable:
         motion=Motion(len(stored.times), first.num, lambda frame: stored.at(stored.times[frame])),
         times=stored.times * stored.seconds,
         shots=_shots(path, stored, notes),
+        unit="m" if stored.metric else "",
         asking=None if labels is None else asking_of(path, stored),
     )
 
@@ -81,7 +83,7 @@ def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
     """The cameras of all frames, with what they saw if that is still there."""
     load = None
     try:
-        sequence = reopen(path / "config.yml", _AGAIN)[0].judged
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_in_time)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
         if found != (wanted := (len(stored.times), *stored.size)):
             raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")

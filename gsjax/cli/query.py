@@ -200,7 +200,7 @@ def _ask_deformation(options: Options, console: Console) -> int:
         found = ", ".join(f"{name}: {count:,}" for name, count in told["classes"].items())
         print(f"{'found':<10}{found} of {told['of']:,} Gaussians, in frame {told['frame']}")
     else:
-        _print(question.words, "", "frames", told, perf_counter() - begun)
+        _print(question.words, "m" if stored.metric else "", "frames", told, perf_counter() - begun)
     print(f"query     {folder}: selection.npz, recolored.ply, frames/, masks/, video.mp4")
     return 0
 

@@ -19,6 +19,7 @@ from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
 
+Opener = Callable[[str, ReadOptions | None], Sequence]
 _LEAST_SIDE = 8  # of a picture that is made smaller, pixels
 
 
@@ -57,16 +58,17 @@ def open_recording(
     frames: str,
     read: ReadOptions | None = None,
     scale: float = 1.0,
+    opened: Opener = open_sequence,
 ) -> Recording:
     """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
-    made smaller by `scale`.
+    made smaller by `scale`. `opened` opens it, whole.
 
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
             much would be left of pictures.
         DataError: the dataset cannot be read.
     """
-    sequence = open_sequence(dataset, read)
+    sequence = opened(dataset, read)
     known = list(sequence.camera_ids)
     chosen = [c for c in known if c not in eval_cameras] if not cameras else list(cameras)
     for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):

@@ -12,8 +12,8 @@ import numpy as np
 import yaml
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.recording import Recording, open_recording
-from gsjax.data import ReadOptions
+from gsjax.cli.recording import Opener, Recording, open_recording
+from gsjax.data import ReadOptions, open_sequence
 from gsjax.data.errors import DataError
 from gsjax.io.ply import PlyReport, read_ply
 from gsjax.scene.gaussians import Gaussians
@@ -103,9 +103,13 @@ def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
 
 
 def reopen(
-    config: Path, again: str, also: Callable[[Mapping[str, Any]], Any] = lambda settings: None
+    config: Path,
+    again: str,
+    also: Callable[[Mapping[str, Any]], Any] = lambda settings: None,
+    opened: Opener = open_sequence,
 ) -> tuple[Recording, Any]:
-    """The recording of a run, by what its config.yml says, and what else is wanted of the settings.
+    """The recording of a run, by what its config.yml says, and what else is wanted of the settings. `opened`
+    opens it, as that command does.
 
     Raises:
         ValueError: these are no such settings, or the recording cannot be opened.
@@ -117,7 +121,7 @@ def reopen(
         scale = float(settings.get("scale", 1.0))
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
         held_out = settings.get("eval_cameras") or ()  # which not all commands have
-        return open_recording(dataset, cameras, held_out, frames, read, scale), wanted
+        return open_recording(dataset, cameras, held_out, frames, read, scale, opened), wanted
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         listed = ", ".join(_SETTINGS)
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error

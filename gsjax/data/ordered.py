@@ -1,15 +1,34 @@
 """Photographs that one camera took one after the other, as a recording: those of a video that structure from
 motion placed, say."""
 
+import re
+
 import numpy as np
 
 from gsjax.data.errors import DataError
+from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
 
 DEFAULT_RATE_HZ = 30.0
 """Of photographs, where the data do not say when they were taken."""
+
+
+def open_in_time(dataset: str, read: ReadOptions | None = None) -> Sequence:
+    """A recording; of placed photographs that are none, as `gsjax poses` makes of a video, those in order.
+
+    Raises:
+        DataError: it cannot be read, or photographs differ in size.
+    """
+    if is_of_photographs(dataset) and not is_recording(dataset):
+        return in_order(open_photographs(dataset, read))
+    return open_sequence(dataset, read)
+
+
+def _by_numbers(name: str) -> list[tuple[int, str]]:
+    """Such that frame_2 comes before frame_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def in_order(photographs: Photographs) -> Sequence:
@@ -20,8 +39,10 @@ def in_order(photographs: Photographs) -> Sequence:
         DataError: they differ in size.
     """
     times, names = photographs.times, photographs.names
-    ranks = np.array(names) if times is None else np.asarray(times)
-    order = np.argsort(ranks, kind="stable").tolist()
+    if times is None:
+        order = sorted(range(len(names)), key=lambda i: _by_numbers(names[i]))
+    else:
+        order = np.argsort(np.asarray(times), kind="stable").tolist()
     width, height = (int(side) for side in photographs.sizes[order[0]])
     other = next((i for i in order if tuple(photographs.sizes[i]) != (width, height)), None)
     if other is not None:

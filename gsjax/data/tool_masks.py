@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from gsjax.data.errors import DataError, DataWarning
 
@@ -41,13 +41,6 @@ def is_tool(value: int, names: Mapping[int, str]) -> bool:
     if value <= TISSUE:
         return False
     return value not in names or _CALLED.search(re.sub(r"[-_]", " ", names[value])) is not None
-
-
-def tools_in(
-    labels: Int[np.ndarray, "height width"], names: Mapping[int, str]
-) -> Bool[np.ndarray, "height width"]:
-    """Where a label map has tools."""
-    return np.isin(labels, [v for v in np.unique(labels).tolist() if is_tool(v, names)])
 
 
 def tool_labels(mask: Int[np.ndarray, "height width"], tool: str) -> Int[np.ndarray, "height width"]:

@@ -16,7 +16,7 @@ from gsjax.scene.initialize import gaussians_from_points
 WIDTH, HEIGHT, FRAMES = 48, 40, 3
 
 
-def written(run, names=("tissue", "tool")):
+def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
     """A wall, and a smaller plate 20 mm before it, on its left; they stand still."""
     wall, plate = (
         np.stack(np.meshgrid(np.arange(*x, 0.002), np.arange(*y, 0.002), [z]), -1).reshape(-1, 3)
@@ -31,6 +31,8 @@ def written(run, names=("tissue", "tool")):
         book = np.eye(2, 3)
         values = jnp.asarray(book[np.repeat([0, 1], [len(wall), len(plate)])], jnp.float32)
         gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
+    viewmats = np.tile(np.eye(4), (FRAMES, 1, 1))
+    viewmats[1:, 2, 3] = -nearer
     stored = StoredDeformation(
         DeformingScene(gaussians),
         None,
@@ -39,11 +41,12 @@ def written(run, names=("tissue", "tool")):
         times=np.linspace(0, 1, FRAMES),
         frame_ids=np.arange(FRAMES) + 5,
         seconds=1.0,
-        viewmats=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        viewmats=viewmats,
         Ks=np.tile(intrinsics(45.0, WIDTH, HEIGHT), (FRAMES, 1, 1)),
         size=(WIDTH, HEIGHT),
         near=0.01,
         held_out=np.zeros(0, int),
+        metric=metric,
     )
     run.mkdir()
     write_deformation(run / NAME, stored)
@@ -88,13 +91,13 @@ def test_over_time(gsjax, scene):
 
 
 def test_a_scene_that_began_on_a_plane_has_no_millimetres(gsjax, tmp_path):
-    run = written(tmp_path / "run")
-    (run / "metrics.json").write_text('{"depth": {"source": "plane", "metric": false}}')
-    code, said = gsjax("ask", run, "how deep is the tool in frame 5?")
-    assert code == 0
-    deep = re.search(r"tool is ([\d.]+) % of the depth deep", said)
-    assert deep is not None, said
-    assert float(deep[1]) == pytest.approx(80, abs=2)
+    run = written(tmp_path / "run", metric=False, nearer=0.02)
+    for frame, per_cent in ((5, 80), (6, 60)):  # of the depth in frame 5, the first
+        code, said = gsjax("ask", run, f"how deep is the tool in frame {frame}?")
+        assert code == 0
+        deep = re.search(r"tool is ([\d.]+) % of the depth deep", said)
+        assert deep is not None, said
+        assert float(deep[1]) == pytest.approx(per_cent, abs=2)
 
 
 def test_without_a_question_it_says_what_can_be_asked(gsjax, scene):

@@ -12,7 +12,7 @@ from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
 
 
-def stored(kind="hexplane", nodes=0, features=0, moves=True):
+def stored(kind="hexplane", nodes=0, features=0, moves=True, rows=False):
     key = jax.random.key(3)
     points = np.random.default_rng(0).uniform(0, 1, (30, 3)).astype(np.float32)
     gaussians = gaussians_from_points(points, points)
@@ -26,7 +26,7 @@ def stored(kind="hexplane", nodes=0, features=0, moves=True):
         field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), field)
     scene = DeformingScene(gaussians, field)
     names, book = (("tissue", "tool"), np.eye(2, features)) if features else ((), None)
-    moving = nodes_of(gaussians, nodes) if nodes else None
+    moving = nodes_of(gaussians, nodes) if nodes else jnp.array([2, 5, 9]) if rows else None
     cameras = {"viewmats": np.tile(np.eye(4), (4, 1, 1)), "Ks": np.tile(np.diag([60.0, 60, 1]), (4, 1, 1))}
     frames = {"times": np.linspace(0, 1, 4), "frame_ids": np.arange(4) + 7, "seconds": 2.5}
     seen = {"size": (64, 52), "near": 0.02, "held_out": np.array([1])}
@@ -46,6 +46,7 @@ def leaves_of(given):
         {"kind": "mlp", "features": 2},
         {"kind": "voxels", "nodes": 5},
         {"moves": False},
+        {"rows": True},
     ],
 )
 def test_what_is_written_is_what_is_read(given, tmp_path):

@@ -40,7 +40,7 @@ FAINT = 0.3  # of a feature's length
 def taught(tmp_path_factory):
     """A run whose Gaussians in the lower left of frame 1 are tool, and all others tissue."""
     run, console = tmp_path_factory.mktemp("taught") / "run", Console(quiet=True)
-    data = deform_data(open_sequence(SCENE), 8, "draw", "classes", 4, Notes(console), console)
+    data = deform_data(open_sequence(SCENE), 8, "draw", "classes", 4, (), Notes(console), console)
     moves = DeformationConfig(resolution=8, time_resolution=4, levels=1)
     config = SurgicalConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
     problem, state = begin_surgical(data.looks, config, data.codebook)

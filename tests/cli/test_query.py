@@ -129,12 +129,14 @@ def test_what_cannot_be_answered(gsjax, tracked, command, options, says):
 def test_help_tells_options_of_fields_from_those_of_tracked_runs(capfd):
     with pytest.raises(SystemExit):
         main(["query", "--help"])
-    both, field, track = re.split("─ (?:field|track) options ─", capfd.readouterr().out)
-    assert "--camera" in both
-    assert "--threshold" in field
-    assert "--min-score" in track
-    assert "--min-score" not in both + field
-    assert "--threshold" not in both + track
+    groups = "─ (?:gaussians|field|deform|track) options ─"
+    shared, gaussians, field, deform, track = re.split(groups, capfd.readouterr().out)
+    where = {"--camera": shared, "--threshold": gaussians, "--negatives": field, "--box": deform}
+    where["--min-score"] = track
+    for option, group in where.items():
+        assert option in group
+        others = {"shared": shared, "gaussians": gaussians, "field": field, "deform": deform, "track": track}
+        assert [name for name, text in others.items() if f"{option} " in text and text is not group] == []
 
 
 def test_what_fits_two_alike_is_said(gsjax, run):

@@ -1,10 +1,9 @@
 """Which values of a label map are tools."""
 
-import numpy as np
 import pytest
 
 from gsjax.data.endovis import INSTRUMENTS, PARTS
-from gsjax.data.tool_masks import is_tool, tools_in
+from gsjax.data.tool_masks import is_tool
 
 # Of EndoVis 2018's labels.json.
 SCENE = {
@@ -32,9 +31,3 @@ def test_by_their_names():
 @pytest.mark.parametrize(("value", "tool"), [(-1, False), (0, False), (1, True), (7, True)])
 def test_what_has_no_name_is_a_tool_but_for_nothing(value, tool):
     assert is_tool(value, {}) is tool
-
-
-def test_in_a_picture():
-    labels = np.array([[0, 1, 4], [-1, 8, 10]], np.int32)
-    np.testing.assert_array_equal(tools_in(labels, SCENE), [[0, 1, 0], [0, 1, 0]])
-    np.testing.assert_array_equal(tools_in(labels, {}), [[0, 1, 1], [0, 1, 1]])

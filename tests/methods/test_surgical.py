@@ -232,10 +232,8 @@ class TestLearning:
                 save_checkpoint(tmp_path / "state.npz", jax.device_get(state))
         rows, count = np.asarray(state.moving), before.gaussians.num
         assert len(rows) == round(count / 4)
-        far = np.max(
-            [np.linalg.norm(before.at(b.time).means - before.gaussians.means, axis=1) for b in problem.batches],
-            axis=0,
-        )
+        then = np.stack([before.at(batch.time).means for batch in problem.batches])
+        far = np.linalg.norm(then - before.gaussians.means, axis=-1).max(axis=0)
         assert far[rows].min() >= np.delete(far, rows).max()
         at = state.scene.at(jnp.asarray(0.7), state.moving).means
         still = np.delete(np.arange(count), rows)
@@ -254,8 +252,9 @@ class TestLearning:
         spoilt = eqx.tree_at(lambda g: g.means, given, given.means.at[:3].set(jnp.nan))
         _, state = begin_surgical(looks, CONFIG, gaussians=spoilt)
         assert state.scene.gaussians.num == given.num - 3
+        nowhere = eqx.tree_at(lambda g: g.means, given, given.means * jnp.nan)
         with pytest.raises(ValueError, match="gaussians: expected some"):
-            begin_surgical(looks, CONFIG, gaussians=eqx.tree_at(lambda g: g.means, given, given.means * jnp.nan))
+            begin_surgical(looks, CONFIG, gaussians=nowhere)
 
     def test_what_was_given_is_kept(self, looks):
         given = start_gaussians(looks[:1], 0, 2.0)
@@ -350,7 +349,9 @@ def test_features_of_some_at_times_are_those_of_the_scene_there(kind, changes):
     gaussians = gaussians_from_points(points, points)
     values = jax.random.normal(jax.random.key(1), (20, 3))
     gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
-    config = DeformationConfig(resolution=4, time_resolution=3, levels=1, channels=2, hidden=5, feature=changes)
+    config = DeformationConfig(
+        resolution=4, time_resolution=3, levels=1, channels=2, hidden=5, feature=changes
+    )
     field = init_deformation(jax.random.key(2), config, np.array([[0, 0, 0], [1, 1, 1]]), 3)
     field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(3), leaf.shape), field)
     scene = DeformingScene(gaussians, field)

@@ -274,3 +274,10 @@ class TestOfAScene:
             scene_facts(bare, None, np.zeros(1), camera, codes, NAMES, (10,))
         with pytest.raises(ValueError, match="for each frame, found 2, 1 and 1"):
             scene_facts(scene, None, np.zeros(2), camera, codes, NAMES, (10,))
+
+
+def test_names_are_known_however_they_are_spelt():
+    names = ("suturing-needle", "st. mark")
+    for said in ("suturing needle", "suturing-needle", "the Suturing_Needle"):
+        assert parse_question(f"where is {said} in frame 3?", names).things == (0,)
+    assert parse_question("where is st. mark in frame 3?", names).things == (1,)

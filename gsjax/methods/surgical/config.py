@@ -108,7 +108,7 @@ class SurgicalConfig:
         )
         if self.nodes and self.moving_share < 1:
             raise ValueError(
-                f"moving_share: expected 1 with nodes, of which there are few anyway, found {self.moving_share}; "
+                f"moving_share: expected 1 with nodes, of which there are few, found {self.moving_share}; "
                 "set nodes to 0"
             )
 

@@ -137,8 +137,8 @@ def scene_facts(
 ) -> SceneFacts:
     """Facts of a deforming scene at some frames.
 
-    A pixel is of the class that its rendered features are most like, a Gaussian of that which its own are, if
-    that has more than half of the probability (`prompt_probabilities`).
+    A pixel is of the class that its rendered features are most like, a Gaussian of that which its own are in
+    the first of the frames, if that has more than half of the probability (`prompt_probabilities`).
 
     Args:
         scene, moving: as `DeformingScene.at` has them.
@@ -164,6 +164,8 @@ def scene_facts(
             f"expected a time, a camera and a number for each frame, found {len(times)}, "
             f"{len(cameras.viewmat)} and {len(frames)}"
         )
+    features = scene.at(jnp.asarray(times[0], features.dtype), moving).features
+    assert features is not None
     said = np.asarray(prompt_probabilities(features, jnp.asarray(codebook, features.dtype)))
     sure = (said.max(axis=1) > 0.5) & (np.asarray(scene.gaussians.opacities) > _SOLID)
     of = np.where(sure, said.argmax(axis=1), -1)

@@ -170,7 +170,7 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
     """
     plain = " ".join(re.sub(r"[?!.,;:\"]", " ", text.lower()).split())
     frames = tuple(int(number) for found in _FRAMES.findall(plain) for number in found if number)
-    core = _plain(_FRAMES.sub(" ", plain))
+    core = plain_words(_FRAMES.sub(" ", plain))
     unknown = None
     for kind in QUESTIONS:
         for form in kind.forms:
@@ -195,15 +195,16 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
     )
 
 
-def _plain(words: str) -> str:
-    """In small letters, with single spaces and no articles."""
-    return " ".join(_ARTICLES.sub(" ", words.lower().replace("_", " ")).split())
+def plain_words(text: str) -> str:
+    """Words in small letters, one space between them, and no articles: "The suturing-needle" is a suturing
+    needle."""
+    return " ".join(_ARTICLES.sub(" ", " ".join(re.findall(r"[^\W_]+", text.lower()))).split())
 
 
 def _thing(said: str, names: Sequence[str]) -> int | None:
     """The class that is meant."""
     for row, name in enumerate(names):
-        plain = _plain(name)
+        plain = plain_words(name)
         if said in (plain, f"{plain}s", f"{plain}es"):
             return row
     return None
