@@ -4,12 +4,13 @@ It stands in for a foundation model: what a pixel shows is taken from the simula
 wrong in a known share of blocks.
 """
 
+import jax.numpy as jnp
 import numpy as np
 from deforming import Dataset, Reconstructed
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from gsjax.cli.deform_scores import draw
+from gsjax.cli.deform_scores import classes_of_pixels, draw
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
 
@@ -68,8 +69,8 @@ def meanings(found: Reconstructed, data: Dataset, codes: np.ndarray) -> dict[str
     for t in data.test:
         true = region_map(data, t)
         features = draw(state.scene, state.moving, data.look(t), found.problem.plan_for(state)).features
-        psnrs.append(feature_psnr(features, codes[np.maximum(true, 0)], true >= 0))
-        named = (features @ codes.T).argmax(axis=-1).astype(np.int32)
+        psnrs.append(feature_psnr(np.asarray(features), codes[np.maximum(true, 0)], true >= 0))
+        named = np.asarray(classes_of_pixels(features, jnp.asarray(codes, features.dtype)))
         overlap.add(named, true)
         one = LabelOverlap()
         one.add(named, true)
