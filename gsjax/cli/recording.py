@@ -58,17 +58,17 @@ def open_recording(
     frames: str,
     read: ReadOptions | None = None,
     scale: float = 1.0,
-    opened: Opener = open_sequence,
+    opened: Opener | None = None,
 ) -> Recording:
     """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
-    made smaller by `scale`. `opened` opens it, whole.
+    made smaller by `scale`. `opened` opens it, whole; `open_sequence` unless given.
 
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
             much would be left of pictures.
         DataError: the dataset cannot be read.
     """
-    sequence = opened(dataset, read)
+    sequence = (opened or open_sequence)(dataset, read)
     known = list(sequence.camera_ids)
     chosen = [c for c in known if c not in eval_cameras] if not cameras else list(cameras)
     for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):

@@ -13,7 +13,7 @@ import yaml
 
 from gsjax.cli.messages import Notes
 from gsjax.cli.recording import Opener, Recording, open_recording
-from gsjax.data import ReadOptions, open_sequence
+from gsjax.data import ReadOptions
 from gsjax.data.errors import DataError
 from gsjax.io.ply import PlyReport, read_ply
 from gsjax.scene.gaussians import Gaussians
@@ -106,7 +106,7 @@ def reopen(
     config: Path,
     again: str,
     also: Callable[[Mapping[str, Any]], Any] = lambda settings: None,
-    opened: Opener = open_sequence,
+    opened: Opener | None = None,
 ) -> tuple[Recording, Any]:
     """The recording of a run, by what its config.yml says, and what else is wanted of the settings. `opened`
     opens it, as that command does.

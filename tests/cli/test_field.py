@@ -89,6 +89,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
     assert (mask & truth).sum() > 0.6 * (mask | truth).sum()
 
 
+@pytest.mark.slow
 def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
     from gsjax.cli import learning
 

@@ -445,6 +445,7 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
     assert len(traces) == 2
 
 
+@pytest.mark.slow
 def test_scenes_of_fewer_gaussians_compile_nothing(monkeypatch):
     """Nor does one of a few more, once there was one of more; and their pictures are their own."""
     traces, drawer = counted(monkeypatch), Drawer()
