@@ -61,7 +61,7 @@ def run(options: Options) -> int:
         return 0
     asked = parse_question(options.question, stored.names)
     rows = rows_of(asked, stored.frame_ids.tolist())
-    with stage(Console(stderr=True, highlight=False), f"looking at frames {_in_words(stored, rows)}"):
+    with stage(Console(stderr=True, highlight=False), f"looking at {_in_words(stored, rows)}"):
         facts = facts_of_run(stored, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
@@ -109,7 +109,9 @@ def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
 def _in_words(stored: StoredDeformation, rows: list[int]) -> str:
     """Which frames are looked at."""
     frames = [str(stored.frame_ids[row]) for row in rows]
-    return f"{frames[0]} to {frames[-1]}" if len(rows) > 2 else " and ".join(frames)
+    if len(rows) == 1:
+        return f"frame {frames[0]}"
+    return "frames " + (f"{frames[0]} to {frames[-1]}" if len(rows) > 2 else " and ".join(frames))
 
 
 def _list(stored: StoredDeformation) -> None:

@@ -42,6 +42,7 @@ HELP = (
     "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane."
 )
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
+_HARDLY = 0.95  # of the error of a scene that stands still
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
@@ -110,6 +111,10 @@ def run(options: Options) -> int:
         deep = _recording(options, notes)
         told = (options.test_every, options.tools, options.features, options.deform.channels)
         data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
+        if not data.names:
+            only = "One class among the pixels that count: colours are learned, and no meaning or graph"
+            notes.add(f"{only}.")
+            console.print(f"{only}; --tools draw, say, for gsjax query and gsjax ask", soft_wrap=True)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
@@ -130,8 +135,9 @@ def run(options: Options) -> int:
             judged = judge(folder, problem, learning.state, data, options.tools)
         if learning.skipped:
             notes.warn(f"{learning.skipped} steps met numbers that are not finite and changed nothing")
-        if not data.names:
-            notes.add("One class among the pixels that count: colours are learned, and no meaning or graph.")
+        tracks = judged["tracks"]
+        if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
+            notes.warn("tracks are hardly better than if nothing moved; more steps (--deform.iterations)?")
         if not data.test:
             notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
         found = {

@@ -121,7 +121,7 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     if test["psnr_other"] is not None:
         grid.add_row("[bold]other camera[/]", f"{test['psnr_other']:.2f} dB")
     if test["t_ssim"] is not None and test["flow_warp_error"] is not None:
-        words = f"t-SSIM {test['t_ssim']:.4f} (recorded {test['t_ssim_true']:.4f})"
+        words = f"t-SSIM {test['t_ssim']:.4f} (recorded {test['t_ssim_true']:.4f}: the nearer, the better)"
         words += f", flow-warped {test['flow_warp_error']:.5f} ({test['flow_warp_error_true']:.5f})"
         grid.add_row("[bold]over time[/]", words)
     if tracks is not None:
@@ -139,9 +139,9 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     grid.add_row(
         "[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, drawn {test['fps']:.1f} times a second"
     )
-    minutes = (seconds["steps"] + seconds["compile"]) / 60
-    pace = f" ({seconds['steps'] / max(1, found['steps']):.2f} s each)" if seconds["steps"] else ""
-    grid.add_row("[bold]steps[/]", f"{found['steps']:,} in {minutes:.1f} min{pace}")
+    took = f"{found['steps']:,} in {seconds['steps'] / 60:.1f} min"
+    took += f" ({seconds['steps'] / max(1, found['steps']):.2f} s each)" if seconds["steps"] else ""
+    grid.add_row("[bold]steps[/]", f"{took}, compiling {seconds['compile'] / 60:.1f} min")
     if not found["complete"]:
         grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
     console.print()

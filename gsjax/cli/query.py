@@ -93,7 +93,7 @@ class Options:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax track` or `gsjax deform`; of any run with a field (`gsjax distill`); or that
     holds field.npz. The answer is written to query/ in it, in place of an earlier one."""
-    text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")] = None
+    text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TEXT]")] = None
     """What is looked for: "red can". Or say it by --image, --point or --box. Unless told any, a run of
     `gsjax deform` says what everything is."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None

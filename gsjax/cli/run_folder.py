@@ -54,8 +54,9 @@ def expect_run(path: Path, made_by: str = "") -> None:
         found = "a file" if path.exists() else "nothing there"
         raise FileNotFoundError(f"{wanted}, found {found}; name its --out")
     if not is_run(path):
+        found = "other files" if any(path.iterdir()) else "an empty folder"
         raise FileNotFoundError(
-            f"{wanted}, whose config.yml begins with {SIGNATURE!r}, found other files; name its --out"
+            f"{wanted}, whose config.yml begins with {SIGNATURE!r}, found {found}; name its --out"
         )
 
 

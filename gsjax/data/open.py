@@ -43,6 +43,7 @@ _LAYOUTS = {
     "seq-*": ("7-Scenes", read_seven_scenes),
 }
 _RECORDINGS = {mark: layout for mark, (layout, _) in _LAYOUTS.items()} | {LEFT: "EndoVis"}
+_RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds.npy and cam*.mp4": "DyNeRF"}
 
 
 @dataclass(frozen=True)

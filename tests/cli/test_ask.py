@@ -62,7 +62,7 @@ def test_an_answer_is_a_sentence(gsjax, scene):
     code, said = gsjax("ask", scene, "Where is the tool in frame 6?")
     assert code == 0
     assert "The centre of tool is in the middle left of the picture." in said
-    assert "looking at frames 6" in said
+    assert "looking at frame 6" in said
 
 
 def test_json_has_the_value_and_what_it_rests_on(scene, capsys):
@@ -87,7 +87,7 @@ def test_over_time(gsjax, scene):
     assert '"value": "still"' in said
     assert '"from_frame": 7' in said
     code, said = gsjax("ask", scene, "when do tool and tissue first touch?")
-    assert (code, "Never: in none of the 3 frames." in said) == (0, True)
+    assert (code, "Never: in none of the 3 frames. They are nearest in frame" in said) == (0, True)
 
 
 def test_a_scene_that_began_on_a_plane_has_no_millimetres(gsjax, tmp_path):

@@ -159,7 +159,11 @@ def _when(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
     else:
         score, said = speeds(facts, things[0]), "are fastest"
     if not np.isfinite(score).any():
-        return Answer(f"Never: in none of the {len(rows)} frames.", None)
+        never = f"Never: in none of the {len(rows)} frames."
+        if asked.event == "touch" and np.isfinite(gaps).any():
+            nearest = facts.frames[int(np.nanargmin(gaps))]
+            never += f" They are nearest in frame {nearest}, {np.nanmin(gaps):.1f} {facts.unit} apart."
+        return Answer(never, None)
     frame = facts.frames[int(np.nanargmax(score))]
     return Answer(
         f"{words} {said if len(things) == 2 else said.replace('are', 'is')} in frame {frame}.", frame
