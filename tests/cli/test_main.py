@@ -45,7 +45,7 @@ def test_every_option_is_explained(say, capfd, command):
         say(command, "--help")
     assert stopped.value.code == 0
     out = capfd.readouterr().out
-    opens = {"track": "DATASET", "info": "DATASET", "query": "RUN TEXT", "grasp": "RUN TEXT"}
+    opens = {"track": "DATASET", "info": "DATASET", "query": "RUN [TEXT]", "grasp": "RUN TEXT"}
     assert opens.get(command, "") in out
     # What it takes, two spaces or a new line, and at once its default.
     assert not re.findall(r"│ --[\w.-]+(?: \S+)*(?:  +|\s*│\n│\s+)\((?:default|required)", out)
