@@ -51,10 +51,10 @@ def run(options: Options) -> int:
     """
     path = options.run / NAME
     stored = read_deformation(path)
-    if stored.codebook is None:
+    if stored.meaning is None:
         raise ValueError(
             f"{path}: expected a scene that knows what is what, found none; reconstruct it with two classes "
-            "or more among the pixels that count, as with gsjax deform DATASET --tools draw"
+            "or more among the pixels that count (gsjax deform DATASET --tools draw), or with --features"
         )
     if options.question is None:
         _list(stored)
@@ -81,17 +81,17 @@ def facts_of_run(stored: StoredDeformation, rows: list[int]) -> SceneFacts:
     """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
 
     Args:
-        stored: a scene with a codebook.
+        stored: a scene with a meaning.
         rows: of its frames, 0 to T - 1.
     """
-    assert stored.codebook is not None
+    assert stored.meaning is not None
     if not stored.metric and 0 not in rows:
         rows = [0, *rows]
     viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (stored.viewmats, stored.Ks))
     cameras = Camera(viewmats, Ks, *stored.size, stored.near)
     frames = stored.frame_ids[rows].tolist()
     times = stored.times[rows]
-    told = (times, cameras, stored.codebook, stored.names, frames)
+    told = (times, cameras, stored.meaning.codebook, stored.names, frames)
     return scene_facts(stored.scene, stored.moving, *told, metric=stored.metric)
 
 

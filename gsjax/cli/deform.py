@@ -13,12 +13,13 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
-from gsjax.cli.deform_data import DeformData, Features, Tools, deform_data
+from gsjax.cli.deform_data import NOBODY, DeformData, Tools, deform_data
 from gsjax.cli.deform_depth import Deep, Depth, with_depth
 from gsjax.cli.deform_file import NAME, StoredDeformation, write_deformation
 from gsjax.cli.deform_poses import as_refined
 from gsjax.cli.deform_results import print_results, write_results
 from gsjax.cli.deform_scores import judge
+from gsjax.cli.field_teacher import Asked, Masks
 from gsjax.cli.learning import Course, Learning, learn, load
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
@@ -73,9 +74,20 @@ class Options:
     depth: Depth = "auto"
     """Where depth is from: data (files), stereo (camera to learn from and the next one are matched) or plane
     (none: the scene begins on one, and its depth is of no unit). auto: the first of these that there is."""
-    features: Features = "auto"
-    """What is to be learned beside colours: classes (a code for each class of the masks), or none. auto:
-    classes if masks have more than one among the pixels that count."""
+    features: str = "auto"
+    """What is to be learned beside colours: classes (a code for each class of the masks), closed (colour and
+    outline of each mask; no foundation model), clip or maskclip (with --weights), a folder of feature files
+    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the frames' pictures, or by frame number), or
+    none. auto: classes if masks have more than one among the pixels that count."""
+    masks: Masks = "auto"
+    """Whose masks closed and clip tell things apart by: the recording's own, or a segmenter's that needs no
+    weights. auto: files if there are."""
+    sam: Path | None = None
+    """Folder of SAM's weights: let it segment for these."""
+    weights: Path | None = None
+    """Folder of CLIP's weights, in the layout of Hugging Face."""
+    level: Literal["default", "small", "medium", "large"] = "default"
+    """Of LangSplat's files, which size of objects."""
     resume: bool = False
     """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
     overwrite: bool = False
@@ -104,24 +116,24 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
-    _check(options)
+    asked = _checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         deep = _recording(options, notes)
-        told = (options.test_every, options.tools, options.features, options.deform.channels)
+        told = (options.test_every, options.tools, asked, options.deform.channels)
         data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
         if not data.names:
             only = "One class among the pixels that count: colours are learned, and no meaning or graph"
             notes.add(f"{only}.")
             console.print(f"{only}; --tools draw, say, for gsjax query and gsjax ask", soft_wrap=True)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = replace(options, dataset=located(options.dataset))
+        settings = _settings(options, asked)
         if options.resume:
             folder.check_config(settings, but=_OF_NO_BEARING)
         config = options.deform
         with stage(console, "placing the first Gaussians"):
-            problem, state = begin_surgical(data.looks, config, data.codebook)
+            problem, state = begin_surgical(data.looks, config, data.codes)
         learning = Learning(state, {"frames, depth, masks and poses": data.digest()})
         if options.resume:
             learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
@@ -147,7 +159,8 @@ def run(options: Options) -> int:
             "num_gaussians": learning.state.scene.gaussians.num,
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
-            "names": list(data.names.values()),
+            "features": NOBODY if data.meaning is None else data.meaning.source.kind,
+            "names": data.names,
             "depth": deep.found,
             "poses": refined,
             **learning.found(begun),
@@ -194,8 +207,7 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     stored = StoredDeformation(
         state.scene,
         state.moving,
-        tuple(data.names.values()),
-        data.codebook,
+        data.meaning,
         data.times,
         np.asarray(seen.frame_ids),
         float(seen.times[-1] - seen.times[0]),
@@ -210,11 +222,34 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
-def _check(options: Options) -> None:
+def _settings(options: Options, asked: Asked) -> Options:
+    """The options by which a run finds everything again from elsewhere."""
+    found: dict[str, Any] = {"dataset": located(options.dataset)}
+    for name in ("sam", "weights"):
+        path = getattr(options, name)
+        found[name] = path and Path(located(str(path)))
+    if asked.of_files and asked.features != NOBODY:
+        found["features"] = located(options.features)
+    return replace(options, **found)
+
+
+def _checked(options: Options) -> Asked:
+    """Whose features are asked for, once all options fit."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
     if options.test_every < 0 or options.test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
+    told = (options.features, options.masks, options.sam, options.weights, options.level)
+    segmented = options.masks != "auto" or options.sam is not None
+    if segmented and options.features in ("auto", "classes", NOBODY):
+        raise ValueError(
+            f"--{'masks' if options.sam is None else 'sam'}: expected --features closed, clip or maskclip, "
+            f"which masks part, found {options.features}"
+        )
+    asked = Asked(*told)
+    if options.features != NOBODY:
+        asked.check()
+    return asked
 
 
 def _told(row: Mapping[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """What `gsjax deform` learns from: frames of one camera, what counts in them, and what masks call things."""
 
 import hashlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,14 +10,17 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from rich.progress import track
 
+from gsjax.cli.deform_teacher import ClassTeacher, Meaning, Said, encoded_teacher, said_of
+from gsjax.cli.field_teacher import Asked
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
 from gsjax.methods.surgical import Look
-from gsjax.perception.codebook import ClassCodebook
 
 Tools = Literal["leave-out", "draw"]
-Features = Literal["auto", "classes", "none"]
+NOBODY = "none"
+"""Of features: there is no teacher."""
+_OF_CLASSES = ("auto", "classes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +32,9 @@ class DeformData:
         train: positions of frames to learn from.
         test: positions of frames that are held out.
         looks: what the camera saw in the former.
-        names: what masks call things, by their value.
-        codebook: what the teacher says of each, in the scene's channels; None without a teacher.
+        meaning: what features are to say; None without a teacher.
+        codes: what ids of looks name, in the scene's channels; None without.
+        held_out: what the teacher says of frames in `test`.
         tool_values: what masks call tools; told by names where there is none.
     """
 
@@ -37,8 +42,9 @@ class DeformData:
     train: list[int]
     test: list[int]
     looks: list[Look]
-    names: dict[int, str]
-    codebook: Float[np.ndarray, "k channels"] | None
+    meaning: Meaning | None
+    codes: Float[np.ndarray, "n channels"] | None
+    held_out: Mapping[int, Said]
     tool_values: tuple[int, ...] = ()
 
     @property
@@ -46,24 +52,25 @@ class DeformData:
         """Of all frames, 0 to 1."""
         return unit_times(self.sequence)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what features tell apart; none without a teacher."""
+        return () if self.meaning is None else self.meaning.names
+
     def digest(self) -> str:
         """Of all that is learned from, in hexadecimal."""
         found = hashlib.sha256()
-        for look in self.looks:
-            for value in look:
-                if value is not None:
-                    found.update(np.ascontiguousarray(value).tobytes())
+        for value in (*(value for look in self.looks for value in look), self.codes):
+            if value is not None:
+                found.update(np.ascontiguousarray(value).tobytes())
         return found.hexdigest()
 
-    def classes(self, mask: Int[np.ndarray, "h w"] | None) -> Int[np.ndarray, "h w"] | None:
-        """Which row of the codebook each pixel of a mask has, -1 for none; None without a teacher."""
-        if self.codebook is None:
-            return None
-        ids = np.full((self.sequence.height, self.sequence.width), -1, np.int32)
-        if mask is not None:
-            for row, value in enumerate(self.names):
-                ids[mask == value] = row
-        return ids
+    def said(self, t: int) -> Said | None:
+        """What the teacher says of a frame; None where that is nothing."""
+        if self.codes is None or t not in self.train:
+            return self.held_out.get(t)
+        ids = self.looks[self.train.index(t)].ids
+        return None if ids is None else Said(ids, self.codes)
 
     def look(self, t: int, camera: int, tools: Tools, mask: Int[np.ndarray, "h w"] | None = None) -> Look:
         """What a camera saw at a frame, without a teacher; its mask is read unless given."""
@@ -81,7 +88,7 @@ def deform_data(
     sequence: Sequence,
     every: int,
     tools: Tools,
-    features: Features,
+    asked: Asked,
     channels: int,
     tool_values: tuple[int, ...],
     notes: Notes,
@@ -93,24 +100,23 @@ def deform_data(
         sequence: camera 0 is learned from.
         every: hold out frame i where (i - 1) mod `every` is 0, as is done with EndoNeRF; 0: none.
         tools: whether what masks call a thing is left out.
-        features: whether the masks' classes are learned.
+        asked: whose features are learned; checked. "auto": the masks' classes, if there are two or more among
+            pixels that count.
         channels: of a Gaussian's feature.
         tool_values: what masks call tools; told by names where there is none.
         notes: told what is odd.
         console: that shows how it goes on.
 
     Raises:
-        ValueError: there are too many classes, or too few that classes are asked for; or no frame has a mask.
-        DataError: a file is bad.
+        ValueError: there are too many classes, or too few that classes are asked for; features do not fit; or
+            no frame has a mask.
+        DataError, FileNotFoundError: a file is bad, or not there.
     """
     count = sequence.num_frames
     test = [i for i in range(count) if every and (i - 1) % every == 0] if count > 1 else []
     train = [i for i in range(count) if i not in test]
     if count < 2:
         notes.warn(f"{sequence.name} has one frame: nothing deforms, and nothing is held out")
-    learns = features == "classes" or (features == "auto" and sequence.has_masks)
-    if learns and not sequence.has_masks:
-        raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")
     frames = range(count) if sequence.has_masks else range(0)
     shown = track(frames, "reading", console=console, transient=True, disable=not console.is_terminal)
     masks = {t: sequence.mask(t, 0) for t in shown}
@@ -124,25 +130,61 @@ def deform_data(
             raise ValueError(
                 f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"
             )
-    values = sorted({int(v) for t in train if masks.get(t) is not None for v in np.unique(masks[t])})
+    counted = _counted_names(sequence, [masks.get(t) for t in train], tools, tool_values, notes)
+    data = DeformData(sequence, train, test, [], None, None, {}, tool_values)
+    looks = [data.look(t, 0, tools, masks.get(t)) for t in train]
+    if asked.features == NOBODY:
+        return replace(data, looks=looks)
+    if asked.features not in _OF_CLASSES:
+        given = (asked, channels, notes, console)
+        teacher, looks, codes = encoded_teacher(sequence, train, looks, *given)
+    else:
+        teacher = _of_classes(sequence, counted, asked.features, channels)
+        if teacher is None:
+            return replace(data, looks=looks)
+        ids = (teacher.of_mask(masks.get(t)).ids for t in train)
+        looks = [look._replace(ids=one) for look, one in zip(looks, ids, strict=True)]
+        codes = teacher.meaning.codebook
+    held_out = said_of(teacher, test, sequence, notes)
+    return replace(data, looks=looks, meaning=teacher.meaning, codes=codes, held_out=held_out)
+
+
+def _counted_names(
+    sequence: Sequence,
+    masks: Iterable[Int[np.ndarray, "h w"] | None],
+    tools: Tools,
+    tool_values: tuple[int, ...],
+    notes: Notes,
+) -> dict[int, str]:
+    """What masks call things that count, by their value; what is left out is noted."""
+    values = sorted({int(v) for mask in masks if mask is not None for v in np.unique(mask)})
     names = {TISSUE: "tissue"} | sequence.names_of_labels
     called = {value: names.get(value, f"object {value}") for value in values if value >= TISSUE}
     gone = [v for v in called if tools == "leave-out" and _is_tool(v, sequence, tool_values)]
     if gone:
         kept = ", ".join(name for value, name in called.items() if value not in gone) or "nothing"
         notes.add(f"Left out as tools: {', '.join(called[v] for v in gone)}; kept: {kept} (--tool-values).")
-    counted = {value: name for value, name in called.items() if value not in gone}
-    if learns and len(counted) < 2:
-        if features == "classes":
-            raise ValueError(
-                "--features classes: expected two classes or more among pixels that count, found "
-                f"{len(counted)}; --tools draw counts tools too"
-            )
-        learns = False
-    codebook = _codebook(counted, channels) if learns else None
-    found = DeformData(sequence, train, test, [], counted if learns else {}, codebook, tool_values)
-    looks = [found.look(t, 0, tools, masks.get(t))._replace(ids=found.classes(masks.get(t))) for t in train]
-    return replace(found, looks=looks)
+    return {value: name for value, name in called.items() if value not in gone}
+
+
+def _of_classes(
+    sequence: Sequence, counted: dict[int, str], features: str, channels: int
+) -> ClassTeacher | None:
+    """A teacher of the masks' classes; None where there is nothing to tell apart, unless it is asked for.
+
+    Raises:
+        ValueError: it is asked for.
+    """
+    if features == "classes" and not sequence.has_masks:
+        raise ValueError(f"--features classes: {sequence.name} has no masks; leave it at auto, or give masks")
+    if len(counted) >= 2:
+        return ClassTeacher(sequence, counted, channels)
+    if features == "classes":
+        raise ValueError(
+            "--features classes: expected two classes or more among pixels that count, found "
+            f"{len(counted)}; --tools draw counts tools too"
+        )
+    return None
 
 
 def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
@@ -154,21 +196,3 @@ def unit_times(sequence: Sequence) -> Float[np.ndarray, "t"]:
 def _is_tool(value: int, sequence: Sequence, given: tuple[int, ...]) -> bool:
     return value in given if given else is_tool(value, sequence.names_of_labels)
 
-
-def _codebook(names: dict[int, str], channels: int) -> Float[np.ndarray, "k channels"]:
-    """Codes of classes in the scene's channels: a projection with orthonormal rows in which they keep their
-    lengths and angles (METHODS.md: fixed, for two that learn agree best where both are 0).
-
-    Raises:
-        ValueError: there are more classes than channels.
-    """
-    if len(names) > channels:
-        raise ValueError(
-            f"--deform.channels {channels}: expected at least {len(names)}, one for each class; give more"
-        )
-    encoder = ClassCodebook({value + 1: name for value, name in names.items()})
-    codes = np.stack([encoder.embed_text(name) for name in names.values()])
-    _, _, axes = np.linalg.svd(codes, full_matrices=False)
-    basis = np.zeros((channels, codes.shape[1]))
-    basis[: len(axes)] = axes
-    return codes @ basis.T

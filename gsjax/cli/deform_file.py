@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gsjax.cli.deform_teacher import Meaning
+from gsjax.cli.field_source import Source
 from gsjax.geometry.cameras import Camera
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.surgical import DeformingScene, Moving
@@ -18,7 +20,7 @@ from gsjax.scene.deformation import DeformationConfig, Nodes, init_deformation
 from gsjax.scene.gaussians import Gaussians
 
 NAME = "deformation.npz"
-_FORMAT = 3  # 1 had no cameras, 2 neither rows nor units
+_FORMAT = 4  # 1 had no cameras, 2 neither rows nor units, 3 no teachers but classes
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
@@ -29,8 +31,7 @@ class StoredDeformation:
     Attributes:
         scene: canonical Gaussians, and the field that moves them; None of a scene that stands still.
         moving: what the field is asked about: nodes, some Gaussians, or all.
-        names: of what there is in it, in the order of the codebook; none without features.
-        codebook: the feature of each; None without.
+        meaning: what features say; None without.
         times: of the recording's frames, 0 to 1.
         frame_ids: what the recording calls these.
         seconds: that the recording lasts.
@@ -44,8 +45,7 @@ class StoredDeformation:
 
     scene: DeformingScene
     moving: Moving
-    names: tuple[str, ...]
-    codebook: Float[np.ndarray, "k channels"] | None
+    meaning: Meaning | None
     times: Float[np.ndarray, "T"]
     frame_ids: Int[np.ndarray, "T"]
     seconds: float
@@ -66,6 +66,11 @@ class StoredDeformation:
         return Camera(viewmat, K, *self.size, self.near)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of what features tell apart; none without."""
+        return () if self.meaning is None else self.meaning.names
+
+    @property
     def meaning_changes(self) -> bool:
         """Whether features are not the same at all times."""
         return self.scene.field is not None and self.scene.field.config.feature
@@ -79,6 +84,11 @@ def _at(scene: DeformingScene, moving: Moving, time: Float[Array, ""]) -> Gaussi
 def write_deformation(path: Path, stored: StoredDeformation) -> None:
     """Writes it; atomic."""
     gaussians, field, moving = stored.scene.gaussians, stored.scene.field, stored.moving
+    meaning, vectors, said = stored.meaning, (), None
+    if meaning is not None:
+        vectors = (meaning.codebook, meaning.basis)
+        dimension = len(meaning.basis)
+        said = {"source": meaning.source.plain(), "names": meaning.names, "dimension": dimension}
     nodes = moving if isinstance(moving, Nodes) else None
     about: dict[str, Any] = {
         "format": _FORMAT,
@@ -86,8 +96,7 @@ def write_deformation(path: Path, stored: StoredDeformation) -> None:
         "field": None if field is None else {"config": asdict(field.config), "bounds": field.bounds},
         "nodes": None if nodes is None else [len(nodes.rows), nodes.indices.shape[1]],
         "rows": None if moving is None or nodes is not None else len(moving),
-        "names": stored.names,
-        "codebook": None if stored.codebook is None else stored.codebook.tolist(),
+        "meaning": said,
         "times": stored.times.tolist(),
         "frame_ids": stored.frame_ids.tolist(),
         "seconds": stored.seconds,
@@ -96,8 +105,8 @@ def write_deformation(path: Path, stored: StoredDeformation) -> None:
         "held_out": stored.held_out.tolist(),
         "metric": stored.metric,
     }
-    cameras = tuple(np.asarray(a, np.float64) for a in (stored.viewmats, stored.Ks))
-    save_checkpoint(path, (*jax.device_get((gaussians, field, moving)), *cameras), about)
+    numbers = tuple(np.asarray(a, np.float64) for a in (stored.viewmats, stored.Ks, *vectors))
+    save_checkpoint(path, (*jax.device_get((gaussians, field, moving)), *numbers), about)
 
 
 def read_deformation(path: Path) -> StoredDeformation:
@@ -114,29 +123,28 @@ def read_deformation(path: Path) -> StoredDeformation:
         if about["format"] != _FORMAT:
             raise ValueError(f"format {about['format']}")
         like = _like(about)
-        names, book = tuple(map(str, about["names"])), about["codebook"]
-        codebook = None if book is None else np.array(book, np.float64)
+        said = about["meaning"]
+        source = None if said is None else Source.of(said["source"])
+        names = () if said is None else tuple(map(str, said["names"]))
         times, frame_ids = np.array(about["times"], float), _whole(about["frame_ids"])
         seconds, near, held_out = float(about["seconds"]), float(about["near"]), _whole(about["held_out"])
         (width, height), metric = _whole(about["size"]).tolist(), bool(about["metric"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected what `gsjax deform` writes, found {error!r}; {_AGAIN}") from error
-    (gaussians, field, moving, viewmats, Ks), _ = load_checkpoint(path, like)
+    (gaussians, field, moving, viewmats, Ks, *vectors), _ = load_checkpoint(path, like)
     scene = DeformingScene(gaussians, field)
-    fits = codebook is None or (
-        gaussians.features is not None and codebook.shape == (len(names), gaussians.features.shape[1])
-    )
-    if not fits or len(times) != len(frame_ids) or not len(times):
-        raise ValueError(f"{path}: expected a code for each name and a time for each frame; {_AGAIN}")
+    meaning = None if source is None else Meaning(source, names, *vectors)
+    if len(times) != len(frame_ids) or not len(times):
+        raise ValueError(f"{path}: expected a time for each frame; {_AGAIN}")
     if min(width, height) < 1 or not set(held_out) <= set(range(len(times))):
         raise ValueError(f"{path}: expected a size of pictures, and held-out frames of these; {_AGAIN}")
-    numbers = (scene, moving, viewmats, Ks, times, np.array([seconds, near]))
+    numbers = (scene, moving, viewmats, Ks, vectors, times, np.array([seconds, near]))
     for leaf in jax.tree.leaves(eqx.filter(numbers, eqx.is_inexact_array)):
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{path}: expected finite numbers, found others; {_AGAIN}")
     _check_moving(path, moving, gaussians.num)
     cameras = (viewmats, Ks, (width, height), near)
-    told = (names, codebook, times, frame_ids, seconds)
+    told = (meaning, times, frame_ids, seconds)
     return StoredDeformation(scene, moving, *told, *cameras, held_out, metric)
 
 
@@ -163,8 +171,10 @@ def _like(about: Mapping[str, Any]) -> Any:
         rows = jnp.zeros(places, jnp.int32)
         return gaussians, field, Nodes(rows, whole, jnp.zeros(whole.shape))
 
-    frames = len(about["times"])
-    return (*eqx.filter_eval_shape(made), np.zeros((frames, 4, 4)), np.zeros((frames, 3, 3)))
+    frames, said, vectors = len(about["times"]), about["meaning"], ()
+    if said is not None:  # of no scene without features
+        vectors = (np.zeros((len(said["names"]), features)), np.zeros((int(said["dimension"]), features)))
+    return (*eqx.filter_eval_shape(made), np.zeros((frames, 4, 4)), np.zeros((frames, 3, 3)), *vectors)
 
 
 def _check_moving(path: Path, moving: Moving, count: int) -> None:

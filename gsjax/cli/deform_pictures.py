@@ -7,11 +7,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.deform_file import StoredDeformation
+from gsjax.cli.deform_prompts import Wanted
 from gsjax.cli.outputs import frame_rate, write_png
 from gsjax.cli.selected import Changes
 from gsjax.geometry.cameras import Camera
@@ -40,7 +41,8 @@ class _Seen(NamedTuple):
         camera: that saw it.
         plan: that held it.
         colors: 0 to 1.
-        said: P(prompt | pixel); 0 where nothing is drawn.
+        features: rendered, on the device.
+        there: where something of the scene is drawn.
     """
 
     t: int
@@ -48,15 +50,15 @@ class _Seen(NamedTuple):
     camera: Camera
     plan: Plan
     colors: Float[np.ndarray, "h w 3"]
-    said: Float[np.ndarray, "h w k"]
+    features: Float[Array, "h w c"]
+    there: Bool[np.ndarray, "h w"]
 
 
 def draw(
     folder: Path,
     stored: StoredDeformation,
     pictured: Sequence[int],
-    vectors: Float[Array, "k c"],
-    row: int,
+    wanted: Wanted,
     threshold: float,
     changes: Changes,
     console: Console,
@@ -68,9 +70,8 @@ def draw(
         folder: for them.
         stored: the scene.
         pictured: positions of the frames.
-        vectors: of the prompt and of what it is told apart from.
-        row: which is asked for.
-        threshold: of the probability of a Gaussian, and of a pixel.
+        wanted: what is asked for.
+        threshold: of the score of a Gaussian, and of a pixel.
         changes: what else is done with what is meant.
         console: shows how far it is.
 
@@ -79,14 +80,15 @@ def draw(
     """
     pixels: dict[str, int] = {}
     with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, vectors, console):
+        for seen in _frames(stored, console):
             assert seen.gaussians.features is not None
-            selected = probabilities_of(seen.gaussians.features, vectors)[:, row] > threshold
+            selected = wanted.scores(seen.gaussians.features) > threshold
             both = {f"frame {stored.frame_ids[seen.t]}": to_uint8(seen.colors)}
             both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
             video.write(in_rows(both, 2, _PANEL_HEIGHT))
             if seen.t in pictured:
-                name, mask = f"{stored.frame_ids[seen.t]:06d}", seen.said[..., row] > threshold
+                name = f"{stored.frame_ids[seen.t]:06d}"
+                mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
                 write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
                 pixels[name] = int(mask.sum())
                 scenes = {"it alone": hidden(seen.gaussians, ~selected)}
@@ -106,11 +108,13 @@ def draw_labels(
     Returns:
         By frame, which share of the picture each name has.
     """
-    assert stored.codebook is not None
+    assert stored.meaning is not None
+    codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
     with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, jnp.asarray(stored.codebook, jnp.float32), console):
-            labels = 1 + most_likely(seen.said)
+        for seen in _frames(stored, console):
+            said = np.asarray(probabilities_of(seen.features, codebook))
+            labels = np.where(seen.there, 1 + most_likely(said), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
             panel = in_rows(
@@ -127,16 +131,15 @@ def draw_labels(
     return shares
 
 
-def _frames(stored: StoredDeformation, vectors: Float[Array, "k c"], console: Console) -> Iterator[_Seen]:
+def _frames(stored: StoredDeformation, console: Console) -> Iterator[_Seen]:
     """All frames, one after the other."""
     plan = None
     for t in track(range(len(stored.times)), "drawing", console=console, transient=True):
         gaussians, camera = stored.at(stored.times[t]), stored.camera(t)
         drawn, plan = render_with_room(gaussians, camera, plan)
         assert drawn.features is not None
-        there = drawn.alphas[0, ..., None] > _OPAQUE
-        said = np.asarray(jnp.where(there, probabilities_of(drawn.features[0], vectors), 0))
-        yield _Seen(t, gaussians, camera, plan, np.asarray(drawn.colors[0]), said)
+        there = np.asarray(drawn.alphas[0]) > _OPAQUE
+        yield _Seen(t, gaussians, camera, plan, np.asarray(drawn.colors[0]), drawn.features[0], there)
 
 
 def _picture(gaussians: Gaussians, seen: _Seen) -> np.ndarray:

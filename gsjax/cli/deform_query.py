@@ -1,6 +1,7 @@
 """`gsjax query` on a run of `gsjax deform`: the Gaussians that a text, a point or a box means, or what all of
 them are, at every time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -14,27 +15,18 @@ from rich.console import Console
 
 from gsjax.cli.deform_file import StoredDeformation
 from gsjax.cli.deform_pictures import draw, draw_labels, probabilities_of
+from gsjax.cli.deform_prompts import Wanted, wanted_like, wanted_text
 from gsjax.cli.messages import Notes
 from gsjax.cli.recording import parse_frames
 from gsjax.cli.run_folder import OF_QUERY, replaced_folder
 from gsjax.cli.selected import Changes, write_scenes, write_selection
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.surgical.query import (
-    Prompt,
-    like_feature,
-    most_likely,
-    region_feature,
-)
-from gsjax.methods.surgical.questions import plain_words
+from gsjax.methods.surgical.query import most_likely, region_feature
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
 from gsjax.viz.colors import INVALID, label_color
 from gsjax.viz.viewer.drawing import recolored
-
-EVEN = 0.5
-"""The probability above which a Gaussian is meant: more likely than all else together."""
-RULE = "a probability among names"
 
 
 @dataclass(frozen=True)
@@ -48,7 +40,9 @@ class DeformQuestion:
         frame: what the recording calls the frame in which point and box lie, and whose Gaussians are written;
             the first unless given.
         frames: of which pictures are made, as Python slices them; the held-out ones unless given.
-        threshold: of the probability.
+        threshold: of the score; by a rule unless given.
+        negatives: texts that a text is held against, where an encoder reads it; its own unless given.
+        weights: of CLIP, where they are now.
     """
 
     text: str | None = None
@@ -56,7 +50,9 @@ class DeformQuestion:
     box: tuple[float, float, float, float] | None = None
     frame: int | None = None
     frames: str | None = None
-    threshold: float = EVEN
+    threshold: float | None = None
+    negatives: tuple[str, ...] | None = None
+    weights: Path | None = None
 
     @property
     def region(self) -> tuple[float, float, float, float] | None:
@@ -113,48 +109,45 @@ def answer_deformation(
     t = _frame(stored, question.frame)
     shown = sorted({t, *_pictured(stored, question)})
     there = stored.at(stored.times[t])
-    if stored.codebook is None or there.features is None:
+    if stored.meaning is None or there.features is None:
         raise ValueError(
             f"{path}: expected a scene that knows what is what in it, found none with features: there "
-            "was one class among the pixels that counted; reconstruct it with --tools draw"
+            "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
+            "--features"
         )
-    everything = question.text is None and question.region is None
-    prompt = Prompt(stored.codebook, 0) if everything else prompt_of(stored, question, t, there)
-    vectors = jnp.asarray(prompt.vectors, jnp.float32)
-    jax.block_until_ready(probabilities_of(there.features, vectors))  # what compiles is no answer's time
-    begun = perf_counter()
-    said = np.asarray(probabilities_of(there.features, vectors))
     about = {
         "text": question.text,
         "point": question.point,
         "box": question.box,
-        "meant": None if everything else stored.names[prompt.row],
-        "features": "classes",
+        "features": stored.meaning.source.kind,
         "names": stored.names,
         "frame": int(stored.frame_ids[t]),
         "of": there.num,
-        "query_seconds": perf_counter() - begun,
     }
-    if everything:
+    if question.text is None and question.region is None:
+        codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
+        said, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
         with replaced_folder(folder, OF_QUERY) as new:
             found = _write_labels(new, stored, there, said)
             told = about | found | {"shares": draw_labels(new, stored, shown, console), "notes": notes.all}
             write_json(new / "query.json", told)
         return told
-    scores = said[:, prompt.row]
-    selected = scores > question.threshold
-    _check_count(question, selected, scores, about["frame"], notes)
+    wanted = wanted_of(stored, question, t, there)
+    scores, about["query_seconds"] = _timed(lambda: wanted.scores(there.features))
+    threshold = wanted.threshold(scores, question.threshold)
+    selected = scores > threshold.value
+    _check_count(question, selected, scores, threshold.value, about["frame"], notes)
     with replaced_folder(folder, OF_QUERY) as new:
         every, scenes = np.arange(there.num), changes.of(there, selected)
         write_selection(new / "selection.npz", there, selected, scores, every, there.num)
         write_scenes(new, there, selected, scenes)
-        asked = (vectors, prompt.row, question.threshold)
-        pixels = draw(new, stored, shown, *asked, changes, console)
+        pixels = draw(new, stored, shown, wanted, threshold.value, changes, console)
         means = np.asarray(there.means)[selected]
         told = about | {
-            "against": [name for row, name in enumerate(stored.names) if row != prompt.row],
-            "threshold": question.threshold,
-            "rule": RULE,
+            "meant": wanted.meant,
+            "against": wanted.against,
+            "threshold": threshold.value,
+            "rule": threshold.rule,
             "gaussians": int(selected.sum()),
             "best_score": float(scores.max()),
             "center": means.mean(axis=0),
@@ -166,18 +159,26 @@ def answer_deformation(
     return told
 
 
+def _timed(score: Callable[[], Float[jax.Array, "*n"]]) -> tuple[Float[np.ndarray, "*n"], float]:
+    """Scores, and the seconds that they took; what compiles is no answer's time."""
+    jax.block_until_ready(score())
+    begun = perf_counter()
+    return np.asarray(score()), perf_counter() - begun
+
+
 def _check_count(
     question: DeformQuestion,
     selected: Bool[np.ndarray, "n"],
     scores: Float[np.ndarray, "n"],
+    threshold: float,
     frame: int,
     notes: Notes,
 ) -> None:
     """Raises a ValueError where nothing is meant, and says where all is."""
     if not selected.any():
         raise ValueError(
-            f"{question.words} means nothing of this scene in frame {frame}: the best probability is "
-            f"{scores.max():.3f}, and more than {question.threshold:g} is asked for; try a lower --threshold"
+            f"{question.words} means nothing of this scene in frame {frame}: the best score is "
+            f"{scores.max():.3f}, and more than {threshold:g} is asked for; try a lower --threshold"
         )
     if selected.all():
         words = f"{question.words} means all {len(selected)} Gaussians"
@@ -198,40 +199,25 @@ def _write_labels(
     return {"classes": counts, "colors": colors}
 
 
-def prompt_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Prompt:
-    """The prompt that a text, a point or a box is; its row has the name that it means or is the most like.
+def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
+    """What a text, a point or a box is in the scene's channels.
 
     Raises:
-        ValueError: the text is none of the names, or nothing of the scene lies there.
+        ValueError: the text cannot be read, or nothing of the scene lies there.
+        FileNotFoundError: weights are not there.
     """
-    assert stored.codebook is not None
-    if question.region is not None:
-        drawn, _ = render_with_room(there, stored.camera(t))
-        assert drawn.features is not None
-        try:
-            feature = region_feature(
-                np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region
-            )
-        except ValueError as error:
-            option = "--point" if question.box is None else "--box"
-            raise ValueError(f"{option}: {error} (frame {stored.frame_ids[t]})") from None
-        return like_feature(feature.astype(np.float64), stored.codebook)
-    assert question.text is not None
-    return Prompt(stored.codebook, row_of(stored, question.text))
-
-
-def row_of(stored: StoredDeformation, text: str) -> int:
-    """Which row of the codebook has a name.
-
-    Raises:
-        ValueError: none has.
-    """
-    known, wanted = [plain_words(name) for name in stored.names], plain_words(text)
-    if wanted not in known:
-        raise ValueError(
-            f"no class {text!r}; this scene knows names alone, and there are: {', '.join(known)}"
-        )
-    return known.index(wanted)
+    assert stored.meaning is not None
+    if question.region is None:
+        assert question.text is not None
+        return wanted_text(stored.meaning, question.text, question.negatives, question.weights)
+    drawn, _ = render_with_room(there, stored.camera(t))
+    assert drawn.features is not None
+    try:
+        feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region)
+    except ValueError as error:
+        option = "--point" if question.box is None else "--box"
+        raise ValueError(f"{option}: {error} (frame {stored.frame_ids[t]})") from None
+    return wanted_like(stored.meaning, feature.astype(np.float64))
 
 
 def _frame(stored: StoredDeformation, frame: int | None) -> int:

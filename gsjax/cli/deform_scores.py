@@ -16,7 +16,15 @@ from gsjax.cli.machine import peak_memory_mb
 from gsjax.cli.outputs import write_png
 from gsjax.cli.run_folder import RunFolder
 from gsjax.geometry.cameras import Camera, pixels_of
-from gsjax.methods.surgical import DeformingScene, Look, Moving, SurgicalProblem, SurgicalState
+from gsjax.methods.surgical import (
+    DeformingScene,
+    Look,
+    Moving,
+    SurgicalProblem,
+    SurgicalState,
+    counted_ids,
+    on_grid,
+)
 from gsjax.methods.surgical.query import prompt_probabilities
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim, psnr, ssim
@@ -79,7 +87,7 @@ def judge(
         "judged_by": "held out" if data.test else "learned",
         "test": test | {"fps": _fps(scene, moving, data.look(0, 0, tools), plan)},
         "tracks": _tracks(scene, moving, data, tools),
-        "classes": _classes(overlap, data.names.values()),
+        "classes": _classes(overlap, data.names),
         "memory_mb": memory,
         "scores": rows,
     }
@@ -151,16 +159,18 @@ def _filled(colors: np.ndarray, look: Look) -> Float[np.ndarray, "h w 3"]:
 
 
 def _of_classes(drawn: Drawn, look: Look, data: DeformData, t: int, overlap: LabelOverlap) -> dict[str, Any]:
-    """f-PSNR of a frame; what its pixels that count are, by the nearest code, is added to `overlap`."""
-    true = data.classes(data.sequence.mask(t, 0))
-    if true is None or data.codebook is None or drawn.features is None:
+    """f-PSNR of a frame, on the teacher's grid; what its pixels that count are, by the nearest code, is added
+    to `overlap`, against what the teacher's are."""
+    said = data.said(t)
+    if said is None or data.meaning is None or drawn.features is None:
         return {"f_psnr": None}
-    if look.counts is not None:
-        true = np.where(look.counts, true, IGNORED_LABEL)
-    named = classes_of_pixels(drawn.features, jnp.asarray(data.codebook, drawn.features.dtype))
-    overlap.add(np.asarray(named), true)
-    teacher = data.codebook[np.maximum(true, 0)]
-    return {"f_psnr": feature_psnr(np.asarray(drawn.features), teacher, true != IGNORED_LABEL)}
+    ids = counted_ids(look._replace(ids=said.ids))
+    known, teacher = ids >= 0, jnp.asarray(said.codes[np.maximum(ids, 0)], jnp.float32)
+    features = on_grid(drawn.features, ids.shape)
+    codebook = jnp.asarray(data.meaning.codebook, jnp.float32)
+    named, true = (np.asarray(classes_of_pixels(one, codebook)) for one in (features, teacher))
+    overlap.add(named, np.where(known, true, IGNORED_LABEL))
+    return {"f_psnr": feature_psnr(np.asarray(features), np.asarray(teacher), known)}
 
 
 @jax.jit

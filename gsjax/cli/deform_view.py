@@ -1,5 +1,6 @@
 """A run of `gsjax deform` in the viewer: over time, and how it is asked."""
 
+from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
 
@@ -10,28 +11,33 @@ from jaxtyping import Bool, Float
 
 from gsjax.cli.deform_file import NAME, StoredDeformation, read_deformation
 from gsjax.cli.deform_pictures import probabilities_of
-from gsjax.cli.deform_query import EVEN, RULE, row_of
+from gsjax.cli.deform_prompts import Wanted, wanted_like, wanted_text
 from gsjax.cli.messages import Notes, describe
 from gsjax.cli.run_files import reopen
 from gsjax.cli.selected import EXTRACTED, keep_part
 from gsjax.data.ordered import open_in_time
-from gsjax.methods.surgical.query import Prompt, like_feature, most_likely
+from gsjax.methods.surgical.query import most_likely
 from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
 
 _AGAIN = "reconstruct it again with this version of gsjax"
 
 
-def viewable_deformation(path: Path, notes: Notes) -> Viewable:
+def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) -> Viewable:
     """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
     can be asked if it knows what is what.
+
+    Args:
+        path: of the run.
+        notes: told of what is odd.
+        weights: of CLIP, where they are now.
 
     Raises:
         ValueError: the file of the scene is damaged.
     """
     stored = read_deformation(path / NAME)
     first, labels = stored.at(0.0), None
-    if stored.codebook is not None and first.features is not None:
-        said = probabilities_of(first.features, jnp.asarray(stored.codebook, jnp.float32))
+    if stored.meaning is not None and first.features is not None:
+        said = probabilities_of(first.features, jnp.asarray(stored.meaning.codebook, jnp.float32))
         labels = 1 + most_likely(np.asarray(said))
     return Viewable(
         path.absolute().name,
@@ -42,41 +48,45 @@ def viewable_deformation(path: Path, notes: Notes) -> Viewable:
         times=stored.times * stored.seconds,
         shots=_shots(path, stored, notes),
         unit="m" if stored.metric else "",
-        asking=None if labels is None else asking_of(path, stored),
+        asking=None if labels is None else asking_of(path, stored, weights),
     )
 
 
-def asking_of(path: Path, stored: StoredDeformation) -> Asking:
+def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None) -> Asking:
     """How the page asks it; what it saves goes to `extracted/` in the run's folder. Where features change
     over time, an answer is of the frame that is looked at."""
-    assert stored.codebook is not None
-    book = stored.codebook
+    assert stored.meaning is not None
+    meaning = stored.meaning
 
     def features_in(frame: int) -> jax.Array:
         features = stored.at(stored.times[frame] if stored.meaning_changes else 0.0).features
         assert features is not None
         return features
 
-    def answer(words: str, prompt: Prompt, features: Float[jax.Array, "n c"]) -> Found:
-        vectors = jnp.asarray(prompt.vectors, jnp.float32)
-        jax.block_until_ready(probabilities_of(features, vectors))  # what compiles is no answer's time
+    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Found:
+        jax.block_until_ready(wanted.scores(features))  # what compiles is no answer's time
         begun = perf_counter()
-        scores = np.asarray(probabilities_of(features, vectors))[:, prompt.row]
-        return Found(words, scores, EVEN, RULE, perf_counter() - begun)
+        scores = np.asarray(wanted.scores(features))
+        seconds = perf_counter() - begun
+        return Found(words, scores, *wanted.threshold(scores), seconds)
+
+    @lru_cache(maxsize=64)  # of CLIP, which is loaded to read one
+    def read(text: str) -> Wanted:
+        return wanted_text(meaning, text, weights=weights)
 
     def ask(text: str, frame: int) -> Found:
-        return answer(text, Prompt(book, row_of(stored, text)), features_in(frame))
+        return answer(text, read(text), features_in(frame))
 
     def like(row: int, frame: int) -> Found:
         features = features_in(frame)
-        prompt = like_feature(np.asarray(features[row], np.float64), book)
-        return answer(f"like Gaussian {row} ({stored.names[prompt.row]})", prompt, features)
+        wanted = wanted_like(meaning, np.asarray(features[row], np.float64))
+        return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         there, called = stored.at(stored.times[frame]), f"{name} frame {stored.frame_ids[frame]}"
         return keep_part(path / EXTRACTED, called, there, selected)
 
-    return Asking("One of: " + ", ".join(sorted(stored.names)), ask, like, save)
+    return Asking(meaning.source.hint(weights), ask, like, save)
 
 
 def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:

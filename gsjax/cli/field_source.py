@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.perception.closed_vocabulary import ClosedVocabulary
+from gsjax.perception.closed_vocabulary import COLORS, OUTLINES, ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook
 
 Kind = Literal["classes", "closed", "clip", "maskclip", "files"]
@@ -81,6 +81,20 @@ class Source:
             raise ValueError(f"{self.kind}: {error}") from error
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}; --weights says where they are now") from error
+
+    def hint(self, weights: Path | None = None) -> str:
+        """What can be asked for, to who is about to.
+
+        Args:
+            weights: of CLIP, where they are now; or for features from files, if they are CLIP's.
+        """
+        if self.kind == "classes":
+            return "One of: " + ", ".join(sorted(self.names.values()))
+        if self.kind == "closed":
+            return "Colours and outlines: " + ", ".join((*COLORS, *OUTLINES, *self.names.values()))
+        if self.kind == "files" and weights is None:
+            return "No words (--weights, if these features are CLIP's): ask for what is picked"
+        return "Any words"
 
     def negatives(self, text: str) -> tuple[str, ...]:
         """What a text is held against unless told: with classes all others, with CLIP what is meant by

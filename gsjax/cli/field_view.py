@@ -14,7 +14,6 @@ from gsjax.cli.field_query import Question, select
 from gsjax.cli.field_run import FieldRun
 from gsjax.cli.selected import EXTRACTED, keep_part
 from gsjax.methods.feature_field import FeatureField, features_of, gaussian_cosines, threshold_for
-from gsjax.perception.closed_vocabulary import COLORS, OUTLINES
 from gsjax.viz.viewer import Asking, Found
 
 
@@ -46,16 +45,4 @@ def asking_of(run: FieldRun) -> Asking:
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         return keep_part(run.path / EXTRACTED, name, run.gaussians, selected, run.labels)
 
-    return Asking(_hint(run), ask, like, save)
-
-
-def _hint(run: FieldRun) -> str:
-    """What can be asked for."""
-    source = run.stored.source
-    if source.kind == "classes":
-        return "One of: " + ", ".join(sorted(source.names.values()))
-    if source.kind == "closed":
-        return "Colours and outlines: " + ", ".join((*COLORS, *OUTLINES, *source.names.values()))
-    if source.kind == "files" and run.weights is None:
-        return "No words (--weights, if these features are CLIP's): ask for what is picked"
-    return "Any words"
+    return Asking(run.stored.source.hint(run.weights), ask, like, save)

@@ -39,11 +39,14 @@ class GaussianOptions:
     point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
     """A pixel that shows what is looked for: of --camera, or of --frame."""
     threshold: float | None = None
-    """Score above which a Gaussian is meant: a cosine (-1 to 1), or against negatives a share (0 to 1).
-    Unless given, 1/2 against negatives and in a scene that deforms; of a text of the closed vocabulary its
-    own; else where the scores part best into two kinds (Otsu)."""
+    """Score above which a Gaussian is meant: a cosine (-1 to 1), or against negatives or other names a share
+    (0 to 1). Unless given, 1/2 against these; of a text of the closed vocabulary its own; else where the
+    scores part best into two kinds (Otsu)."""
     color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
     """RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
+    negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
+    """What it is held against. A text is, of classes, against all others, of CLIP against "object", "things",
+    "stuff", "texture", unless given."""
     move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """By how much along each axis, in the scene's unit, what was found is moved in moved.ply; not written
     unless given."""
@@ -55,9 +58,6 @@ class FieldOptions:
 
     image: Path | None = None
     """A picture of what is looked for; of one with an alpha channel what is opaque."""
-    negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
-    """What it is held against. A text is, of classes, against all others, of CLIP against "object", "things",
-    "stuff", "texture", unless given."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
     """The file of its scene, where it is now. Found where it was, or beside the field, unless given."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -100,7 +100,7 @@ class Options:
     """Camera (or photograph) to show it from, and in which a --point is. Of a tracked run the first held out
     one, else the first; of a field all, unless given."""
     weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face; of a field, where they are now."""
+    """Folder of CLIP's weights, in the layout of Hugging Face; of what CLIP taught, where they are now."""
     debug: bool = False
     """Show Python's traceback when something fails."""
     gaussians: Annotated[GaussianOptions, tyro.conf.OmitArgPrefixes] = GaussianOptions()
@@ -259,19 +259,22 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
         ValueError: more than one of text, point and box, or options that such a scene has no use for.
     """
     asked, deform = options.gaussians, options.deform
-    others = {"camera": options.camera, "weights": options.weights, **vars(options.field)}
+    others = {"camera": options.camera, **vars(options.field)}
     others |= {n: v for n, v in vars(options.track).items() if v != getattr(TrackOptions(), n)}
     if unused := [name for name, value in others.items() if value is not None]:
         name = unused[0].replace("_", "-")
         raise ValueError(f"--{name}: a run of `gsjax deform` has no use for it; leave it out")
     if sum(way is not None for way in (options.text, asked.point, deform.box)) > 1:
         raise ValueError("expected at most one of TEXT, --point and --box, found more")
-    if asked.threshold is not None and not 0 <= asked.threshold < 1:
-        raise ValueError(f"--threshold: expected 0 to below 1, a probability, found {asked.threshold:g}")
+    if asked.threshold is not None and not -_HIGHEST <= asked.threshold < _HIGHEST:
+        raise ValueError(f"--threshold: expected less than 1, found {asked.threshold:g}")
+    if options.text is None and (asked.negatives is not None or options.weights is not None):
+        option = "negatives" if asked.negatives is not None else "weights"
+        raise ValueError(f"--{option}: expected a TEXT too, which it is for; found none")
     point = None if asked.point is None else _numbers("--point", asked.point, "X,Y")
     box = None if deform.box is None else _numbers("--box", deform.box, "X0,Y0,X1,Y1")
-    given = {} if asked.threshold is None else {"threshold": asked.threshold}
-    return DeformQuestion(options.text, point, box, deform.frame, deform.frames, **given)
+    told = (asked.threshold, asked.negatives, options.weights)
+    return DeformQuestion(options.text, point, box, deform.frame, deform.frames, *told)
 
 
 def _question(options: Options) -> Question:
@@ -299,7 +302,7 @@ def _question(options: Options) -> Question:
             f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
             f"{asked.threshold:g}"
         )
-    told = (of_field.image, point, options.camera, of_field.negatives, asked.threshold)
+    told = (of_field.image, point, options.camera, asked.negatives, asked.threshold)
     return Question(options.text, *told)
 
 

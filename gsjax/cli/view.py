@@ -45,7 +45,7 @@ class Options:
     images: str | None = None
     """Of a field or a fit: where the photographs are now."""
     weights: Path | None = None
-    """Of a field: the folder of CLIP's weights, where it is now."""
+    """Of what CLIP taught: the folder of its weights, where it is now."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 

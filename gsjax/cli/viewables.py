@@ -49,8 +49,8 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
         return _of_field(path, notes, now), path
     expect_run(path)
     if (path / DEFORMATION).is_file():
-        _expect_only((), now, f"{path} is a run that deforms")
-        return viewable_deformation(path, notes), path
+        _expect_only(("weights",), now, f"{path} is a run that deforms")
+        return viewable_deformation(path, notes, now.weights), path
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from gsjax.cli.deform_file import NAME, StoredDeformation, write_deformation
+from gsjax.cli.deform_teacher import Meaning
+from gsjax.cli.field_source import Source
 from gsjax.geometry.cameras import intrinsics
 from gsjax.methods.surgical import QUESTIONS, DeformingScene
 from gsjax.scene.initialize import gaussians_from_points
@@ -26,9 +28,11 @@ def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
     gaussians = gaussians_from_points(points, np.full_like(points, 0.5))
     logits = jnp.full(len(points), 4.0)
     gaussians = eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
-    book = None
+    meaning = None
     if names:
         book = np.eye(2, 3)
+        source = Source("classes", dict(enumerate(names, 1)))
+        meaning = Meaning(source, names, book, np.eye(4, 3))
         values = jnp.asarray(book[np.repeat([0, 1], [len(wall), len(plate)])], jnp.float32)
         gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
     viewmats = np.tile(np.eye(4), (FRAMES, 1, 1))
@@ -36,8 +40,7 @@ def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
     stored = StoredDeformation(
         DeformingScene(gaussians),
         None,
-        names,
-        book,
+        meaning,
         times=np.linspace(0, 1, FRAMES),
         frame_ids=np.arange(FRAMES) + 5,
         seconds=1.0,

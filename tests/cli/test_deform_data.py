@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from gsjax.cli.deform_data import deform_data
+from gsjax.cli.field_teacher import Asked
 from gsjax.cli.messages import Notes
 from gsjax.data import open_sequence
 
@@ -29,12 +30,13 @@ def recording(masked=range(10), names=NAMES):
 def read(sequence, tools="leave-out", tool_values=(), features="auto"):
     console = Console(quiet=True)
     notes = Notes(console)
-    return deform_data(sequence, 8, tools, features, 8, tool_values, notes, console), " ".join(notes.all)
+    told = (tools, Asked(features), 8, tool_values, notes, console)
+    return deform_data(sequence, 8, *told), " ".join(notes.all)
 
 
 def test_tools_are_left_out_by_name_and_other_classes_are_learned():
     data, said = read(recording())
-    assert list(data.names.values()) == ["background-tissue", "kidney-parenchyma"]
+    assert data.names == ("background-tissue", "kidney-parenchyma")
     look = data.looks[0]
     np.testing.assert_array_equal(look.counts[:8], False)
     np.testing.assert_array_equal(look.counts[8:], True)
@@ -45,7 +47,7 @@ def test_tools_are_left_out_by_name_and_other_classes_are_learned():
 
 def test_tools_may_be_named_by_value():
     data, _ = read(recording(), tool_values=(KIDNEY,))
-    assert list(data.names.values()) == ["background-tissue", "instrument-shaft"]
+    assert data.names == ("background-tissue", "instrument-shaft")
     np.testing.assert_array_equal(data.looks[0].counts[8:, :24], False)
     np.testing.assert_array_equal(data.looks[0].counts[:8], True)
 
@@ -57,6 +59,5 @@ def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
     data, _ = read(recording(masked=[0, 3, 4]), tools="draw")
     assert data.train == [0, 2, 3, 4, 5, 6, 7, 8]
     assert (data.looks[1].ids == -1).all()  # nobody says what frame 2 shows
-    assert (data.classes(None) == -1).all()
     with pytest.raises(ValueError, match="expected masks of frames to learn from"):
         read(recording(masked=[1]))

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from gsjax.cli.deform_file import StoredDeformation, read_deformation, write_deformation
+from gsjax.cli.deform_teacher import Meaning
+from gsjax.cli.field_source import Source
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.surgical import DeformingScene, nodes_of
 from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
+
+SOURCE = Source("classes", {1: "tissue", 2: "tool"})
 
 
 def stored(kind="hexplane", nodes=0, features=0, moves=True, rows=False):
@@ -25,17 +29,21 @@ def stored(kind="hexplane", nodes=0, features=0, moves=True, rows=False):
         field = init_deformation(key, config, np.array([[0, 0, 0], [1, 1, 1]]), features)
         field = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), field)
     scene = DeformingScene(gaussians, field)
-    names, book = (("tissue", "tool"), np.eye(2, features)) if features else ((), None)
+    meaning = None
+    if features:
+        meaning = Meaning(SOURCE, ("tissue", "tool"), np.eye(2, features), np.eye(5, features))
     moving = nodes_of(gaussians, nodes) if nodes else jnp.array([2, 5, 9]) if rows else None
     cameras = {"viewmats": np.tile(np.eye(4), (4, 1, 1)), "Ks": np.tile(np.diag([60.0, 60, 1]), (4, 1, 1))}
     frames = {"times": np.linspace(0, 1, 4), "frame_ids": np.arange(4) + 7, "seconds": 2.5}
     seen = {"size": (64, 52), "near": 0.02, "held_out": np.array([1])}
-    return StoredDeformation(scene, moving, names, book, **frames, **cameras, **seen)
+    return StoredDeformation(scene, moving, meaning, **frames, **cameras, **seen)
 
 
 def leaves_of(given):
     """What the file has of it."""
-    return (given.scene.gaussians, given.scene.field, given.moving, given.viewmats, given.Ks)
+    scene, meaning = given.scene, given.meaning
+    vectors = () if meaning is None else (meaning.codebook, meaning.basis)
+    return (scene.gaussians, scene.field, given.moving, given.viewmats, given.Ks, *vectors)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +62,11 @@ def test_what_is_written_is_what_is_read(given, tmp_path):
     write_deformation(tmp_path / "deformation.npz", first)
     again = read_deformation(tmp_path / "deformation.npz")
     assert again.names == first.names
-    for name in ("codebook", "times", "frame_ids", "viewmats", "Ks", "held_out"):
+    if first.meaning is not None:
+        assert again.meaning.source == first.meaning.source
+        np.testing.assert_array_equal(first.meaning.codebook, again.meaning.codebook)
+        np.testing.assert_array_equal(first.meaning.basis, again.meaning.basis)
+    for name in ("times", "frame_ids", "viewmats", "Ks", "held_out"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name), err_msg=name)
     for name in ("seconds", "size", "near", "meaning_changes"):
         assert getattr(first, name) == getattr(again, name)
@@ -101,7 +113,9 @@ def test_a_file_with_what_no_scene_has(spoil, match, tmp_path):
 @pytest.mark.parametrize(
     ("told", "match"),
     [
-        ({"names": ["tissue"]}, "a code for each name"),
+        ({"meaning": {"source": SOURCE.plain(), "names": ["tissue"], "dimension": 5}}, "does not fit"),
+        ({"meaning": {"source": {"kind": "x"}, "names": [], "dimension": 5}}, "expected what `gsjax deform`"),
+        ({"meaning": None}, "does not fit"),
         ({"held_out": [1, 4]}, "held-out frames of these"),
         ({"size": [64, 0]}, "a size of pictures"),
         ({"size": [64]}, "expected what `gsjax deform` writes"),

@@ -17,6 +17,7 @@ from gsjax.cli import main
 from gsjax.cli.deform import Options, write_scene
 from gsjax.cli.deform_data import deform_data
 from gsjax.cli.deform_file import read_deformation, write_deformation
+from gsjax.cli.field_teacher import Asked
 from gsjax.cli.messages import Notes
 from gsjax.cli.run_folder import RunFolder
 from gsjax.cli.viewables import open_viewable
@@ -40,10 +41,10 @@ FAINT = 0.3  # of a feature's length
 def taught(tmp_path_factory):
     """A run whose Gaussians in the lower left of frame 1 are tool, and all others tissue."""
     run, console = tmp_path_factory.mktemp("taught") / "run", Console(quiet=True)
-    data = deform_data(open_sequence(SCENE), 8, "draw", "classes", 4, (), Notes(console), console)
+    data = deform_data(open_sequence(SCENE), 8, "draw", Asked("classes"), 4, (), Notes(console), console)
     moves = DeformationConfig(resolution=8, time_resolution=4, levels=1)
     config = SurgicalConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
-    problem, state = begin_surgical(data.looks, config, data.codebook)
+    problem, state = begin_surgical(data.looks, config, data.codes)
     scene, _, moving = with_field(problem, state.scene)
     layers = jax.tree.map(
         lambda leaf: leaf + 0.02 * jax.random.normal(jax.random.key(1), leaf.shape), scene.field.layers
@@ -54,7 +55,7 @@ def taught(tmp_path_factory):
     write_scene(folder, SurgicalState(scene, None, moving, None, 0, 0), data)
     stored = read_deformation(run / "deformation.npz")
     rows = in_corner(stored, 1).astype(int)
-    features = jnp.asarray(FAINT * stored.codebook[rows], jnp.float32)
+    features = jnp.asarray(FAINT * stored.meaning.codebook[rows], jnp.float32)
     scene = eqx.tree_at(lambda s: s.gaussians.features, stored.scene, features)
     write_deformation(run / "deformation.npz", replace(stored, scene=scene))
     return run
@@ -150,10 +151,12 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("--box", "9,9,3"), "--box: expected X0,Y0,X1,Y1 in pixels, found '9,9,3'"),
         (("tool", "--frame", 10), "--frame: expected one of 0 to 9, found 10"),
         (("tool", "--frames", "20:"), "--frames: 20: holds no frame of the run, which has 10"),
-        (("tool", "--threshold", 1), "--threshold: expected 0 to below 1"),
-        (("tool", "--threshold", 0.99999), "best probability"),
+        (("tool", "--threshold", 1), "--threshold: expected less than 1"),
+        (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
-        (("tool", "--negatives", "tissue"), "--negatives: a run of `gsjax deform` has no use for it"),
+        (("tool", "--negatives", "tissue"), "--negatives: this scene knows classes"),
+        (("--point", "3,3", "--negatives", "tissue"), "--negatives: expected a TEXT too"),
+        (("tool", "--image", "x.png"), "--image: a run of `gsjax deform` has no use for it"),
         (("tool", "--min-score", 0.1), "--min-score: a run of `gsjax deform` has no use for it"),
     ],
 )
@@ -167,7 +170,7 @@ def test_what_is_asked_is_checked(gsjax, taught, told, words):
 def test_a_run_without_names_and_one_without_a_scene(gsjax, run):
     stored = read_deformation(run / "deformation.npz")
     scene = eqx.tree_at(lambda s: s.gaussians.features, stored.scene, None)
-    write_deformation(run / "deformation.npz", replace(stored, scene=scene, names=(), codebook=None))
+    write_deformation(run / "deformation.npz", replace(stored, scene=scene, meaning=None))
     code, said = gsjax("query", run, "tool")
     assert code == 2
     assert "reconstruct it with --tools draw" in said
@@ -213,10 +216,10 @@ def test_a_run_whose_recording_is_gone(run):
 def test_features_that_change_are_those_of_the_frame(run):
     """All are tissue, and the field adds the difference to tool as time goes on."""
     stored = read_deformation(run / "deformation.npz")
-    tissue, tool = stored.codebook
+    tissue, tool = stored.meaning.codebook
     field = stored.scene.field
     config = replace(field.config, feature=True)
-    width = field.layers[-1].weight.shape[0] + stored.codebook.shape[1]
+    width = field.layers[-1].weight.shape[0] + stored.meaning.codebook.shape[1]
     last = eqx.tree_at(
         lambda layer: (layer.weight, layer.bias),
         field.layers[-1],

@@ -37,7 +37,13 @@ def prompt_probabilities(
             is the mean of the features rendered there.
         temperature: of the softmax.
     """
-    return jax.nn.softmax(_directions(features) @ _directions(prompts).T / temperature, axis=-1)
+    return jax.nn.softmax(prompt_cosines(features, _directions(prompts)) / temperature, axis=-1)
+
+
+def prompt_cosines(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n k"]:
+    """Cosines of features, whatever their length, and vectors that have length 1 where they are from; 0 of
+    what has no length."""
+    return _directions(features) @ directions.T
 
 
 def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:

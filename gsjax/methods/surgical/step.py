@@ -152,9 +152,14 @@ def feature_loss(
 ) -> Float[Array, ""]:
     """|F_t - F_s|_1, a mean over channels and the teacher's pixels, to whose grid F_s is brought bilinearly
     (papers/004, eq. 10)."""
-    resized = jax.image.resize(drawn, (*ids.shape, drawn.shape[2]), "linear", antialias=False)
     known = (ids >= 0).astype(drawn.dtype)
-    return weighted_mean(jnp.abs(resized - codebook[jnp.maximum(ids, 0)]).mean(axis=-1), known)
+    off = jnp.abs(on_grid(drawn, ids.shape) - codebook[jnp.maximum(ids, 0)])
+    return weighted_mean(off.mean(axis=-1), known)
+
+
+def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Float[Array, "h w c"]:
+    """Rendered features brought to the teacher's grid, bilinearly."""
+    return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=False)
 
 
 def surgical_step(config: SurgicalConfig, radius: float) -> Step:

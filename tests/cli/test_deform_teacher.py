@@ -1,0 +1,224 @@
+"""What `gsjax deform` learns besides classes of masks: features of files and of encoders, and how a scene
+that learned them is asked."""
+
+import json
+import re
+from pathlib import Path
+
+import hypothesis.strategies as st
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from rich.console import Console
+
+from gsjax.cli import main
+from gsjax.cli.deform_data import deform_data
+from gsjax.cli.deform_file import read_deformation
+from gsjax.cli.deform_prompts import wanted_like, wanted_text
+from gsjax.cli.deform_teacher import GROUPS, Meaning, basis_of, groups_of
+from gsjax.cli.field_source import Source
+from gsjax.cli.field_teacher import Asked
+from gsjax.cli.messages import Notes
+from gsjax.data import open_sequence
+from tests.cli.test_deform import SCENE, SMALL
+from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
+
+DIMENSION, GRID = 24, (13, 16)
+OF_TISSUE, OF_TOOL = np.random.default_rng(0).normal(size=(2, DIMENSION)).astype(np.float32)
+
+
+def feature_map(t, shape=GRID):
+    """A map as a model might give it: a vector for the tissue and one for the tool, with some noise."""
+    mask = open_sequence(SCENE).mask(t, 0)
+    rows, columns = (np.arange(n) * m // n for n, m in zip(shape, mask.shape, strict=True))
+    tool = mask[np.ix_(rows, columns)] > 0
+    noise = 0.05 * np.random.default_rng(t).normal(size=(*shape, DIMENSION))
+    return (np.where(tool[..., None], OF_TOOL, OF_TISSUE) + noise).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("features")
+    for t in range(10):
+        np.save(folder / f"{t:06d}.npy", feature_map(t))
+    return folder
+
+
+def told(run, *options):
+    return [str(one) for one in ("deform", SCENE, "--out", run, "--tools", "draw", *SMALL, *options)]
+
+
+@pytest.fixture(scope="module")
+def learned(files, tmp_path_factory):
+    run = tmp_path_factory.mktemp("learned") / "run"
+    assert main(told(run, "--features", files, "--deform.rates.features", 0.03)) == 0
+    return run
+
+
+def query(run, *options):
+    assert main(["query", *map(str, (run, *options))]) == 0
+    return json.loads((run / "query" / "query.json").read_text())
+
+
+def data_of(features, folder, channels=4, **asked):
+    console = Console(quiet=True)
+    given = (Asked(str(features), **asked), channels, (), notes := Notes(console), console)
+    return deform_data(open_sequence(SCENE), 8, "draw", *given), " ".join(notes.all)
+
+
+def test_feature_files_are_learned_and_judged_on_their_grid(learned):
+    found = json.loads((learned / "metrics.json").read_text())
+    assert found["features"] == "files"
+    assert found["names"] == ["group 1", "group 2"]
+    assert [row["f_psnr"] is None for row in found["scores"]] == [False, False]
+    assert 0.6 < found["test"]["iou"] <= 1
+    assert found["curve"][-1]["feature"] < found["curve"][0]["feature"]
+    stored = read_deformation(learned / "deformation.npz")
+    assert stored.meaning.basis.shape == (DIMENSION, 4)
+    assert stored.scene.gaussians.features.shape[1] == 4
+
+
+def test_what_files_taught_is_asked_by_place_and_without_a_prompt(learned):
+    mask = open_sequence(SCENE).mask(0, 0) > 0
+    y, x = (int(np.median(axis)) for axis in np.nonzero(mask))
+    found = query(learned, "--point", f"{x},{y}", "--frame", 0)
+    assert found["meant"].startswith("group ")
+    assert 0 < found["gaussians"] < found["of"]
+    assert set(query(learned)["classes"]) <= {f"group {n}" for n in range(1, GROUPS + 1)}
+
+
+def test_nobody_reads_a_text_in_the_space_of_files(learned, capsys):
+    assert main(["query", str(learned), "tool"]) == 2
+    assert re.search("nobody here reads texts.*--point", " ".join(capsys.readouterr().err.split()))
+
+
+def test_masks_with_embeddings_are_rows_of_one_codebook(tmp_path):
+    for t in range(10):
+        ids = (open_sequence(SCENE).mask(t, 0) > 0).astype(np.int32)
+        np.savez(tmp_path / f"{t}.npz", ids=ids, codebook=np.stack([OF_TISSUE, OF_TOOL]))
+    (tmp_path / "0.npz").rename(tmp_path / "000000.npz")
+    for t in range(1, 10):
+        (tmp_path / f"{t}.npz").rename(tmp_path / f"{t:06d}.npz")
+    data, said = data_of(tmp_path, tmp_path)
+    assert len(data.codes) == 2
+    assert data.names == ("group 1", "group 2")
+    assert "4 channels keep 100.0% of their 24 numbers" in said
+    cosine = OF_TISSUE @ OF_TOOL / np.linalg.norm(OF_TISSUE) / np.linalg.norm(OF_TOOL)
+    ours = data.codes / np.linalg.norm(data.codes, axis=1, keepdims=True)
+    np.testing.assert_allclose(ours[0] @ ours[1], cosine, atol=1e-6)  # the basis keeps angles
+
+
+def test_a_map_is_learned_where_it_counts_and_a_held_out_frame_may_lack_one(files, tmp_path):
+    for t in (t for t in range(10) if t != 9):
+        np.save(tmp_path / f"{t:06d}.npy", feature_map(t))
+    data, said = data_of(tmp_path, tmp_path)
+    assert sorted(data.held_out) == [1]
+    assert "frame 9 is not compared with the teacher" in said
+    ids, codes = data.said(data.train[3])
+    t = data.train[3]
+    scale = np.linalg.norm([feature_map(i) for i in data.train], axis=-1).mean()
+    np.testing.assert_allclose(
+        codes[ids], feature_map(t) / scale @ data.meaning.basis, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--features", "nowhere"), ("--features nowhere", "a folder of feature files")),
+        (("--features", "clip"), ("--features clip", "--weights PATH too")),
+        (("--features", "none", "--masks", "segment"), ("--masks", "which masks part", "found none")),
+        (("--sam", "."), ("--sam", "found auto")),
+        (("--features", "classes", "--level", "small"), ("--level small", "LangSplat")),
+    ],
+)
+def test_options_that_contradict_each_other(options, words, tmp_path, capsys):
+    assert main(told(tmp_path / "run", *options)) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "run").exists()
+
+
+def test_files_that_do_not_fit(files, tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected features of the picture 000000"):
+        data_of(tmp_path, tmp_path)
+    for t in range(10):
+        np.save(tmp_path / f"{t:06d}.npy", feature_map(t, (13, 16) if t else (26, 32)))
+    with pytest.raises(ValueError, match="expected one grid in all frames, found 16x13, 32x26"):
+        data_of(tmp_path, tmp_path)
+    np.save(tmp_path / "000000.npy", feature_map(0, (16, 13)))
+    with pytest.raises(ValueError, match="features of a picture of the shape"):
+        data_of(tmp_path, tmp_path)
+
+
+def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
+    """Tissue is pink and the tool grey; who asks for a colour finds the Gaussians of it."""
+    data, said = data_of("closed", tmp_path, 16)
+    assert "no foundation model" in said
+    wanted = wanted_text(data.meaning, "grey")
+    scores = np.asarray(wanted.scores(jnp.asarray(data.codes, jnp.float32)))
+    threshold = wanted.threshold(scores)
+    assert threshold.rule == "the encoder's own"
+    ids, mask = data.said(0).ids, open_sequence(SCENE).mask(0, 0)
+    assert (scores[ids[mask > 0]] > threshold.value).all()
+    assert (scores[ids[mask == 0]] < threshold.value).all()
+    with pytest.raises(ValueError, match="--weights"):
+        wanted_text(data.meaning, "grey", weights=Path("x"))
+
+
+@needs_foundation
+def test_clip_teaches_and_reads(tmp_path, request, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    weights = request.getfixturevalue("clip_folder")
+    run = tmp_path / "run"
+    assert main(told(run, "--features", "clip", "--weights", weights)) == 0
+    assert query(run, "--point", "5,5")["features"] == "clip"
+    found = query(run, "a tool", "--threshold", 0.01)
+    assert found["against"] == ["object", "things", "stuff", "texture"]
+    assert (found["threshold"], found["meant"]) == (0.01, None)
+    found = query(run, "a tool", "--negatives", "tissue", "--threshold", 0.01)
+    assert found["against"] == ["tissue"]
+
+
+def test_classes_are_named_and_nothing_else():
+    names = ("tissue", "tool")
+    meaning = Meaning(Source("classes", dict(enumerate(names, 1))), names, np.eye(2), np.eye(5, 2))
+    assert wanted_text(meaning, "Tool").row == 1
+    for option, given_ in (("negatives", ("x",)), ("weights", Path("x"))):
+        with pytest.raises(ValueError, match=f"--{option}: this scene knows classes"):
+            wanted_text(meaning, "tool", **{option: given_})
+
+
+def test_a_place_is_told_apart_from_the_other_names():
+    meaning = Meaning(Source("files"), ("a", "b"), np.eye(2), np.eye(5, 2))
+    wanted = wanted_like(meaning, np.array([0.1, 0.9]))
+    assert (wanted.meant, wanted.against) == ("b", ("a",))
+    scores = np.asarray(wanted.scores(jnp.array([[1.0, 0], [0.1, 0.9], [0, 0]])))
+    assert scores[1] > 0.99 > 0.5 > scores[0]
+    np.testing.assert_allclose(scores[2], 0.5)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**31), st.integers(1, 6), st.integers(1, 8), st.integers(1, 5))
+def test_a_basis_is_orthonormal_and_keeps_all_where_there_is_room(seed, rank, channels, more):
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(rank + more, rank)) @ rng.normal(size=(rank, 12))
+    basis, kept = basis_of(vectors, channels)
+    gram = basis.T @ basis
+    held = min(rank, channels)
+    np.testing.assert_allclose(gram, np.diag([1.0] * held + [0.0] * (channels - held)), atol=1e-9)
+    ours = vectors @ basis
+    np.testing.assert_allclose(kept, (ours**2).sum() / (vectors**2).sum(), rtol=1e-6)
+    if channels >= rank:
+        np.testing.assert_allclose(ours @ ours.T, vectors @ vectors.T, atol=1e-6)
+
+
+def test_groups_are_kinds_the_largest_first():
+    rng = np.random.default_rng(1)
+    kinds = np.eye(5)[np.repeat([0, 2, 4], [30, 50, 10])]
+    codes = kinds * rng.uniform(0.5, 2, (90, 1)) + 0.01 * rng.normal(size=(90, 5))
+    groups = groups_of(codes)
+    np.testing.assert_array_equal(groups.argmax(axis=1), [2, 0, 4])
+    np.testing.assert_array_equal(groups_of(np.eye(5)[[3, 3, 1]]), np.eye(5)[[3, 1]])
+    assert 2 <= len(groups_of(rng.normal(size=(5000, 4)))) <= GROUPS
