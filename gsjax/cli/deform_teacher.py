@@ -151,7 +151,7 @@ def encoded_teacher(
     groups = groups_of(codes[there[there >= 0]])
     names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
     notes.add(
-        f"Features are {teaching.about}: {channels} channels keep {kept:.1%} of their "
+        f"Learned beside colours: {teaching.about}; {channels} channels keep {kept:.1%} of their "
         f"{teaching.teacher.dimension} numbers (--deform.channels). They have no names, and are parted into "
         f"{len(groups)} groups."
     )
