@@ -9,6 +9,7 @@ from gsjax.cli.deform_scores import OVER_TIME
 from gsjax.cli.machine import in_words
 from gsjax.cli.report import Media, Table, write_report
 from gsjax.cli.run_folder import RunFolder
+from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
 
 _COLUMNS = (  # key, head, unit and decimals, where frames have it
@@ -95,11 +96,13 @@ def _of_classes(classes: list[dict[str, Any]], test: dict[str, Any]) -> list[Tab
     if not classes:
         return []
     keys = ("class", "iou", "dice")
-    rows = [[one[key] for key in keys] for one in classes] + [["mean", test["iou"], test["dice"]]]
-    right = test["accuracy"]
-    note = "" if right is None else f"{right:.2%} of the pixels that count are named right."
-    heads = ("class", "IoU", "Dice (F1)")
-    return [Table("What is what", heads, rows, note=note, decimals=(None, 4, 4))]
+    rows = [[one[key] for key in keys] for one in classes]
+    note, heads = "", ("class", "IoU", "Dice (F1)")
+    if test["iou"] is not None:
+        note = f"On average an IoU of {test['iou']:.4f} and a Dice of {test['dice']:.4f}; "
+        note += f"{test['accuracy']:.2%} of the pixels that count are named right."
+    colors = [label_color(label) for label in range(1, len(rows) + 1)]
+    return [Table("What is what", heads, rows, note=note, decimals=(None, 4, 4), colors=colors)]
 
 
 def _memory(found: dict[str, Any]) -> str:

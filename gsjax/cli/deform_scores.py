@@ -34,7 +34,7 @@ from gsjax.metrics.tracking import carried_points
 from gsjax.perception.optical_flow import DisFlow
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.render import render
-from gsjax.viz.colors import side_by_side, to_uint8
+from gsjax.viz.colors import in_rows, overlay_labels, to_uint8
 
 OVER_TIME = ("t_ssim", "flow_warp_error", "warped_ssim")
 """Scores of a frame and its neighbour, as `temporal_scores` names them; beside each stand NAME_true, that of
@@ -42,6 +42,7 @@ the recording, and NAME_gap, how far apart the two are."""
 _OF_FRAMES = ("psnr_masked", "ssim", "depth_mm", "psnr_other", "ms_ssim", "f_psnr", "flow_warp_share")
 _OF_FRAMES += tuple(f"{name}{end}" for name in OVER_TIME for end in ("", "_true", "_gap"))
 _SHOWN = 8  # frames in the report
+_PANEL_HEIGHT = 200  # pixels, at least
 _TIMED = 12  # frames drawn to say how many a second
 _SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
 _HEADROOM = 1.3
@@ -77,8 +78,7 @@ def judge(
             row["psnr_other"] = psnr(there, other.image / 255.0, other.counts)
         if len(rows) < _SHOWN:
             panels = folder.render("held_out" if data.test else "learned", number)
-            difference = _difference(drawn.colors, look)
-            write_png(panels, side_by_side(look.image, drawn.colors, difference, captions=PANELS))
+            write_png(panels, _panels(drawn, look, data))
             row["picture"] = str(panels.relative_to(folder.path))
         rows.append(row)
     test = mean_scores(rows, _OF_FRAMES)
@@ -220,6 +220,16 @@ def over_time(pair: list[tuple[np.ndarray, Look]]) -> dict[str, Any]:
         row[f"{name}_true"] = wants
         row[f"{name}_gap"] = None if ours is None or wants is None else abs(ours - wants)
     return row
+
+
+def _panels(drawn: Drawn, look: Look, data: DeformData) -> np.ndarray:
+    """What was seen, what is drawn, their difference, and, of a scene that knows it, what is what."""
+    pictures = (to_uint8(look.image), to_uint8(drawn.colors), _difference(drawn.colors, look))
+    named = dict(zip(PANELS, pictures, strict=True))
+    if data.meaning is not None and drawn.features is not None:
+        labels = classes_of_pixels(drawn.features, jnp.asarray(data.meaning.codebook, jnp.float32))
+        named["what is what"] = overlay_labels(drawn.colors, 1 + np.asarray(labels))
+    return in_rows(named, 2 if len(named) == 4 else 3, _PANEL_HEIGHT)
 
 
 def _difference(colors: np.ndarray, look: Look) -> np.ndarray:
