@@ -1,4 +1,4 @@
-"""`gsjax deform`: a scene that deforms, seen by one moving camera, with --tools draw what is what in it."""
+"""`gsjax deform`: a scene that deforms, seen by one moving camera, and what is what in it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
@@ -13,7 +13,7 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
-from gsjax.cli.deform_data import NOBODY, DeformData, Tools, deform_data
+from gsjax.cli.deform_data import DeformData, Tools, deform_data
 from gsjax.cli.deform_depth import Deep, Depth, with_depth
 from gsjax.cli.deform_file import NAME, StoredDeformation, write_deformation
 from gsjax.cli.deform_poses import as_refined
@@ -44,6 +44,7 @@ HELP = (
 )
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
+NOBODY = "none"  # of features: there is no teacher
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
@@ -80,7 +81,7 @@ class Options:
     (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the frames' pictures, or by frame number), or
     none. auto: classes if masks have more than one among the pixels that count."""
     masks: Masks = "auto"
-    """Whose masks closed and clip tell things apart by: the recording's own, or a segmenter's that needs no
+    """Whose masks closed and clip are asked about: the recording's own, or a segmenter's that needs no
     weights. auto: files if there are."""
     sam: Path | None = None
     """Folder of SAM's weights: let it segment for these."""
@@ -120,21 +121,22 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        deep = _recording(options, notes)
-        told = (options.test_every, options.tools, asked, options.deform.channels)
-        data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
-        if not data.names:
-            only = "One class among the pixels that count: colours are learned, and no meaning or graph"
-            notes.add(f"{only}.")
-            console.print(f"{only}; --tools draw, say, for gsjax query and gsjax ask", soft_wrap=True)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = _settings(options, asked)
         if options.resume:
             folder.check_config(settings, but=_OF_NO_BEARING)
+        deep = _recording(options, notes)
+        told = (options.test_every, options.tools, asked, options.deform.channels)
+        data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
+        if data.meaning is None and asked is not None:
+            only = "One class among the pixels that count" if data.sequence.has_masks else "No masks"
+            only += ": colours are learned, and no meaning or graph"
+            notes.add(f"{only}.")
+            console.print(f"{only}; for gsjax query and ask: --tools draw, or --features", soft_wrap=True)
         config = options.deform
         with stage(console, "placing the first Gaussians"):
-            problem, state = begin_surgical(data.looks, config, data.codes)
-        learning = Learning(state, {"frames, depth, masks and poses": data.digest()})
+            problem, state = begin_surgical(data.looks, config, data.codes, data.first)
+        learning = Learning(state, {"frames, depth, masks, poses and features": data.digest()})
         if options.resume:
             learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
@@ -159,7 +161,7 @@ def run(options: Options) -> int:
             "num_gaussians": learning.state.scene.gaussians.num,
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
-            "features": NOBODY if data.meaning is None else data.meaning.source.kind,
+            "features": "none" if data.meaning is None else data.meaning.source.kind,
             "names": data.names,
             "depth": deep.found,
             "poses": refined,
@@ -222,34 +224,36 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
-def _settings(options: Options, asked: Asked) -> Options:
+def _settings(options: Options, asked: Asked | None) -> Options:
     """The options by which a run finds everything again from elsewhere."""
     found: dict[str, Any] = {"dataset": located(options.dataset)}
     for name in ("sam", "weights"):
         path = getattr(options, name)
         found[name] = path and Path(located(str(path)))
-    if asked.of_files and asked.features != NOBODY:
+    if asked is not None and asked.of_files:
         found["features"] = located(options.features)
     return replace(options, **found)
 
 
-def _checked(options: Options) -> Asked:
-    """Whose features are asked for, once all options fit."""
+def _checked(options: Options) -> Asked | None:
+    """Whose features are asked for, once all options fit; None: nobody's."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
     if options.test_every < 0 or options.test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
-    told = (options.features, options.masks, options.sam, options.weights, options.level)
-    segmented = options.masks != "auto" or options.sam is not None
-    if segmented and options.features in ("auto", "classes", NOBODY):
+    asked = Asked(options.features, options.masks, options.sam, options.weights, options.level)
+    given = {"masks": options.masks != "auto", "sam": options.sam is not None}
+    if any(given.values()) and options.features not in ("closed", "clip"):
+        option = next(name for name, there in given.items() if there)
         raise ValueError(
-            f"--{'masks' if options.sam is None else 'sam'}: expected --features closed, clip or maskclip, "
-            f"which masks part, found {options.features}"
+            f"--{option}: expected --features closed or clip, which ask of masks, found {options.features}"
         )
-    asked = Asked(*told)
     if options.features != NOBODY:
-        asked.check()
-    return asked
+        asked.check(also=(NOBODY,))
+        return asked
+    if asked != Asked(NOBODY):
+        raise ValueError("--weights, --level: expected --features that have a use for them, found none")
+    return None
 
 
 def _told(row: Mapping[str, Any]) -> str:

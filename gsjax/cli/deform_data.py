@@ -10,17 +10,16 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.cli.deform_teacher import ClassTeacher, Meaning, Said, encoded_teacher, said_of
+from gsjax.cli.deform_teacher import ClassTeacher, EncodedTeacher, Meaning, Said, said_of, teaching_of
 from gsjax.cli.field_teacher import Asked
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
-from gsjax.methods.surgical import Look
+from gsjax.methods.surgical import Look, begins, counted_ids
 
 Tools = Literal["leave-out", "draw"]
-NOBODY = "none"
-"""Of features: there is no teacher."""
 _OF_CLASSES = ("auto", "classes")
+_SHOWN = 0.005  # of a picture: a class that has less of it hardly shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +34,7 @@ class DeformData:
         meaning: what features are to say; None without a teacher.
         codes: what ids of looks name, in the scene's channels; None without.
         held_out: what the teacher says of frames in `test`.
+        taught: digest of what the teacher says, in hexadecimal.
         tool_values: what masks call tools; told by names where there is none.
     """
 
@@ -45,6 +45,7 @@ class DeformData:
     meaning: Meaning | None
     codes: Float[np.ndarray, "n channels"] | None
     held_out: Mapping[int, Said]
+    taught: str = ""
     tool_values: tuple[int, ...] = ()
 
     @property
@@ -57,10 +58,24 @@ class DeformData:
         """Of what features tell apart; none without a teacher."""
         return () if self.meaning is None else self.meaning.names
 
+    @property
+    def first(self) -> int | None:
+        """Which of the looks the canonical scene is to be like: the earliest that shows most of the classes,
+        for what it does not show has no Gaussians of its own. None where there are none, or no depth."""
+        if self.meaning is None or self.meaning.source.kind != "classes":
+            return None
+        shown = np.zeros(len(self.looks), int)
+        for i, look in enumerate(self.looks):
+            ids = counted_ids(look)
+            if begins(look, self.looks):
+                counts = np.bincount(ids[ids >= 0], minlength=len(self.names))
+                shown[i] = (counts > _SHOWN * ids.size).sum()
+        return int(shown.argmax()) if shown.any() else None
+
     def digest(self) -> str:
         """Of all that is learned from, in hexadecimal."""
-        found = hashlib.sha256()
-        for value in (*(value for look in self.looks for value in look), self.codes):
+        found = hashlib.sha256(self.taught.encode())
+        for value in (value for look in self.looks for value in look):
             if value is not None:
                 found.update(np.ascontiguousarray(value).tobytes())
         return found.hexdigest()
@@ -88,7 +103,7 @@ def deform_data(
     sequence: Sequence,
     every: int,
     tools: Tools,
-    asked: Asked,
+    asked: Asked | None,
     channels: int,
     tool_values: tuple[int, ...],
     notes: Notes,
@@ -101,7 +116,7 @@ def deform_data(
         every: hold out frame i where (i - 1) mod `every` is 0, as is done with EndoNeRF; 0: none.
         tools: whether what masks call a thing is left out.
         asked: whose features are learned; checked. "auto": the masks' classes, if there are two or more among
-            pixels that count.
+            pixels that count. None: nobody's.
         channels: of a Gaussian's feature.
         tool_values: what masks call tools; told by names where there is none.
         notes: told what is odd.
@@ -131,22 +146,23 @@ def deform_data(
                 f"{sequence.name}: expected masks of frames to learn from, found none (--tools draw)"
             )
     counted = _counted_names(sequence, [masks.get(t) for t in train], tools, tool_values, notes)
-    data = DeformData(sequence, train, test, [], None, None, {}, tool_values)
+    data = DeformData(sequence, train, test, [], None, None, {}, tool_values=tool_values)
+    encoded = asked is not None and asked.features not in _OF_CLASSES
+    teaching = teaching_of(sequence, train, asked, console) if encoded else None
     looks = [data.look(t, 0, tools, masks.get(t)) for t in train]
-    if asked.features == NOBODY:
-        return replace(data, looks=looks)
-    if asked.features not in _OF_CLASSES:
-        given = (asked, channels, notes, console)
-        teacher, looks, codes = encoded_teacher(sequence, train, looks, *given)
+    if teaching is not None:
+        teacher = EncodedTeacher(teaching, looks, channels)
+        ids, codes = teacher.ids, teacher.codes
+        notes.add(teacher.note())
     else:
-        teacher = _of_classes(sequence, counted, asked.features, channels)
+        teacher = None if asked is None else _of_classes(sequence, counted, asked.features, channels)
         if teacher is None:
             return replace(data, looks=looks)
-        ids = (teacher.of_mask(masks.get(t)).ids for t in train)
-        looks = [look._replace(ids=one) for look, one in zip(looks, ids, strict=True)]
-        codes = teacher.meaning.codebook
+        ids, codes = [teacher.of_mask(masks.get(t)).ids for t in train], teacher.meaning.codebook
+    looks = [look._replace(ids=one) for look, one in zip(looks, ids, strict=True)]
     held_out = said_of(teacher, test, sequence, notes)
-    return replace(data, looks=looks, meaning=teacher.meaning, codes=codes, held_out=held_out)
+    said = {"meaning": teacher.meaning, "codes": codes, "held_out": held_out, "taught": teacher.digest()}
+    return replace(data, looks=looks, **said)
 
 
 def _counted_names(

@@ -34,7 +34,7 @@ class DeformQuestion:
     """What is asked of a deforming scene: one of text, point and box; without any, what everything is.
 
     Attributes:
-        text: one of the scene's names.
+        text: one of the scene's names, or what the encoder of its features reads.
         point: x, y in pixels of a frame, as the scene was learned.
         box: x0, y0, x1, y1, likewise.
         frame: what the recording calls the frame in which point and box lie, and whose Gaussians are written;
@@ -209,7 +209,9 @@ def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there
     assert stored.meaning is not None
     if question.region is None:
         assert question.text is not None
-        return wanted_text(stored.meaning, question.text, question.negatives, question.weights)
+        source = stored.meaning.source
+        told = (question.negatives, lambda: source.encoder(question.weights))
+        return wanted_text(stored.meaning, question.text, *told)
     drawn, _ = render_with_room(there, stored.camera(t))
     assert drawn.features is not None
     try:

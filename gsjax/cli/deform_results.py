@@ -135,9 +135,9 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
         )
     if found["names"]:
         grid.add_row("[bold]names[/]", ", ".join(found["names"]))
-    if test["iou"] is not None:
+    if test["iou"] is not None and test["f_psnr"] is not None:
         words = f"IoU {test['iou']:.4f}, Dice {test['dice']:.4f}, accuracy {test['accuracy']:.4f}"
-        words += "" if test["f_psnr"] is None else f", f-PSNR {test['f_psnr']:.2f} dB"
+        words += f", f-PSNR {test['f_psnr']:.2f} dB"
         grid.add_row("", words)
     grid.add_row(
         "[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, drawn {test['fps']:.1f} times a second"

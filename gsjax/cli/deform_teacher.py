@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from scipy.cluster.hierarchy import fcluster, ward
 
-from gsjax.cli.feature_cache import FeatureCache
+from gsjax.cli.feature_cache import FeatureCache, content_digest
 from gsjax.cli.field_source import Source
 from gsjax.cli.field_teacher import Asked, Teaching
 from gsjax.cli.messages import Notes, describe
@@ -24,6 +24,7 @@ from gsjax.perception.codebook import ClassCodebook
 GROUPS = 8
 """Into how many kinds, at most, features without names are parted."""
 _SAMPLE = 2000  # of the vectors that are parted, for all pairs are compared
+_ALIKE = 0.98  # cosine of directions that are of one kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,11 @@ class Meaning:
     names: tuple[str, ...]
     codebook: Float[np.ndarray, "k channels"]
     basis: Float[np.ndarray, "D channels"]
+
+    def hint(self, weights: Path | None = None) -> str:
+        """What can be asked for, to who is about to; as `Source.hint`."""
+        said = self.source.hint(weights)
+        return said if self.source.kind == "classes" else f"{said}; or one of: {', '.join(self.names)}"
 
 
 class Said(NamedTuple):
@@ -77,7 +83,7 @@ class ClassTeacher:
         source = Source("classes", {value + 1: name for value, name in names.items()})
         encoder = ClassCodebook(source.names)
         codes = np.stack([encoder.embed_text(name) for name in names.values()])
-        basis, _ = basis_of(codes, channels)
+        basis, _ = basis_of([codes], channels)
         self.meaning = Meaning(source, tuple(names.values()), codes @ basis, basis)
 
     def said(self, t: int) -> Said:
@@ -92,15 +98,34 @@ class ClassTeacher:
                 ids[mask == value] = row
         return Said(ids, self.meaning.codebook)
 
+    def digest(self) -> str:
+        """Of what is taught beside the looks' ids, in hexadecimal."""
+        return content_digest(f"classes {self.meaning.names}", {})
+
 
 class EncodedTeacher:
-    """Features of files, or of an encoder."""
+    """Features of files, or of an encoder, brought into the scene's channels."""
 
-    def __init__(self, teaching: Teaching, meaning: Meaning):
-        self._teaching, self.meaning = teaching, meaning
+    def __init__(self, teaching: Teaching, looks: Many[Look], channels: int):
+        """
+        Args:
+            teaching: has frames segmented and encoded, or their features read.
+            looks: of the frames that teach.
+            channels: of a Gaussian's feature.
+
+        Raises:
+            ValueError: grids differ, or nothing is said of pixels that count.
+        """
+        self._teaching, teacher = teaching, teaching.teacher
+        vectors, weights = _counted(teacher, looks)
+        basis, self.kept = basis_of(vectors, channels)
+        self.ids, self.codes = _in_channels(teacher, basis)
+        groups = groups_of(np.concatenate([some @ basis for some in vectors]), np.concatenate(weights))
+        names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
+        self.meaning = Meaning(teaching.source, names, groups, basis)
 
     def said(self, t: int) -> Said | None:
-        """Of frame t, whether it was learned from or not.
+        """Of frame t, whether it teaches or not; None where that is nothing.
 
         Raises:
             ValueError, OSError: it cannot be read, or its file does not fit.
@@ -111,51 +136,34 @@ class EncodedTeacher:
         (ids,), codes = _in_channels(teacher, self.meaning.basis)
         return Said(ids, codes)
 
+    def digest(self) -> str:
+        """Of what is taught, in hexadecimal."""
+        return self._teaching.digest()
 
-def encoded_teacher(
-    sequence: Sequence,
-    train: Many[int],
-    looks: Many[Look],
-    asked: Asked,
-    channels: int,
-    notes: Notes,
-    console: Console,
-) -> tuple[EncodedTeacher, list[Look], Float[np.ndarray, "n channels"]]:
-    """Have frames segmented and encoded, or their features read.
+    def note(self) -> str:
+        """What a run says of it."""
+        (dimension, channels), count = self.meaning.basis.shape, len(self.meaning.names)
+        parted = f"they are parted into {count} groups" if count > 1 else "all of it is alike, one group"
+        return (
+            f"Learned beside colours: {self._teaching.about}; {channels} channels keep {self.kept:.1%} of "
+            f"its {dimension} numbers (--deform.channels); {parted}."
+        )
+
+
+def teaching_of(sequence: Sequence, train: Many[int], asked: Asked, console: Console) -> Teaching:
+    """Have frames of camera 0 segmented and encoded, or their features read.
 
     Args:
-        sequence: camera 0 is the one that is learned from.
+        sequence: the recording.
         train: frames to learn from.
-        looks: of these, without a teacher.
-        asked: whose masks and features; checked, of neither classes nor nobody.
-        channels: of a Gaussian's feature.
-        notes: told how much of the features the channels keep.
+        asked: whose masks and features; checked, not of classes.
         console: shows how far it is.
 
-    Returns:
-        The teacher, looks with what it says, and the codes that their ids name.
-
     Raises:
-        ValueError: there are no masks, files do not fit, a package is missing, or nothing is said of pixels
-            that count.
+        ValueError: there are no masks, files do not fit, or a package is missing.
         FileNotFoundError: files of features or weights are not there.
     """
-    teaching = Teaching(_as_photographs(sequence), train, asked, FeatureCache(), console)
-    basis, kept = basis_of(_counted_vectors(teaching.teacher, looks), channels)
-    ids, codes = _in_channels(teaching.teacher, basis)
-    if len({one.shape for one in ids}) > 1:
-        found = ", ".join(sorted({f"{one.shape[1]}x{one.shape[0]}" for one in ids}))
-        raise ValueError(f"--features {asked.features}: expected one grid in all frames, found {found}")
-    looks = [look._replace(ids=one) for look, one in zip(looks, ids, strict=True)]
-    there = np.unique(np.concatenate([counted_ids(look).ravel() for look in looks]))
-    groups = groups_of(codes[there[there >= 0]])
-    names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
-    notes.add(
-        f"Learned beside colours: {teaching.about}; {channels} channels keep {kept:.1%} of their "
-        f"{teaching.teacher.dimension} numbers (--deform.channels). They have no names, and are parted into "
-        f"{len(groups)} groups."
-    )
-    return EncodedTeacher(teaching, Meaning(teaching.source, names, groups, basis)), looks, codes
+    return Teaching(_as_photographs(sequence), train, asked, FeatureCache(), console)
 
 
 def said_of(
@@ -163,74 +171,118 @@ def said_of(
 ) -> dict[int, Said]:
     """Of frames that are only judged; those that cannot be read are noted and left out."""
     found: dict[int, Said] = {}
+    failed: dict[int, str] = {}
     for t in frames:
         try:
             if (said := teacher.said(t)) is not None:
                 found[t] = said
         except (ValueError, OSError) as error:
-            notes.warn(f"frame {sequence.frame_ids[t]} is not compared with the teacher: {describe(error)}")
+            failed[int(sequence.frame_ids[t])] = describe(error)
+    if failed:
+        which = ", ".join(map(str, failed))
+        notes.warn(f"not compared with the teacher: frames {which} ({next(iter(failed.values()))})")
     return found
 
 
 def basis_of(
-    vectors: Float[np.ndarray, "n D"], channels: int
+    vectors: Many[Float[np.ndarray, "_ D"]], channels: int
 ) -> tuple[Float[np.ndarray, "D channels"], float]:
     """The orthonormal columns that keep most of some vectors, their lengths and angles, and which share of
     their squares that is; zeros fill it up where there are fewer than `channels`."""
-    vectors = np.asarray(vectors, np.float64)
-    squares, axes = np.linalg.eigh(vectors.T @ vectors)
+    products = sum(np.asarray(some, np.float64).T @ np.asarray(some, np.float64) for some in vectors)
+    squares, axes = np.linalg.eigh(products)
     squares, axes = np.maximum(squares[::-1], 0), axes[:, ::-1]
-    held = min(channels, axes.shape[1], int(np.linalg.matrix_rank(vectors)))
-    basis = np.zeros((vectors.shape[1], channels))
+    held = min(channels, int((squares > 1e-12 * squares[0]).sum()))
+    basis = np.zeros((len(axes), channels))
     basis[:, :held] = axes[:, :held]
     return basis, float(squares[:held].sum() / max(squares.sum(), 1e-30))
 
 
-def groups_of(codes: Float[np.ndarray, "n channels"], most: int = GROUPS) -> Float[np.ndarray, "k channels"]:
-    """Means of codes that point the same way, the largest group first: as many as there are different codes,
-    or, of more than `most`, so many that to join two more would cost most beside what it cost to join them so
-    far (Ward's method, of directions)."""
-    codes = np.unique(codes, axis=0)
-    codes = codes[np.unique(np.linspace(0, len(codes) - 1, _SAMPLE).astype(int))]
-    if len(codes) <= most:
-        return codes
-    tree = ward(codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), 1e-12))
-    to_join = tree[: -most - 1 : -1, 2]  # the last two, the last three, ...
-    count = 2 + int(np.argmax(to_join[:-1] / np.maximum(to_join[1:], 1e-12)))
-    group = fcluster(tree, count, "maxclust")
-    kinds, sizes = np.unique(group, return_counts=True)
-    return np.stack([codes[group == kind].mean(axis=0) for kind in kinds[np.argsort(-sizes, kind="stable")]])
+def groups_of(
+    codes: Float[np.ndarray, "n channels"], weights: Float[np.ndarray, "n"], most: int = GROUPS
+) -> Float[np.ndarray, "k channels"]:
+    """Means of codes that point the same way, the heaviest group first.
+
+    Ward's method joins directions; it stops where to join two more costs most beside what it cost before, and
+    goes on while two groups are alike.
+
+    Args:
+        codes: not all zeros.
+        weights: what each counts, the pixels that it is said of.
+        most: there may be so many groups.
+    """
+    chosen = np.unique(np.linspace(0, len(codes) - 1, _SAMPLE).astype(int))
+    codes, weights = codes[chosen], weights[chosen]
+    lengths = np.linalg.norm(codes, axis=1)
+    codes, weights, lengths = (one[lengths > 0] for one in (codes, weights, lengths))
+    directions = codes / lengths[:, None]
+    group = np.ones(len(codes), int)
+    if len(codes) > 1:
+        tree = ward(directions)
+        alike = np.sqrt(2 - 2 * _ALIKE)  # what it costs to join two directions of one kind
+        costs = np.maximum(np.append(tree[: -most - 1 : -1, 2][: most - 1], alike), alike)  # the last first
+        count = 2 + int(np.argmax(costs[:-1] / costs[1:])) if len(costs) > 1 else 1
+        group = fcluster(tree, count, "maxclust")
+        while count > 1 and _closest(_means(directions, weights, group)) > _ALIKE:
+            count -= 1
+            group = fcluster(tree, count, "maxclust")
+    heavy = [weights[group == kind].sum() for kind in np.unique(group)]
+    return _means(codes, weights, group)[np.argsort(-np.array(heavy), kind="stable")]
+
+
+def _means(
+    vectors: Float[np.ndarray, "n c"], weights: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "k c"]:
+    kinds = [group == kind for kind in np.unique(group)]
+    return np.stack([np.average(vectors[some], axis=0, weights=weights[some]) for some in kinds])
+
+
+def _closest(vectors: Float[np.ndarray, "k c"]) -> float:
+    """The largest cosine of two of some vectors."""
+    directions = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    return float((directions @ directions.T - 2 * np.eye(len(vectors))).max())
 
 
 def _as_photographs(sequence: Sequence) -> Photographs:
-    """The frames of camera 0, named as their pictures' files are, or by their number where they have none."""
+    """The frames of camera 0, named as their pictures' files are, or by their number where they have none.
+    Without depth: what a segmenter would find by it are planes, which do not deform."""
     alone = photographs_of(sequence.select(cameras=[sequence.camera_ids[0]]))
     files = [Path(alone.where("image", i)) for i in range(alone.num)]
     names = [file.name for file in files if file.is_file()]
     if len(set(names)) < alone.num:
         names = [f"{number:06d}" for number in sequence.frame_ids]
-    return replace(alone, names=tuple(names))
+    return replace(alone, names=tuple(names), load_depth=None)
 
 
-def _counted_vectors(teacher: Teacher, looks: Many[Look]) -> Float[np.ndarray, "n D"]:
-    """What is said of pixels that count: rows of its codebook, each once, or a vector a pixel of its maps.
+def _counted(
+    teacher: Teacher, looks: Many[Look]
+) -> tuple[list[Float[np.ndarray, "_ D"]], list[Float[np.ndarray, "_"]]]:
+    """What is said of pixels that count, and of how many of them: rows of its codebook, each once, or the
+    vectors of each map.
 
     Raises:
-        ValueError: that is nothing.
+        ValueError: grids differ, or that is nothing.
     """
+    grids = {one.shape[:2] for one in (teacher.maps or teacher.ids)}
+    if len(grids) > 1:
+        found = ", ".join(sorted(f"{width}x{height}" for height, width in grids))
+        raise ValueError(f"--features: expected one grid in all frames, found {found}")
     if teacher.codebook is not None:
-        pairs = zip(looks, teacher.ids, strict=True)
-        counted = [counted_ids(look._replace(ids=ids)).ravel() for look, ids in pairs]
-        there = np.unique(np.concatenate(counted))
-        vectors = teacher.codebook[there[there >= 0]]
+        counts = np.zeros(len(teacher.codebook) + 1)
+        for look, ids in zip(looks, teacher.ids, strict=True):
+            counts += np.bincount(1 + counted_ids(look._replace(ids=ids)).ravel(), minlength=len(counts))
+        there = counts[1:] > 0
+        vectors, weights = [teacher.codebook[there]], [counts[1:][there]]
     else:
         assert teacher.maps is not None
-        every = [np.zeros(one.shape[:2], np.int32) for one in teacher.maps]
-        counted = [counted_ids(look._replace(ids=ids)) >= 0 for look, ids in zip(looks, every, strict=True)]
-        vectors = np.concatenate([one[some] for one, some in zip(teacher.maps, counted, strict=True)])
-    if not np.any(vectors):
+        ids, _ = _in_channels(teacher, np.zeros((teacher.dimension, 1)))
+        pairs = zip(looks, ids, strict=True)
+        counted = [counted_ids(look._replace(ids=one)) >= 0 for look, one in pairs]
+        vectors = [one[some] for one, some in zip(teacher.maps, counted, strict=True)]
+        weights = [np.ones(len(some)) for some in vectors]
+    if not any(map(np.any, vectors)):
         raise ValueError("--features: expected some of pixels that count, found none; do masks hide all?")
-    return vectors
+    return vectors, weights
 
 
 def _in_channels(

@@ -1,6 +1,7 @@
 """A run of `gsjax deform` in the viewer: over time, and how it is asked."""
 
-from functools import lru_cache
+import threading
+from functools import cache
 from pathlib import Path
 from time import perf_counter
 
@@ -32,9 +33,12 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
         weights: of CLIP, where they are now.
 
     Raises:
-        ValueError: the file of the scene is damaged.
+        ValueError: the file of the scene is damaged, or there are weights that it has no use for.
     """
     stored = read_deformation(path / NAME)
+    kind = None if stored.meaning is None else stored.meaning.source.kind
+    if weights is not None and kind in (None, "classes", "closed"):
+        raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
     first, labels = stored.at(0.0), None
     if stored.meaning is not None and first.features is not None:
         said = probabilities_of(first.features, jnp.asarray(stored.meaning.codebook, jnp.float32))
@@ -70,12 +74,12 @@ def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None
         seconds = perf_counter() - begun
         return Found(words, scores, *wanted.threshold(scores), seconds)
 
-    @lru_cache(maxsize=64)  # of CLIP, which is loaded to read one
-    def read(text: str) -> Wanted:
-        return wanted_text(meaning, text, weights=weights)
+    one_by_one, encoder = threading.Lock(), cache(lambda: meaning.source.encoder(weights))
 
     def ask(text: str, frame: int) -> Found:
-        return answer(text, read(text), features_in(frame))
+        with one_by_one:  # several pages may ask before the encoder is loaded
+            wanted = wanted_text(meaning, text, encoder=encoder)
+        return answer(text, wanted, features_in(frame))
 
     def like(row: int, frame: int) -> Found:
         features = features_in(frame)
@@ -86,7 +90,7 @@ def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None
         there, called = stored.at(stored.times[frame]), f"{name} frame {stored.frame_ids[frame]}"
         return keep_part(path / EXTRACTED, called, there, selected)
 
-    return Asking(meaning.source.hint(weights), ask, like, save)
+    return Asking(meaning.hint(weights), ask, like, save)
 
 
 def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:

@@ -57,11 +57,13 @@ class Asked:
     def of_files(self) -> bool:
         return self.features not in ("auto", *KINDS)
 
-    def check(self) -> None:
-        """Raises ValueError where these contradict each other, FileNotFoundError for files not there."""
+    def check(self, also: tuple[str, ...] = ()) -> None:
+        """Raises ValueError where these contradict each other, FileNotFoundError for files not there.
+        `also`: what else --features may be, to say so."""
         if self.of_files and not Path(self.features).is_dir():
+            known = ", ".join(("auto", *KINDS, *also))
             raise FileNotFoundError(
-                f"--features {self.features}: expected {', '.join(KINDS)}, or a folder of feature files, "
+                f"--features {self.features}: expected {known}, or a folder of feature files, "
                 f"found {_what_is(Path(self.features), 'none of these')}"
             )
         for option, folder, model in (("weights", self.weights, "CLIP"), ("sam", self.sam, "SAM")):

@@ -267,7 +267,7 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
     if sum(way is not None for way in (options.text, asked.point, deform.box)) > 1:
         raise ValueError("expected at most one of TEXT, --point and --box, found more")
     if asked.threshold is not None and not -_HIGHEST <= asked.threshold < _HIGHEST:
-        raise ValueError(f"--threshold: expected less than 1, found {asked.threshold:g}")
+        raise ValueError(f"--threshold: expected -1 to below 1, found {asked.threshold:g}")
     if options.text is None and (asked.negatives is not None or options.weights is not None):
         option = "negatives" if asked.negatives is not None else "weights"
         raise ValueError(f"--{option}: expected a TEXT too, which it is for; found none")

@@ -206,7 +206,8 @@ def _stacked(path: Path, maps: np.ndarray, count: int, which: Sequence[int]) -> 
     if len(maps) not in (count, len(which)):
         some = f", or of the {len(which)} that are wanted" if len(which) < count else ""
         raise ValueError(
-            f"{path}: expected features of {count} pictures{some}, found {len(maps)}; it goes by order"
+            f"{path}: expected features of {count} pictures{some}, found {len(maps)}; it goes by order, so "
+            "it is to have those alone that are taken"
         )
     for i in which if len(maps) == count else range(len(which)):
         yield PictureFeatures(path, map=np.array(maps[i], np.float32))

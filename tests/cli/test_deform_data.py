@@ -61,3 +61,21 @@ def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
     assert (data.looks[1].ids == -1).all()  # nobody says what frame 2 shows
     with pytest.raises(ValueError, match="expected masks of frames to learn from"):
         read(recording(masked=[1]))
+
+
+def test_the_scene_begins_where_most_classes_are_seen():
+    """The instrument comes in at frame 4, as a few pixels first; frame 5 has no depth."""
+    seen = recording()
+
+    def mask(t, c):
+        labels = seen.load_mask(t, c)
+        labels[:8] = 0
+        labels[: {4: 1}.get(t, 8), : {4: 2}.get(t, 48) if t >= 4 else 0] = SHAFT
+        return labels
+
+    def depth(t, c):
+        return seen.load_depth(t, c) * (t != 5)
+
+    data, _ = read(replace(seen, load_mask=mask, load_depth=depth), tools="draw")
+    assert data.train[data.first] == 6
+    assert read(seen, features="none")[0].first is None

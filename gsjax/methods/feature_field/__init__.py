@@ -24,7 +24,6 @@ from gsjax.methods.feature_field.field import (
 )
 from gsjax.methods.feature_field.inverse import learned_inverse, pseudo_inverse
 from gsjax.methods.feature_field.query import (
-    EVEN,
     Threshold,
     back_projected_cosines,
     gaussian_cosines,
@@ -50,7 +49,6 @@ from gsjax.methods.feature_field.training import (
 from gsjax.methods.feature_field.votes import label_votes, majority_labels
 
 __all__ = [
-    "EVEN",
     "Distilled",
     "FeatureField",
     "FieldBatch",

@@ -34,7 +34,7 @@ from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.poses import refined_viewmats
 from gsjax.methods.surgical.query import prompt_probabilities
 from gsjax.methods.surgical.questions import QUESTIONS, Question, QuestionType, parse_question, rows_of
-from gsjax.methods.surgical.start import Look, start_gaussians
+from gsjax.methods.surgical.start import Look, begins, start_gaussians
 from gsjax.methods.surgical.step import (
     Batch,
     DeformingScene,
@@ -79,6 +79,7 @@ __all__ = [
     "SurgicalWeightsConfig",
     "TemplatedAnswerer",
     "begin_surgical",
+    "begins",
     "compiled_step",
     "counted_ids",
     "facts_of_sights",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import Camera, pixels_of
-from gsjax.methods.surgical.query import prompt_probabilities
+from gsjax.methods.surgical.query import most_likely, prompt_probabilities
 from gsjax.methods.surgical.step import DeformingScene, Moving
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.render import plan_render, render
@@ -138,7 +138,7 @@ def scene_facts(
     """Facts of a deforming scene at some frames.
 
     A pixel is of the class that its rendered features are most like, a Gaussian of that which its own are in
-    the first of the frames, if that has more than half of the probability (`prompt_probabilities`).
+    the first of the frames, unless two are as likely (`prompt_probabilities`).
 
     Args:
         scene, moving: as `DeformingScene.at` has them.
@@ -167,8 +167,7 @@ def scene_facts(
     features = scene.at(jnp.asarray(times[0], features.dtype), moving).features
     assert features is not None
     said = np.asarray(prompt_probabilities(features, jnp.asarray(codebook, features.dtype)))
-    sure = (said.max(axis=1) > 0.5) & (np.asarray(scene.gaussians.opacities) > _SOLID)
-    of = np.where(sure, said.argmax(axis=1), -1)
+    of = np.where(np.asarray(scene.gaussians.opacities) > _SOLID, most_likely(said), -1)
     counts = np.array([(of == k).sum() for k in range(len(names))])
     rows = tuple(_thinned(np.flatnonzero(of == k)) for k in range(len(names)))
     sights = _sights(scene, moving, times, cameras, codebook, rows)

@@ -12,6 +12,8 @@ from gsjax.geometry.neighbors import voxel_thin
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
+_NEAR_PX = 2.0  # nearer than this to a Gaussian that is there, a point of another look is none of its own
+
 
 class Look(NamedTuple):
     """What a camera saw at a time, on the host.
@@ -78,7 +80,11 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
     return gaussians_from_points(points, colors)
 
 
-_NEAR_PX = 2.0
+def begins(look: Look, looks: Sequence[Look]) -> bool:
+    """Whether a scene can begin with one of the looks: something counts, and has depth where any has."""
+    if all(one.depth is None for one in looks):
+        return look.counts is None or bool(look.counts.any())
+    return bool(known_depth(look).any())
 
 
 def on_plane(looks: Sequence[Look], first: int, depth: float) -> list[Look]:

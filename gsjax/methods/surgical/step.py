@@ -158,8 +158,9 @@ def feature_loss(
 
 
 def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Float[Array, "h w c"]:
-    """Rendered features brought to the teacher's grid, bilinearly."""
-    return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=False)
+    """Rendered features brought to the teacher's grid, bilinearly; to a coarser one by a triangle as wide as
+    its cells are, or most pixels would learn nothing."""
+    return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=True)
 
 
 def surgical_step(config: SurgicalConfig, radius: float) -> Step:

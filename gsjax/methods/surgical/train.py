@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
+import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
 from gsjax.methods.surgical.poses import refined_looks
-from gsjax.methods.surgical.start import Look, known_depth, on_plane, start_gaussians
+from gsjax.methods.surgical.start import Look, begins, known_depth, on_plane, start_gaussians
 from gsjax.methods.surgical.step import Batch, DeformingScene, Moving, surgical_step
 from gsjax.methods.turns import whose_turn
 from gsjax.optim.compiler import host_options
@@ -30,6 +31,7 @@ _HEADROOM = 1.3
 _OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
 _GATE_AFTER = 0.25  # of the steps with deformation: until then it is seen who moves
 _THIN = 0.2  # radii: a scene is taken to reach so far along an axis at least, as a plane's does not
+_NEARLY = 0.95  # of the pixels of a teacher's cell: it counts
 _MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
 
 
@@ -120,10 +122,10 @@ def begin_surgical(
             the codebook has not.
     """
     _check(looks, config, codebook)
-    flat = all(look.depth is None for look in looks)
     if first is None:
-        first = next((i for i, look in enumerate(looks) if _begins(look, flat)), 0)
+        first = next((i for i, look in enumerate(looks) if begins(look, looks)), 0)
     if gaussians is None:
+        flat = all(look.depth is None for look in looks)
         seen = on_plane(looks, first, config.plane_depth) if flat else looks
         gaussians = start_gaussians(seen, first, config.start_pixels)
     twists = jnp.zeros((len(looks), 6)) if config.refine_poses else None
@@ -142,7 +144,8 @@ def begin_surgical(
     radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
     if not radius > 0:
         raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
-    batches = [_batch(look, codebook) for look in looks]
+    shared = None if codebook is None else jnp.asarray(codebook, jnp.result_type(float))
+    batches = [_batch(look, shared) for look in looks]
     if config.refine_poses:
         rows = (-1 if i == first else i for i in range(len(looks)))
         batches = [
@@ -155,13 +158,6 @@ def begin_surgical(
     problem = SurgicalProblem(looks, codebook, batches, first, config, radius, bounds, plan)
     state = SurgicalState(scene, surgical_step(config, radius).init(scene), None, None, 0, plan.capacity)
     return problem, state
-
-
-def _begins(look: Look, flat: bool) -> bool:
-    """Whether a scene can begin with a look: something counts, and has depth where any has."""
-    if flat:
-        return look.counts is None or bool(look.counts.any())
-    return bool(known_depth(look).any())
 
 
 def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Advanced]:
@@ -279,16 +275,17 @@ def _turn(problem: SurgicalProblem, step: int) -> int:
 
 
 def counted_ids(look: Look) -> Int[np.ndarray, "h w"]:
-    """What the teacher says of pixels that count: what is behind a tool is not to learn that it is one."""
+    """What the teacher says of pixels that count, and of cells of its grid of which nearly all do: what is
+    behind a tool is not to learn that it is one."""
     assert look.ids is not None
     if look.counts is None:
         return look.ids
-    (high, wide), (height, width) = look.ids.shape, look.counts.shape
-    rows, columns = (np.arange(n) * m // n for n, m in ((high, height), (wide, width)))
-    return np.where(look.counts[np.ix_(rows, columns)], look.ids, -1)
+    high, wide = look.ids.shape
+    share = cv2.resize(look.counts.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
+    return np.where(share > _NEARLY, look.ids, -1)
 
 
-def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
+def _batch(look: Look, codebook: Array | None) -> Batch:
     """A look on the device."""
     dtype = jnp.result_type(float)
     height, width = look.image.shape[:2]
@@ -303,7 +300,7 @@ def _batch(look: Look, codebook: np.ndarray | None) -> Batch:
         Camera(viewmat, K, width, height, look.near),
         jnp.asarray(look.time, dtype),
         jnp.asarray(ids, jnp.int32) if taught else None,
-        jnp.asarray(codebook, dtype) if taught else None,
+        codebook if taught else None,
         None,
         None,
         Plan(width, height, 0),
