@@ -30,7 +30,7 @@ def recording(masked=range(10), names=NAMES):
 def read(sequence, tools="leave-out", tool_values=(), features="auto"):
     console = Console(quiet=True)
     notes = Notes(console)
-    told = (tools, Asked(features), 8, tool_values, notes, console)
+    told = (tools, None if features == "none" else Asked(features), 8, tool_values, notes, console)
     return deform_data(sequence, 8, *told), " ".join(notes.all)
 
 
