@@ -20,6 +20,7 @@ from timing import CALLS, jitted, timed
 
 import gsjax
 from gsjax.data.photographs import photographs_of
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.object_tracker import (
     PRESETS,
     StartConfig,
@@ -40,8 +41,7 @@ from gsjax.scene.render import plan_render, render
 RECORDING = "tabletop_1"
 CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, 2, 6
 TRACKER = replace(PRESETS["fast"], start=StartConfig(object_pixels=2.5, background_pixels=6.0, iterations=60))
-SHRINK = 4  # of the pictures that features are drawn in, and of the teacher's grid
-NODES, CHANNELS, RADIUS = 16, 8, 0.5  # nodes of each group; metres
+NODES, CHANNELS, RADIUS, RATE = 16, 8, 0.5, 0.03  # nodes of each group; metres
 WARM = 10  # frames after which all classes have been learned, whatever the noise
 PATCH = 16  # pixels of the picture
 GRAPHS = {
@@ -56,7 +56,7 @@ class Problem(NamedTuple):
     """The recording, and all that stands still while it is followed."""
 
     frames: list[Frame]
-    masks: np.ndarray  # [T,C,h,w], on the teacher's grid
+    masks: np.ndarray  # [T,C,H,W]
     scene: Any
     nodes: Any
     codebook: np.ndarray
@@ -72,7 +72,6 @@ def problem() -> Problem:
     recording = gsjax.open_sequence(recorded(RECORDING))
     seen = recording.select(cameras=CAMERAS)
     frames = [seen.frame(t) for t in range(seen.num_frames)]
-    grid = slice(SHRINK // 2, None, SHRINK)
     masks = np.array([[seen.mask(t, c) for c in range(len(CAMERAS))] for t in range(seen.num_frames)])
     scene = start_scene(frames[0], seen.mask(0, MASK_CAMERA), MASK_CAMERA, TRACKER)
     at_first = photographs_of(recording.select(frames=slice(0, 1)))
@@ -87,7 +86,7 @@ def problem() -> Problem:
     held_out = [(alone.frame(t).cameras, alone.mask(t, 0)) for t in range(0, seen.num_frames, EVERY)]
     return Problem(
         frames,
-        masks[:, :, grid, grid].astype(np.int32),
+        masks.astype(np.int32),
         scene,
         nodes,
         codebook,
@@ -99,30 +98,24 @@ def problem() -> Problem:
 
 
 @cache
-def stepper(graph: str) -> tuple[Callable, Callable]:
-    """The jitted step of a kind of graph, and its first state at a rate of Adam."""
+def stepper(graph: str, shrink: int) -> tuple[Callable, tuple, Camera]:
+    """The jitted step of a kind of graph, its first state, and cameras that features are drawn in."""
     p, config = problem(), GRAPHS[graph]
     tracker = object_tracker(TRACKER, p.scene.num_objects, TrackerBatch(p.scene, p.frames[0], p.plan))
-    views = part_of(p.frames[0], shrink=SHRINK).cameras
+    views = part_of(p.frames[0], shrink=shrink).cameras
     plan = plan_render(p.scene.gaussians, views, headroom=2.0)
-    adam = optax.inject_hyperparams(optax.adam)(learning_rate=1.0)  # no program of its own for each rate
-    _, init, step = composed(tracker, p.nodes, jnp.asarray(p.codebook), RADIUS, adam, config, plan)
-
-    def first(rate: float):
-        features = jnp.zeros((len(p.nodes.rows), CHANNELS))
-        learning = init(features)
-        learning.hyperparams["learning_rate"] = jnp.float32(rate)
-        memory = empty_memory(2 * config.window + 1, len(p.nodes.rows))
-        return first_pose(p.scene), p.first, features, learning, memory
-
-    return jitted(step), first
+    how = (jnp.asarray(p.codebook), RADIUS, optax.adam(RATE), config, plan)
+    _, init, step = composed(tracker, p.nodes, *how)
+    features = jnp.zeros((len(p.nodes.rows), CHANNELS))
+    memory = empty_memory(2 * config.window + 1, len(p.nodes.rows))
+    return jitted(step), (first_pose(p.scene), p.first, features, init(features), memory), views
 
 
 def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator) -> np.ndarray:
     """A teacher's labels of a picture: a simulated stand-in for a model that errs anew in every picture.
 
     Args:
-        mask: true labels [h,w], 0 the background, on the teacher's grid.
+        mask: true labels [H,W], 0 the background.
         kind: what is mislabelled as one: "things", each class in a picture, or "patches" of 16 pixels.
         share: how many of those have another's label.
         random: its generator.
@@ -131,23 +124,22 @@ def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator
     if kind == "things":
         wrong = np.where(random.random(count) < share, random.integers(1, count, count), 0)[mask]
     else:
-        edge = PATCH // SHRINK
-        grid = tuple(-(-size // edge) for size in mask.shape)
+        grid = tuple(size // PATCH for size in mask.shape)
         coarse = np.where(random.random(grid) < share, random.integers(1, count, grid), 0)
-        wrong = np.kron(coarse, np.ones((edge, edge), int))[: mask.shape[0], : mask.shape[1]]
+        wrong = np.kron(coarse, np.ones((PATCH, PATCH), int))
     return ((mask + wrong) % count).astype(np.int32)
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """The recording followed and learned once, a step a frame; labels against truth after every one."""
-    p, (step, first) = problem(), stepper(options["graph"])
-    random = np.random.default_rng(seed)
+    shrink = int(options["shrink"])
+    p, (step, state, views) = problem(), stepper(options["graph"], shrink)
+    random, cells = np.random.default_rng(seed), slice(shrink // 2, None, shrink)
     taught = [[noisy(one, options["wrong"], options["share"], random) for one in pair] for pair in p.masks]
-    views = part_of(p.frames[0], shrink=SHRINK).cameras
-    state, in_space, overlap = first(options["rate"]), [], LabelOverlap()
+    in_space, overlap = [], LabelOverlap()
     for t in range(1, len(p.frames)):
         batch = TrackerBatch(p.scene, p.frames[t], p.plan)
-        given = batch, views, jnp.asarray(np.stack(taught[t])), jnp.float32(t / 10)
+        given = batch, views, jnp.asarray(np.stack(taught[t])[:, cells, cells]), jnp.float32(t / 10)
         state, told = step(state, *given)
         assert not bool(told["skipped"] | told["overflow"].any())
         labels = labels_of_gaussians(state[2])
@@ -156,7 +148,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
             camera, true = p.held_out[t // EVERY]
             overlap.add(drawn_labels(state[0], labels, camera), true)
     assert step._cache_size() == 1  # nothing is compiled between frames
-    ms, without_ms = durations(options["graph"], given)
+    ms, without_ms = durations(options["graph"], shrink, given)
     things = range(1, len(p.codebook))
     late = in_space[WARM - 1 :]
     return {
@@ -172,10 +164,10 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def durations(graph: str, given: tuple) -> tuple[float, float]:
+def durations(graph: str, shrink: int, given: tuple) -> tuple[float, float]:
     """Milliseconds of a step with this graph, and of one without a graph: medians, taken in turns."""
-    steps = [stepper(kind) for kind in (graph, "none")]
-    took = [[timed(step, first(0.03), *given)[1] for step, first in steps] for _ in range(CALLS + 1)]
+    steps = [stepper(kind, shrink) for kind in (graph, "none")]
+    took = [[timed(step, state, *given)[1] for step, state, _ in steps] for _ in range(CALLS + 1)]
     ours, without = np.median(took[1:], axis=0)  # the first may compile
     return float(ours), float(without)
 

@@ -48,7 +48,10 @@ class Wanted(NamedTuple):
         """
         if given is None and len(self.vectors) == 1 and self.least is not None:
             return Threshold(self.least, "the encoder's own")
-        return threshold_for(scores, len(self.vectors) > 1, given)
+        found = threshold_for(scores, len(self.vectors) > 1, given)
+        if given is None and self.meant is not None and len(self.vectors) > 1:
+            return found._replace(rule="better than each other name")
+        return found
 
 
 def wanted_text(

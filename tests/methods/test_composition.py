@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ CODES = jnp.eye(7, 8)
 RADIUS = 0.5
 
 
+@cache
 def page_names() -> dict:
     """What the first program of the page defines."""
     page = (ROOT / "docs/composition.md").read_text(encoding="utf-8")

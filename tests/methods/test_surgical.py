@@ -96,6 +96,19 @@ class TestStart:
         assert hidden[y[inside], x[inside]].sum() > 60
         assert not (known_depth(first)[y[inside], x[inside]] > 0).any()
 
+    def test_later_looks_add_what_lies_far_behind_something(self, looks):
+        """A plate a third nearer hides tissue in the first look, and is gone in the others."""
+        plate = np.s_[20:32, 20:44]
+        first = looks[0]._replace(counts=None, depth=looks[0].depth.copy())
+        first.depth[plate] *= 2 / 3
+        alone, all_ = (start_gaussians([first, *more], 0, 1.0) for more in ([], looks[1:]))
+        new = np.asarray(all_.means)[alone.num :]
+        local = new @ first.viewmat[:3, :3].T + first.viewmat[:3, 3]
+        x, y = ((local @ first.K.T)[:, :2] / local[:, 2:]).T.astype(int)
+        behind = (x >= 20) & (x < 44) & (y >= 20) & (y < 32)
+        assert behind.sum() > 60
+        np.testing.assert_allclose(local[behind, 2], looks[0].depth[y, x][behind], rtol=0.1)
+
     def test_without_depth_there_is_no_start(self, looks):
         flat = [look._replace(depth=np.zeros_like(look.depth)) for look in looks]
         with pytest.raises(ValueError, match="depth: no look has any where a pixel counts"):

@@ -12,6 +12,7 @@ from gsjax.geometry.neighbors import voxel_thin
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
+_BEHIND = 0.06  # of the depth: farther behind what is seen lies what that hides, not what has moved
 _NEAR_PX = 2.0  # nearer than this to a Gaussian that is there, a point of another look is none of its own
 
 
@@ -42,10 +43,11 @@ class Look(NamedTuple):
 
 def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussians:
     """Gaussians on what the first look shows, and, from the other looks, on what it does not: there lay a
-    tool, or it lay outside.
+    tool that is left out, it lay behind something, or outside.
 
-    A point of a later look is new if it falls where the first look shows nothing, and none of those before
-    lies within two pixels of it; so what has moved in the meantime is not doubled.
+    A point of another look is new if it falls where the first look shows nothing, or far behind what it
+    shows, and none of those before lies within two pixels of it; so what has moved in the meantime is not
+    doubled.
 
     Args:
         looks: over time.
@@ -67,7 +69,7 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
             pixel = float(np.median(known[known > 0])) / look.K[0, 0]
         some, shades = points_from_rgbd(look.image, known, look.viewmat, look.K)
         if len(points):
-            new = _in_other_pixels(some, looks[first])
+            new = _unseen(some, looks[first])
             apart, _ = cKDTree(points).query(some, distance_upper_bound=_NEAR_PX * pixel)
             new &= ~np.isfinite(apart)
             some, shades = some[new], shades[new]
@@ -113,12 +115,13 @@ def on_plane(looks: Sequence[Look], first: int, depth: float) -> list[Look]:
     return [of(look) for look in looks]
 
 
-def _in_other_pixels(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
-    """Which points fall outside of a look, or where it does not count or has no depth."""
-    known = known_depth(look) > 0
+def _unseen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
+    """Which points fall outside of a look, where it does not count or has no depth, or far behind that."""
+    known = known_depth(look)
     height, width = known.shape
     at = pixels_of(points, look.viewmat, look.K, width, height)
-    return ~at.inside | ~known[at.rows, at.columns]
+    before = known[at.rows, at.columns]
+    return ~at.inside | (before == 0) | (at.depths > (1 + _BEHIND) * before)
 
 
 def known_depth(look: Look) -> Float[np.ndarray, "h w"]:
