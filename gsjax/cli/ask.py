@@ -10,8 +10,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from gsjax.cli.deform_file import NAME, StoredDeformation, read_deformation
-from gsjax.cli.messages import stage
+from gsjax.cli.deform_file import NAME, StoredDeformation, read_deformation, warn_of_partial
+from gsjax.cli.messages import Notes, stage
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical import (
     QUESTIONS,
@@ -56,12 +56,17 @@ def run(options: Options) -> int:
             f"{path}: expected a scene that knows what is what, found none; reconstruct it with two classes "
             "or more among the pixels that count (gsjax deform DATASET --tools draw), or with --features"
         )
+    if len(stored.names) < 2:
+        found = ", ".join(stored.names)
+        raise ValueError(f"{path}: expected two things or more to ask about, found {found} alone")
+    console = Console(stderr=True, highlight=False)
+    warn_of_partial(options.run, Notes(console))
     if options.question is None:
         _list(stored)
         return 0
     asked = parse_question(options.question, stored.names)
     rows = rows_of(asked, stored.frame_ids.tolist())
-    with stage(Console(stderr=True, highlight=False), f"looking at {_in_words(stored, rows)}"):
+    with stage(console, f"looking at {_in_words(stored, rows)}"):
         facts = facts_of_run(stored, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:

@@ -45,6 +45,7 @@ HELP = (
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
 NOBODY = "none"  # of features: there is no teacher
+_UNLIKE = 0.6  # an IoU
 _OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
@@ -140,6 +141,8 @@ def run(options: Options) -> int:
         if options.resume:
             learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
+            if (folder.path / "query").exists():
+                notes.warn(f"{folder.path / 'query'} is an answer of the scene as it was; ask again")
         folder.write_config(settings)  # from here on an earlier run is gone
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
         learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
@@ -152,6 +155,9 @@ def run(options: Options) -> int:
         tracks = judged["tracks"]
         if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
             notes.warn("tracks are hardly better than if nothing moved; more steps (--deform.iterations)?")
+        unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
+        if unlike:
+            notes.warn(f"what is drawn hardly overlaps what was seen (IoU): {', '.join(unlike)}; more steps?")
         if not data.test:
             notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
         found = {

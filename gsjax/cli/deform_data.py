@@ -154,6 +154,7 @@ def deform_data(
         teacher = EncodedTeacher(teaching, looks, channels)
         ids, codes = teacher.ids, teacher.codes
         notes.add(teacher.note())
+        console.print(f"[bold]features[/]  {teacher.note()}", soft_wrap=True)
     else:
         teacher = None if asked is None else _of_classes(sequence, counted, asked.features, channels)
         if teacher is None:

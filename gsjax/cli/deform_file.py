@@ -1,5 +1,6 @@
 """deformation.npz: a scene that deforms, apart from the recording that it was learned from."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.cli.deform_teacher import Meaning
 from gsjax.cli.field_source import Source
+from gsjax.cli.messages import Notes
 from gsjax.geometry.cameras import Camera
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.surgical import DeformingScene, Moving
@@ -146,6 +148,17 @@ def read_deformation(path: Path) -> StoredDeformation:
     cameras = (viewmats, Ks, (width, height), near)
     told = (meaning, times, frame_ids, seconds)
     return StoredDeformation(scene, moving, *told, *cameras, held_out, metric)
+
+
+def warn_of_partial(path: Path, notes: Notes) -> None:
+    """Warns where the run in a folder was stopped before its end."""
+    try:
+        found = json.loads((path / "metrics.json").read_text(encoding="utf-8"))
+        steps = found["steps"] if not found["complete"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if steps is not None:
+        notes.warn(f"{path} is a partial run of {steps} steps; gsjax deform goes on with --resume")
 
 
 def _whole(values: list[int]) -> Int[np.ndarray, "n"]:

@@ -77,7 +77,10 @@ def wanted_text(
         if negatives is not None:
             raise ValueError("--negatives: a name is held against the other names; leave it out")
         return _among(meaning, meaning.codebook, row_of(meaning.names, text))
-    reader = source.encoder() if encoder is None else encoder()
+    try:
+        reader = source.encoder() if encoder is None else encoder()
+    except ValueError as error:
+        raise ValueError(f"{error}; or by a name: {', '.join(meaning.names)}") from error
     against = source.negatives(text) if negatives is None else negatives
     texts = np.stack([np.asarray(reader.embed_text(one), np.float64) for one in (text, *against)])
     if texts.shape[1] != len(meaning.basis):

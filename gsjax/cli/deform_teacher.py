@@ -1,6 +1,7 @@
 """Who says what there is in frames of a deforming scene: classes of masks, or features of files or of an
 encoder, brought into the scene's few channels."""
 
+from collections import Counter
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -143,7 +144,10 @@ class EncodedTeacher:
     def note(self) -> str:
         """What a run says of it."""
         (dimension, channels), count = self.meaning.basis.shape, len(self.meaning.names)
-        parted = f"they are parted into {count} groups" if count > 1 else "all of it is alike, one group"
+        parted = f"they are parted into {count} groups"
+        if count == 1:
+            parted = "all of it is alike, one group"
+            parted += " (--masks segment finds more pieces)" if self.meaning.source.kind == "closed" else ""
         return (
             f"Learned beside colours: {self._teaching.about}; {channels} channels keep {self.kept:.1%} of "
             f"its {dimension} numbers (--deform.channels); {parted}."
@@ -176,6 +180,8 @@ def said_of(
         try:
             if (said := teacher.said(t)) is not None:
                 found[t] = said
+        except FileNotFoundError:
+            failed[int(sequence.frame_ids[t])] = "they have no file"
         except (ValueError, OSError) as error:
             failed[int(sequence.frame_ids[t])] = describe(error)
     if failed:
@@ -263,10 +269,10 @@ def _counted(
     Raises:
         ValueError: grids differ, or that is nothing.
     """
-    grids = {one.shape[:2] for one in (teacher.maps or teacher.ids)}
+    grids = Counter(one.shape[:2] for one in (teacher.maps or teacher.ids))
     if len(grids) > 1:
-        found = ", ".join(sorted(f"{width}x{height}" for height, width in grids))
-        raise ValueError(f"--features: expected one grid in all frames, found {found}")
+        found = ", ".join(f"{width}x{height} ({n})" for (height, width), n in grids.most_common())
+        raise ValueError(f"--features: expected one grid in all frames, found (frames) {found}")
     if teacher.codebook is not None:
         counts = np.zeros(len(teacher.codebook) + 1)
         for look, ids in zip(looks, teacher.ids, strict=True):
@@ -281,7 +287,9 @@ def _counted(
         vectors = [one[some] for one, some in zip(teacher.maps, counted, strict=True)]
         weights = [np.ones(len(some)) for some in vectors]
     if not any(map(np.any, vectors)):
-        raise ValueError("--features: expected some of pixels that count, found none; do masks hide all?")
+        silent = teacher.maps is not None and not any(map(np.any, teacher.maps))
+        found = "zeros alone" if silent else "none; do masks hide all?"
+        raise ValueError(f"--features: expected some of pixels that count, found {found}")
     return vectors, weights
 
 

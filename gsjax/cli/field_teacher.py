@@ -73,7 +73,8 @@ class Asked:
                     f"Face, found {_what_is(folder, 'nothing there')}"
                 )
         if self.features in _OF_CLIP and self.weights is None:
-            raise ValueError(f"--features {self.features}: expected --weights PATH too, a folder of CLIP's")
+            raise ValueError(f"--features {self.features}: expected --weights PATH too, a folder of CLIP's "
+                "weights; closed needs none")
         if self.features not in _OF_CLIP and self.weights is not None:
             raise ValueError(
                 f"--weights: expected --features {' or '.join(_OF_CLIP)}, which have them, found "
@@ -366,10 +367,10 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
     # A grid of square patches leaves up to one of them at the far side of each axis.
     stretch = _STRETCH if one.map is None else np.log(1 + 1.5 / min(rows, columns))
     if abs(np.log((columns / rows) / (width / height))) > stretch:
-        what = "masks" if one.map is None else "features"
+        what, axes = ("masks", "[H,W]") if one.map is None else ("features", "[h,w,C]")
         raise ValueError(
-            f"{one.path}: expected {what} of a picture of the shape of {photographs.names[i]}, "
-            f"{width}x{height}, found {columns}x{rows}"
+            f"{one.path}: expected {what} {axes}, as wide for their height as {photographs.names[i]}, "
+            f"{width}x{height}, found {columns}x{rows}; are axes swapped?"
         )
 
 

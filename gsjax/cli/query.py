@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from gsjax.cli.deform_file import NAME as DEFORMATION
-from gsjax.cli.deform_file import read_deformation
+from gsjax.cli.deform_file import read_deformation, warn_of_partial
 from gsjax.cli.deform_query import DeformQuestion, answer_deformation
 from gsjax.cli.field_query import Question, answer
 from gsjax.cli.field_run import Whereabouts, field_of, open_field_run, unfinished_field_of
@@ -119,6 +119,9 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
+    if not options.run.is_dir():
+        found = "a file" if options.run.exists() else "nothing there"
+        raise FileNotFoundError(f"{options.run}: expected the folder of a run, found {found}; name its --out")
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
     # A tracked run answers over time, but not to what only fields can.
     tracked, of_field = (
@@ -195,6 +198,7 @@ def _ask_deformation(options: Options, console: Console) -> int:
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
             stored = read_deformation(options.run / DEFORMATION)
+        warn_of_partial(options.run, notes)
         told = answer_deformation(options.run, stored, question, changes, folder, notes, console)
     if "classes" in told:
         found = ", ".join(f"{name}: {count:,}" for name, count in told["classes"].items())

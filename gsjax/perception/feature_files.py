@@ -108,9 +108,12 @@ def _pictures(
         for i in which:
             name, file = names[i], files[i]
             if file is None:
-                listed = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6]) or "nothing"
+                there = sorted(entry.name for entry in folder.iterdir())
+                listed = ", ".join(there[:6]) or "nothing"
+                listed += f", ... ({len(there)} files)" if len(there) > 6 else ""
                 raise FileNotFoundError(
-                    f"{folder}: expected features of the picture {name} ({_LAYOUTS}), found {listed}"
+                    f"{folder}: expected features of the picture {name}, as {PurePosixPath(name).stem}.npy, "
+                    f"say ({_LAYOUTS}), found {listed}"
                 )
             yield file.read(file.path)
 

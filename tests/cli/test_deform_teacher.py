@@ -15,7 +15,7 @@ from rich.console import Console
 
 from gsjax.cli import learning, main
 from gsjax.cli.deform_data import deform_data
-from gsjax.cli.deform_file import read_deformation
+from gsjax.cli.deform_file import read_deformation, write_deformation
 from gsjax.cli.deform_prompts import wanted_like, wanted_text
 from gsjax.cli.deform_teacher import GROUPS, Meaning, basis_of, groups_of
 from gsjax.cli.field_source import Source
@@ -92,7 +92,8 @@ def test_what_files_taught_is_asked_by_place_and_without_a_prompt(learned):
 
 def test_nobody_reads_a_text_in_the_space_of_files(learned, capsys):
     assert main(["query", str(learned), "tool"]) == 2
-    assert re.search("nobody here reads texts.*--point", " ".join(capsys.readouterr().err.split()))
+    said = " ".join(capsys.readouterr().err.split())
+    assert re.search("nobody here reads texts.*--point.*or by a name: group 1, group 2", said)
 
 
 def test_masks_with_embeddings_are_rows_of_one_codebook(tmp_path):
@@ -146,10 +147,10 @@ def test_files_that_do_not_fit(files, tmp_path):
         data_of(tmp_path, tmp_path)
     for t in range(10):
         np.save(tmp_path / f"{t:06d}.npy", feature_map(t, (13, 16) if t else (26, 32)))
-    with pytest.raises(ValueError, match="expected one grid in all frames, found 16x13, 32x26"):
+    with pytest.raises(ValueError, match=r"one grid in all frames, found \(frames\) 16x13 \(7\), 32x26"):
         data_of(tmp_path, tmp_path)
     np.save(tmp_path / "000000.npy", feature_map(0, (16, 13)))
-    with pytest.raises(ValueError, match="features of a picture of the shape"):
+    with pytest.raises(ValueError, match="for their height as 000000, 64x52, found 13x16; are axes swap"):
         data_of(tmp_path, tmp_path)
 
 
@@ -303,3 +304,23 @@ def test_groups_are_as_many_as_there_are_kinds(seed, kinds, each):
     codes = np.eye(8)[of] + 0.02 * rng.normal(size=(len(of), 8))
     groups = groups_of(rng.permutation(codes), np.ones(len(of)))
     assert sorted(groups.argmax(axis=1)) == list(range(kinds))
+
+
+def test_maps_of_zeros_say_nothing(tmp_path):
+    for t in range(10):
+        np.save(tmp_path / f"{t:06d}.npy", np.zeros((13, 16, 3), np.float32))
+    with pytest.raises(ValueError, match="found zeros alone"):
+        data_of(tmp_path, tmp_path)
+
+
+def test_of_one_name_all_are_that_and_nothing_is_asked(learned, tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    stored = read_deformation(learned / "deformation.npz")
+    alone = replace(stored.meaning, names=("group 1",), codebook=stored.meaning.codebook[:1])
+    write_deformation(run / "deformation.npz", replace(stored, meaning=alone))
+    (run / "metrics.json").write_text('{"complete": false, "steps": 7}')
+    assert query(run)["classes"] == {"group 1": stored.scene.gaussians.num}
+    assert "run is a partial run of 7 steps" in " ".join(capsys.readouterr().err.split())
+    assert main(["ask", str(run), "where is group 1 in frame 0?"]) == 2
+    assert "two things or more to ask about, found group 1 alone" in " ".join(capsys.readouterr().err.split())

@@ -153,7 +153,7 @@ def test_what_fits_two_alike_is_said(gsjax, run):
     [
         (
             lambda run: shutil.rmtree(run),
-            "expected the folder of a run of `gsjax track`, found nothing there",
+            "expected the folder of a run, found nothing there",
         ),
         (lambda run: (run / "config.yml").write_text("a: 1"), "config.yml begins with '# gsjax run'"),
         (lambda run: (run / "config.yml").write_text("# gsjax run\na: 1"), "expected a run's settings"),

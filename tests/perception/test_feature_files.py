@@ -230,7 +230,7 @@ def test_the_only_file_of_a_folder_may_hold_all_pictures(tmp_path):
         read_feature_folder(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
     np.save(tmp_path / "other.npy", np.stack([MAP, MAP]))
     with pytest.raises(
-        FileNotFoundError, match=r"of the picture 0/a\.jpg .* found dino\.info, dino\.npy, other"
+        FileNotFoundError, match=r"of the picture 0/a\.jpg, as a\.npy, .* found dino\.info, dino\.npy, other"
     ):
         read_feature_folder(tmp_path, ["0/a.jpg", "1/a.jpg"])
 
@@ -327,7 +327,7 @@ def test_features_that_are_not_there_are_missed(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of features"):
         read_feature_folder(tmp_path / "none", ["a.jpg"])
     np.save(tmp_path / "other.npy", MAP)
-    with pytest.raises(FileNotFoundError, match=r"features of the picture a\.jpg .* found other\.npy"):
+    with pytest.raises(FileNotFoundError, match=r"features of the picture a\.jpg, as a\.npy, .* found other\.npy"):
         read_feature_folder(tmp_path, ["a.jpg"])
     with pytest.raises(ValueError, match="level: expected one of default, small, medium, large"):
         read_feature_folder(tmp_path, ["other.jpg"], level="huge")

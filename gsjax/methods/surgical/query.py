@@ -53,7 +53,9 @@ def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
 
 
 def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
-    """Without a prompt: the most likely of all; -1 where all are as likely."""
+    """Without a prompt: the most likely of all; -1 where several are as likely."""
+    if probabilities.shape[-1] == 1:
+        return np.zeros(probabilities.shape[:-1], int)
     apart = probabilities.max(axis=-1) > probabilities.min(axis=-1)
     return np.where(apart, probabilities.argmax(axis=-1), -1)
 
@@ -76,9 +78,13 @@ def region_feature(
     height, width = alphas.shape
     x0, y0, x1, y1 = box
     if not (0 <= x0 <= x1 < width and 0 <= y0 <= y1 < height):
+        found, corners = f"{x0:g},{y0:g}", ""
+        if (x0, y0) != (x1, y1):
+            found += f" to {x1:g},{y1:g}"
+            corners = ", the first corner left of and above the second"
         raise ValueError(
-            f"expected 0 <= X < {width} and 0 <= Y < {height}, the first corner left of and above the "
-            f"second, found {x0:g},{y0:g} to {x1:g},{y1:g}"
+            f"expected 0 <= X < {width} and 0 <= Y < {height}, pixels as they were learned{corners}, "
+            f"found {found}"
         )
     region = np.s_[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1]
     if alphas[region].mean() < _LITTLE:
