@@ -327,7 +327,7 @@ def test_features_that_are_not_there_are_missed(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of features"):
         read_feature_folder(tmp_path / "none", ["a.jpg"])
     np.save(tmp_path / "other.npy", MAP)
-    with pytest.raises(FileNotFoundError, match=r"features of the picture a\.jpg, as a\.npy, .* found other\.npy"):
+    with pytest.raises(FileNotFoundError, match=r"picture a\.jpg, as a\.npy, .* found other\.npy"):
         read_feature_folder(tmp_path, ["a.jpg"])
     with pytest.raises(ValueError, match="level: expected one of default, small, medium, large"):
         read_feature_folder(tmp_path, ["other.jpg"], level="huge")
