@@ -254,4 +254,4 @@ def test_what_is_missing_is_said(gsjax, pristine, scene, tmp_path):
     assert "gsjax fit" in said
     code, said = gsjax("query", tmp_path / "nothing", "can")
     assert code == 2
-    assert "expected the folder of a run of `gsjax track`, found nothing there" in said
+    assert "expected the folder of a run, found nothing there" in said
