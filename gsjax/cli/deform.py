@@ -123,7 +123,8 @@ def run(options: Options) -> int:
     with Notes(console) as notes:
         expect_dataset(options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        settings = _settings(options, asked)
+        elsewhere = {} if asked is None else asked.located()
+        settings = replace(options, dataset=located(options.dataset), **elsewhere)
         if options.resume:
             folder.check_config(settings, but=_OF_NO_BEARING)
         deep = _recording(options, notes)
@@ -230,17 +231,6 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
-def _settings(options: Options, asked: Asked | None) -> Options:
-    """The options by which a run finds everything again from elsewhere."""
-    found: dict[str, Any] = {"dataset": located(options.dataset)}
-    for name in ("sam", "weights"):
-        path = getattr(options, name)
-        found[name] = path and Path(located(str(path)))
-    if asked is not None and asked.of_files:
-        found["features"] = located(options.features)
-    return replace(options, **found)
-
-
 def _checked(options: Options) -> Asked | None:
     """Whose features are asked for, once all options fit; None: nobody's."""
     if len(options.cameras) > 1:
@@ -248,9 +238,8 @@ def _checked(options: Options) -> Asked | None:
     if options.test_every < 0 or options.test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
     asked = Asked(options.features, options.masks, options.sam, options.weights, options.level)
-    given = {"masks": options.masks != "auto", "sam": options.sam is not None}
-    if any(given.values()) and options.features not in ("closed", "clip"):
-        option = next(name for name, there in given.items() if there)
+    option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
+    if option is not None and asked.features not in ("closed", "clip"):
         raise ValueError(
             f"--{option}: expected --features closed or clip, which ask of masks, found {options.features}"
         )

@@ -45,7 +45,13 @@ class Wanted(NamedTuple):
         Args:
             scores: of Gaussians.
             given: by who asks.
+
+        Raises:
+            ValueError: no score can be above the given one, or all are.
         """
+        least, what = (-1, "a cosine") if len(self.vectors) == 1 else (0, "a share against others")
+        if given is not None and not least <= given < 1:
+            raise ValueError(f"--threshold: expected {least} to below 1, {what}, found {given:g}")
         if given is None and len(self.vectors) == 1 and self.least is not None:
             return Threshold(self.least, "the encoder's own")
         found = threshold_for(scores, len(self.vectors) > 1, given)

@@ -118,10 +118,14 @@ class EncodedTeacher:
             ValueError: grids differ, or nothing is said of pixels that count.
         """
         self._teaching, teacher = teaching, teaching.teacher
-        vectors, weights = _counted(teacher, looks)
+        self.ids = _ids(teacher)
+        weights = _counts(teacher, self.ids, looks)
+        blocks = _vectors(teacher)
+        counted = np.split(weights > 0, np.cumsum([len(block) for block in blocks])[:-1])
+        vectors = [block[some] for block, some in zip(blocks, counted, strict=True)]
         basis, self.kept = basis_of(vectors, channels)
-        self.ids, self.codes = _in_channels(teacher, basis)
-        groups = groups_of(np.concatenate([some @ basis for some in vectors]), np.concatenate(weights))
+        self.codes = _codes(teacher, basis)
+        groups = groups_of(self.codes[weights > 0], weights[weights > 0])
         names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
         self.meaning = Meaning(teaching.source, names, groups, basis)
 
@@ -134,8 +138,8 @@ class EncodedTeacher:
         teacher = self._teaching.of(t)
         if teacher is None:
             return None
-        (ids,), codes = _in_channels(teacher, self.meaning.basis)
-        return Said(ids, codes)
+        (ids,) = _ids(teacher)
+        return Said(ids, _codes(teacher, self.meaning.basis))
 
     def digest(self) -> str:
         """Of what is taught, in hexadecimal."""
@@ -260,49 +264,48 @@ def _as_photographs(sequence: Sequence) -> Photographs:
     return replace(alone, names=tuple(names), load_depth=None)
 
 
-def _counted(
-    teacher: Teacher, looks: Many[Look]
-) -> tuple[list[Float[np.ndarray, "_ D"]], list[Float[np.ndarray, "_"]]]:
-    """What is said of pixels that count, and of how many of them: rows of its codebook, each once, or the
-    vectors of each map.
+def _counts(
+    teacher: Teacher, ids: Many[Int[np.ndarray, "h w"]], looks: Many[Look]
+) -> Float[np.ndarray, "n"]:
+    """Of how many pixels that count each vector is said.
 
     Raises:
-        ValueError: grids differ, or that is nothing.
+        ValueError: grids differ, or that is none of any.
     """
-    grids = Counter(one.shape[:2] for one in (teacher.maps or teacher.ids))
+    grids = Counter(one.shape for one in ids)
     if len(grids) > 1:
         found = ", ".join(f"{width}x{height} ({n})" for (height, width), n in grids.most_common())
         raise ValueError(f"--features: expected one grid in all frames, found (frames) {found}")
-    if teacher.codebook is not None:
-        counts = np.zeros(len(teacher.codebook) + 1)
-        for look, ids in zip(looks, teacher.ids, strict=True):
-            counts += np.bincount(1 + counted_ids(look._replace(ids=ids)).ravel(), minlength=len(counts))
-        there = counts[1:] > 0
-        vectors, weights = [teacher.codebook[there]], [counts[1:][there]]
-    else:
-        assert teacher.maps is not None
-        ids, _ = _in_channels(teacher, np.zeros((teacher.dimension, 1)))
-        pairs = zip(looks, ids, strict=True)
-        counted = [counted_ids(look._replace(ids=one)) >= 0 for look, one in pairs]
-        vectors = [one[some] for one, some in zip(teacher.maps, counted, strict=True)]
-        weights = [np.ones(len(some)) for some in vectors]
-    if not any(map(np.any, vectors)):
-        silent = teacher.maps is not None and not any(map(np.any, teacher.maps))
+    counts = np.zeros(1 + sum(map(len, _vectors(teacher))))
+    for look, one in zip(looks, ids, strict=True):
+        counts += np.bincount(1 + counted_ids(look._replace(ids=one)).ravel(), minlength=len(counts))
+    if not counts[1:].any():
+        silent = all((one < 0).all() for one in ids)
         found = "zeros alone" if silent else "none; do masks hide all?"
         raise ValueError(f"--features: expected some of pixels that count, found {found}")
-    return vectors, weights
+    return counts[1:]
 
 
-def _in_channels(
-    teacher: Teacher, basis: Float[np.ndarray, "D channels"]
-) -> tuple[list[Int[np.ndarray, "h w"]], Float[np.ndarray, "n channels"]]:
-    """Ids of each view, and the codes that they name; a map's pixels have a code each."""
+def _vectors(teacher: Teacher) -> list[Float[np.ndarray, "_ D"]]:
+    """What it says: rows of its codebook, or a block of them for each map, whose pixels have one each."""
     if teacher.codebook is not None:
-        return teacher.ids, teacher.codebook @ basis
+        return [teacher.codebook]
     assert teacher.maps is not None
+    return [one.reshape(-1, one.shape[2]) for one in teacher.maps]
+
+
+def _codes(teacher: Teacher, basis: Float[np.ndarray, "D channels"]) -> Float[np.ndarray, "n channels"]:
+    """All of that, in the scene's channels."""
+    return np.concatenate([block @ basis for block in _vectors(teacher)])
+
+
+def _ids(teacher: Teacher) -> list[Int[np.ndarray, "h w"]]:
+    """Which of these each pixel of each view has; -1 where nothing is said, as where a map is zero."""
+    if teacher.maps is None:
+        return teacher.ids
     ids, begin = [], 0
     for one in teacher.maps:
         places = begin + np.arange(one.shape[0] * one.shape[1], dtype=np.int32).reshape(one.shape[:2])
         ids.append(np.where(np.any(one, axis=2), places, -1))
         begin += places.size
-    return ids, np.concatenate([one.reshape(-1, one.shape[2]) @ basis for one in teacher.maps])
+    return ids

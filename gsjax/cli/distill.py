@@ -182,12 +182,9 @@ def _out(options: Options, scene: Path) -> Path:
 
 def _settings(options: Options, asked: Asked) -> Options:
     """The options by which a run finds everything again from elsewhere."""
-    paths = {name: getattr(options, name) for name in ("scene", "sam", "weights")}
-    found = {name: path and Path(located(str(path))) for name, path in paths.items()}
+    found = asked.located() | {"scene": options.scene and Path(located(str(options.scene)))}
     if options.images is not None:
         found["images"] = located(options.images)
-    if asked.of_files:
-        found["features"] = located(options.features)
     return replace(options, **found)
 
 

@@ -14,6 +14,7 @@ from rich.progress import track
 
 from gsjax.cli.feature_cache import FeatureCache, content_digest, folder_digest
 from gsjax.cli.field_source import KINDS, SAID, Source
+from gsjax.cli.recording import located
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.methods.feature_field import Teacher, teacher_of_maps, teacher_of_objects, with_maps
@@ -56,6 +57,12 @@ class Asked:
     @property
     def of_files(self) -> bool:
         return self.features not in ("auto", *KINDS)
+
+    def located(self) -> dict[str, Any]:
+        """Its paths as they are found from elsewhere, by the options that name them."""
+        paths = {"sam": self.sam, "weights": self.weights}
+        found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
+        return found | ({"features": located(self.features)} if self.of_files else {})
 
     def check(self, also: tuple[str, ...] = ()) -> None:
         """Raises ValueError where these contradict each other, FileNotFoundError for files not there.

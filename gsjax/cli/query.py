@@ -17,7 +17,7 @@ from gsjax.cli.field_query import Question, answer
 from gsjax.cli.field_run import Whereabouts, field_of, open_field_run, unfinished_field_of
 from gsjax.cli.messages import USER_ERRORS, Notes, describe, stage
 from gsjax.cli.object_query import Asked, ask_for_object
-from gsjax.cli.run_folder import is_run
+from gsjax.cli.run_folder import expect_folder, is_run
 from gsjax.cli.run_records import read_config, read_record
 from gsjax.cli.selected import Changes
 
@@ -119,9 +119,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
-    if not options.run.is_dir():
-        found = "a file" if options.run.exists() else "nothing there"
-        raise FileNotFoundError(f"{options.run}: expected the folder of a run, found {found}; name its --out")
+    expect_folder(options.run)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
     # A tracked run answers over time, but not to what only fields can.
     tracked, of_field = (
@@ -270,8 +268,6 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
         raise ValueError(f"--{name}: a run of `gsjax deform` has no use for it; leave it out")
     if sum(way is not None for way in (options.text, asked.point, deform.box)) > 1:
         raise ValueError("expected at most one of TEXT, --point and --box, found more")
-    if asked.threshold is not None and not -_HIGHEST <= asked.threshold < _HIGHEST:
-        raise ValueError(f"--threshold: expected -1 to below 1, found {asked.threshold:g}")
     if options.text is None and (asked.negatives is not None or options.weights is not None):
         option = "negatives" if asked.negatives is not None else "weights"
         raise ValueError(f"--{option}: expected a TEXT too, which it is for; found none")

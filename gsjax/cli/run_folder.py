@@ -49,15 +49,24 @@ def is_run(folder: Path) -> bool:
 def expect_run(path: Path, made_by: str = "") -> None:
     """Raises FileNotFoundError where there is no folder of a run, which is then said to be `made_by` a
     command."""
-    wanted = f"{path}: expected the folder of a run" + (f" of {made_by}" if made_by else "")
-    if not path.is_dir():
-        found = "a file" if path.exists() else "nothing there"
-        raise FileNotFoundError(f"{wanted}, found {found}; name its --out")
+    expect_folder(path, made_by)
     if not is_run(path):
         found = "other files" if any(path.iterdir()) else "an empty folder"
         raise FileNotFoundError(
-            f"{wanted}, whose config.yml begins with {SIGNATURE!r}, found {found}; name its --out"
+            f"{_wanted(path, made_by)}, whose config.yml begins with {SIGNATURE!r}, found {found}; name its "
+            "--out"
         )
+
+
+def expect_folder(path: Path, made_by: str = "") -> None:
+    """Raises FileNotFoundError where there is no folder that could be a run's."""
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing there"
+        raise FileNotFoundError(f"{_wanted(path, made_by)}, found {found}; name its --out")
+
+
+def _wanted(path: Path, made_by: str) -> str:
+    return f"{path}: expected the folder of a run" + (f" of {made_by}" if made_by else "")
 
 
 def expect_dataset(path: str) -> None:

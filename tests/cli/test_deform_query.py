@@ -151,7 +151,7 @@ def test_without_a_prompt_all_are_named(gsjax, run):
         (("--box", "9,9,3"), "--box: expected X0,Y0,X1,Y1 in pixels, found '9,9,3'"),
         (("tool", "--frame", 10), "--frame: expected one of 0 to 9, found 10"),
         (("tool", "--frames", "20:"), "--frames: 20: holds no frame of the run, which has 10"),
-        (("tool", "--threshold", 1), "--threshold: expected -1 to below 1"),
+        (("tool", "--threshold", 1), "--threshold: expected 0 to below 1"),
         (("tool", "--threshold", 0.99999), "best score"),
         (("tool", "--camera", 1), "--camera: a run of `gsjax deform` has no use for it"),
         (("tool", "--negatives", "tissue"), "--negatives: a name is held against"),

@@ -359,7 +359,8 @@ def test_a_run_is_told_by_what_paths_mean_not_by_how_they_are_typed(monkeypatch,
         return distill._settings(told, asked)
 
     assert settings(Path()) == settings(tmp_path)
-    named = distill._settings(Options(Path("run"), features="clip", weights=Path("clip")), Asked("clip"))
+    asked = Asked("clip", weights=Path("clip"))
+    named = distill._settings(Options(Path("run"), features="clip", weights=Path("clip")), asked)
     assert (named.features, named.weights) == ("clip", tmp_path / "clip")
 
 
