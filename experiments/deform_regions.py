@@ -10,7 +10,7 @@ from deforming import Dataset, Reconstructed
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from gsjax.cli.deform_scores import classes_of_pixels, draw
+from gsjax.cli.deform.scores import classes_of_pixels, draw
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
 

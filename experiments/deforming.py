@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from recordings import recorded
 
 import gsjax
-from gsjax.cli.deform_data import unit_times
-from gsjax.cli.deform_scores import draw
+from gsjax.cli.deform.data import unit_times
+from gsjax.cli.deform.scores import draw
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.geometry.cameras import PixelsOf, pixels_of

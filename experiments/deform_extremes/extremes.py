@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
-from gsjax.cli.deform_scores import draw
+from gsjax.cli.deform.scores import draw
 from gsjax.methods.surgical import (
     GraphConfig,
     Look,

@@ -15,7 +15,7 @@ from jaxtyping import Bool, UInt8
 from recordings import recorded
 
 import gsjax
-from gsjax.cli.deform_data import unit_times
+from gsjax.cli.deform.data import unit_times
 from gsjax.data import DataWarning, Sequence
 from gsjax.methods.surgical import Look, SurgicalConfig
 from gsjax.metrics.image import psnr, ssim

@@ -15,7 +15,7 @@ import numpy as np
 from autoencoder import trained
 from fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
-from gsjax.cli.field_scene import FieldScene, scaled
+from gsjax.cli.distill.scene import FieldScene, scaled
 from gsjax.methods.feature_field import FieldConfig, FieldWeightsConfig, Teacher, features_of
 from gsjax.methods.feature_field.field import FeatureField
 

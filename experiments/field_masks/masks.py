@@ -18,7 +18,7 @@ from fields import (
     scored,
 )
 
-from gsjax.cli.field_scene import FieldScene
+from gsjax.cli.distill.scene import FieldScene
 from gsjax.methods.feature_field import FieldConfig
 
 

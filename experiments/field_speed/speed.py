@@ -12,7 +12,7 @@ import numpy as np
 from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
 from timing import jitted, median_ms
 
-from gsjax.cli.field_scene import FieldScene
+from gsjax.cli.distill.scene import FieldScene
 from gsjax.data.photographs import Photographs
 from gsjax.methods.feature_field import FieldConfig, Teacher, gaussian_cosines
 from gsjax.scene.gaussians import concatenate

@@ -12,10 +12,10 @@ import numpy as np
 from fields import NO_FLAWS, codebook_of, flawed_teacher, learned, of_field
 from recordings import recorded
 
-from gsjax.cli import track as track_command
-from gsjax.cli.field_scene import scene_of_run
-from gsjax.cli.field_scores import ClassScores, class_maps
-from gsjax.cli.saved_run import open_run
+from gsjax.cli.distill.scene import scene_of_run
+from gsjax.cli.distill.scores import ClassScores, class_maps
+from gsjax.cli.track import command as track_command
+from gsjax.cli.track.saved import open_run
 from gsjax.data.simulated.flawed_masks import Flaws
 from gsjax.methods.feature_field import FeatureField, FieldConfig, features_of, frozen_views
 from gsjax.methods.object_tracker import place

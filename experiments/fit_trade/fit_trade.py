@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 from recordings import recorded
 from static_fit.static_fit import SCENES
 
-from gsjax.cli.fit_loop import Budget
-from gsjax.cli.fit_results import Curve, judge, living, look
+from gsjax.cli.fit.loop import Budget
+from gsjax.cli.fit.results import Curve, judge, living, look
 from gsjax.cli.photographs import split
 from gsjax.data import open_photographs
 from gsjax.geometry.cameras import Camera

@@ -15,9 +15,9 @@ from recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
 from scipy.spatial.transform import Rotation
 from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
-from gsjax.cli.loop import Tracking
 from gsjax.cli.recording import Recording, draw_ahead, first_mask, remembered
-from gsjax.cli.scoring import lost_over_frames, score_motion, turn_unknown
+from gsjax.cli.track.loop import Tracking
+from gsjax.cli.track.scoring import lost_over_frames, score_motion, turn_unknown
 from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
 from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene

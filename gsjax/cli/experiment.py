@@ -28,8 +28,8 @@ from gsjax.cli.experiment_sweep import (
     run_cell,
 )
 from gsjax.cli.messages import Notes, describe, say_error
-from gsjax.cli.report import Media, format_number, write_report
-from gsjax.cli.report import Table as PageTable
+from gsjax.cli.run.report import Media, format_number, write_report
+from gsjax.cli.run.report import Table as PageTable
 from gsjax.io.atomic import atomic_write, write_json
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}

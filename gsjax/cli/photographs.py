@@ -14,7 +14,7 @@ from rich.progress import track
 
 from gsjax.cli.machine import available_mb
 from gsjax.cli.recording import expect_enough_left, open_recording, parse_frames
-from gsjax.cli.run_folder import expect_dataset
+from gsjax.cli.run.folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of

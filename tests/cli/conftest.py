@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli import loop, main, track
-from gsjax.cli.field_file import StoredField, write_field
-from gsjax.cli.field_scene import SceneOptions
-from gsjax.cli.field_source import Source
-from gsjax.cli.run_folder import RunFolder, plain
-from gsjax.cli.run_records import digest
+from gsjax.cli import main
+from gsjax.cli.distill.file import StoredField, write_field
+from gsjax.cli.distill.scene import SceneOptions
+from gsjax.cli.distill.source import Source
+from gsjax.cli.run.folder import RunFolder, plain
+from gsjax.cli.run.records import digest
+from gsjax.cli.track import command as track
+from gsjax.cli.track import loop
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV

@@ -17,7 +17,7 @@ KEPT = """
 import os
 import threading
 import jax
-import gsjax.cli.live
+import gsjax.cli.track.live
 from gsjax.cli.machine import describe, keep_to_cores
 
 before = os.sched_getaffinity(0)

@@ -1,0 +1,293 @@
+"""`gsjax fit`: a static scene from posed photographs."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, make_dataclass, replace
+from difflib import get_close_matches
+from itertools import pairwise
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+
+from gsjax.cli.fit.loop import follow, some_of
+from gsjax.cli.fit.orbit import write_orbit
+from gsjax.cli.fit.results import Curve, Plans, Scores, judge, living, print_results, write_results
+from gsjax.cli.fit.resume import load
+from gsjax.cli.fit.start import start_from
+from gsjax.cli.fit.tensorboard import TensorBoard
+from gsjax.cli.fit.worth import parts
+from gsjax.cli.machine import describe as describe_machine
+from gsjax.cli.messages import Notes, reason, stage
+from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
+from gsjax.cli.recording import expect_scale, located
+from gsjax.cli.run.folder import RunFolder
+from gsjax.data.open import ReadOptions
+from gsjax.io.atomic import write_npz
+from gsjax.io.ply import write_ply
+from gsjax.methods.reconstruction import (
+    PRESETS,
+    FitConfig,
+    Model,
+    View,
+    as_found,
+    begin,
+    light_of,
+    needed,
+)
+from gsjax.scene.gaussians import Gaussians, take
+
+_OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
+
+HELP = (
+    " Settings have names, to be said before the dataset, as in `gsjax fit quick DATASET --out RUN`: quick "
+    "(a first look), classic (cloning and splitting, as in 3DGS), depth (for RGB-D), published (those of "
+    "3DGS-MCMC, for a GPU or a night). What else is given counts more."
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `gsjax fit` is told."""
+
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+    """Folder of photographs or of a recording, all of whose frames are taken as photographs of one scene."""
+    out: Path
+    """Folder for the run."""
+    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
+    """Which frames of a recording, or which photographs, as Python slices them: 4:5 is the fifth alone."""
+    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of the cameras of a recording to fit. All that are not held out, unless given."""
+    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
+    """Ids of cameras of a recording that are held out, instead of every N-th photograph."""
+    scale: float = 1.0
+    """Fit photographs at this fraction of their size (width and height), as in 0.25; time goes with the
+    number of pixels."""
+    test_every: int = 8
+    """Hold out every N-th photograph, to judge by, where the data has no split; 0 holds out none."""
+    minutes: float | None = None
+    """Stop after so many minutes of steps, compiling included: how many there are follows from their pace.
+    The first fit on a machine compiles for about a minute; programs are kept for later ones."""
+    until_psnr: float | None = None
+    """Stop when held-out photographs are seen with so many dB."""
+    judge_every: int = 500
+    """Steps between looks at held-out photographs; under --minutes there are ten besides."""
+    save_every: float = 30.0
+    """Seconds of fitting that a run may lose when it is killed."""
+    tensorboard: bool = False
+    """Write the curve for TensorBoard too, into RUN/tensorboard."""
+    resume: bool = False
+    """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
+    overwrite: bool = False
+    """Replace an earlier run in the same folder."""
+    debug: bool = False
+    """Show Python's traceback when something fails."""
+    read: ReadOptions = field(default_factory=ReadOptions)
+    """What the layout of the data leaves open."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """How the scene is fitted."""
+
+
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
+    """The options where the first word is that of a preset: how the scene is fitted is then that preset's
+    unless given."""
+    if not arguments or arguments[0] not in PRESETS:
+        if len(arguments) > 1 and not arguments[0].startswith("-") and not arguments[1].startswith("-"):
+            meant = get_close_matches(arguments[0], PRESETS, 1)
+            raise ValueError(
+                f"expected a dataset, or a preset and a dataset, found {arguments[0]!r} and {arguments[1]!r}"
+                f"; presets are {', '.join(PRESETS)}" + (f": did you mean {meant[0]}?" if meant else "")
+            )
+        for before, word in pairwise(arguments):
+            if word in PRESETS and not before.startswith("-"):
+                raise ValueError(f"presets are said first: gsjax fit {word} DATASET --out RUN")
+        return Options, arguments
+    fitted = ("fit", FitConfig, field(default=PRESETS[arguments[0]]))
+    return make_dataclass("Options", [fitted], bases=(Options,), frozen=True), arguments[1:]
+
+
+def run(options: Options) -> int:
+    """Fit a scene and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
+    """
+    _check(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        photographs = choose_photographs(
+            options.dataset,
+            options.read,
+            scale=options.scale,
+            frames=options.frames,
+            cameras=options.cameras,
+            eval_cameras=options.eval_cameras,
+        )
+        chosen, held_out = split(photographs, options.test_every)
+        if options.until_psnr is not None and not len(held_out):
+            raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset))
+        if options.resume:
+            folder.check_config(settings, but=_OF_NO_BEARING)
+        say_if_large(photographs)
+        views = read_views(photographs, console)
+        fitted = [views[i] for i in chosen]
+        config, cloud = start_from(photographs, fitted, options.fit, console)
+        problem, state = begin(fitted, config, cloud, photographs.background)
+        folder.write_config(settings)  # from here on an earlier run is gone
+        curve = Curve()
+        if options.resume:
+            state, curve = load(folder.resume, problem, state)
+            notes.add(f"Resumed after {state.step} steps of an earlier run.")
+        board = TensorBoard(folder.path, curve.rows) if options.tensorboard else None
+        judged = [(photographs.names[i], views[i]) for i in held_out]
+        state, stopped = follow(
+            problem,
+            state,
+            curve,
+            judged,
+            folder,
+            console,
+            minutes=options.minutes,
+            until_psnr=options.until_psnr,
+            judge_every=options.judge_every,
+            save_every=options.save_every,
+            board=board,
+        )
+        if isinstance(stopped, KeyboardInterrupt):
+            console.print("stopping: what there is is written; Ctrl-C again leaves out the scores")
+        seconds = {"fit": curve.seconds, "compile": curve.compile_seconds}
+        gaussians, finished, worth = living(state.gaussians)[0], stopped is None, []
+        _say_what_was_odd(options, curve, gaussians, finished, notes)
+        found_views = as_found(problem, state.model)
+        write_cameras(folder, [photographs.names[i] for i in chosen], found_views, state.model)
+        aside = Aside(seconds, console, notes)
+        light, plans, scores = None, Plans(), Scores([])
+        if finished:  # who pressed Ctrl-C does not wait for this
+            with aside("pruning", "leaving out what no photograph needs"):
+                gaussians, light = without_needless(found_views, problem.config, gaussians, notes)
+        write_ply(folder.scene, gaussians)
+        with aside("scores", "scoring held-out photographs"):
+            shown = judged or [(photographs.names[i], views[i]) for i in chosen[:1]]
+            scores = judge(problem, gaussians, shown, folder, plans)
+        if finished and judged and light is not None and gaussians.num:
+            with aside("parts", "looking at what each part of the scene is worth"):
+                worth = parts(problem, gaussians, light, some_of(judged), curve, plans)
+        if finished:
+            with aside("video", "drawing a video of the scene"):
+                write_orbit(folder, problem._replace(views=found_views), gaussians)
+        found = {
+            "kind": "fit",
+            "dataset": photographs.name,
+            "complete": finished,
+            "report": True,
+            "stopped": None if stopped is None else reason(stopped),
+            "steps": state.step,
+            "skipped": curve.skipped,
+            "num_gaussians": gaussians.num,
+            "sh_degree": gaussians.sh_degree,
+            "photographs": {
+                "fitted": len(chosen),
+                "held_out": len(held_out),
+                "looked_at": len(some_of(judged)),
+            },
+            "size": photographs.sizes.max(0),
+            "start": problem.start,
+            "seconds": seconds | {"total": perf_counter() - begun},
+            "machine": describe_machine(),
+            "test": scores.mean() if judged and scores.rows else None,
+            "views": scores.rows,
+            "parts": worth,
+            "curve": curve.rows,
+            "notes": notes.all,
+        }
+        if board is not None:
+            board.close({f"held_out/{row['view']}": folder.path / row["picture"] for row in scores.rows})
+        folder.write_metrics(found)
+        write_results(folder, found, curve)
+        if finished:
+            folder.forget_resume()
+    print_results(folder, found)
+    if isinstance(stopped, KeyboardInterrupt):
+        return 130
+    if stopped is not None:
+        raise stopped
+    return 0
+
+
+def _check(options: Options) -> None:
+    for name in ("minutes", "until_psnr", "judge_every", "save_every"):
+        value = getattr(options, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
+    expect_scale(options.scale)
+    if options.test_every < 0 or options.test_every == 1:
+        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
+
+
+class Aside:
+    """What is done with a fit after its last step, and what it can do without: Ctrl-C and errors end it, and
+    the run still has its report."""
+
+    def __init__(self, seconds: dict[str, float], console: Console, notes: Notes):
+        self._seconds, self._console, self._notes = seconds, console, notes
+
+    @contextmanager
+    def __call__(self, name: str, words: str) -> Iterator[None]:
+        """Say what goes on, and how long it took."""
+        begun = perf_counter()
+        try:
+            with stage(self._console, words):
+                yield
+        except (KeyboardInterrupt, OSError, ValueError) as error:
+            self._notes.warn(f"{words} was left out: {reason(error)}")
+        self._seconds[name] = perf_counter() - begun
+
+
+def _say_what_was_odd(
+    options: Options, curve: Curve, gaussians: Gaussians, finished: bool, notes: Notes
+) -> None:
+    if curve.skipped:
+        notes.add(f"{curve.skipped} steps met numbers that are not finite and changed nothing.")
+    compiling, given = curve.compile_seconds, 60 * (options.minutes or np.inf)
+    if compiling > given / 3:
+        kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir
+        later = "; programs are kept, and the next fit at this size finds most of them" if kept else ""
+        notes.warn(f"compiling took {compiling:.0f} s, of {given:.0f} given{later}")
+    if finished and gaussians.sh_degree < options.fit.sh_degree:
+        notes.add(
+            f"Colours are of degree {gaussians.sh_degree}: a degree is added every "
+            f"{options.fit.sh_every:,} steps (--fit.sh-every)."
+        )
+
+
+def write_cameras(folder: RunFolder, names: list[str], views: list[View], model: Model) -> None:
+    """Writes cameras.npz, where cameras or exposures were learned: names [V], viewmats [V,4,4] (world to
+    camera, OpenCV axes), exposures [V,3,4] (the affine maps of colours)."""
+    if model.twists is None and model.exposures is None:
+        return
+    found = {"names": np.array(names), "viewmats": np.stack([view.viewmat for view in views])}
+    if model.exposures is not None:
+        exposures = np.asarray(model.exposures)
+        found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)
+    write_npz(folder.path / "cameras.npz", found)
+
+
+def without_needless(
+    views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes
+) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
+    """Those that some photograph needs, and the light that each sends."""
+    if not gaussians.num:
+        return gaussians, np.zeros(0)
+    light = light_of(gaussians, views, "antialiased" if config.antialiased else "classic")
+    kept = needed(light, config.prune) if config.prune else np.ones(len(light), bool)
+    if not kept.all():
+        some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
+        notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
+    return take(gaussians, kept), light[kept]

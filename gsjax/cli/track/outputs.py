@@ -1,0 +1,193 @@
+"""What a run writes: trajectory, scene, renders, videos, plots."""
+
+import contextlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gsjax.cli.recording import FirstMask, Recording
+from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.track.loop import Tracking
+from gsjax.cli.track.scoring import Scores
+from gsjax.cli.track.views import View
+from gsjax.io.atomic import atomic_write
+from gsjax.io.ply import write_ply
+from gsjax.io.video import VideoWriter
+from gsjax.metrics.tracking import ObjectScore
+from gsjax.viz import plots
+from gsjax.viz.colors import overlay_labels, side_by_side, to_uint8
+
+RENDERS = 5
+"""Rendered pictures a camera that are kept as files, from the first frame to the last."""
+MAX_VIDEO_HZ = 60.0
+MIN_VIDEO_HZ = 1.0
+
+
+def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
+    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped."""
+    # Parts of one object are one label in the files.
+    label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
+    labels = label_of[np.asarray(tracking.scene.labels)].astype(np.int32)
+    folder.write_trajectory(
+        means=tracking.means().astype(np.float32),
+        quats=tracking.quats().astype(np.float32),
+        normals=np.asarray(tracking.scene.normals, np.float32),
+        labels=labels,
+        label_ids=label_ids.astype(np.int32),
+        lost=_of_objects(tracking.lost, label_of),
+        turn_known=~_of_objects([~known for known in tracking.turn_known], label_of),
+        times=times[: tracking.num_frames],
+        update_s=np.asarray(tracking.update_s),
+    )
+    write_ply(folder.scene, tracking.scene.gaussians, labels=labels)
+
+
+def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:
+    """Whether an update set the flag of any part of each object; none is set in the first frame."""
+    rows = np.zeros((1 + len(flags), label_of.max()), bool)
+    for t, row in enumerate(flags, 1):
+        np.logical_or.at(rows[t], label_of[1:] - 1, row)
+    return rows
+
+
+def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -> Path | None:
+    """Writes a picture of the labels that tracking started from, the only ones it ever saw."""
+    if mask.labels is None or mask.camera is None:
+        return None
+    image = recording.tracked.image(0, recording.tracked.camera_ids.index(mask.camera))
+    path = folder.plot("first_mask", ".png")
+    write_png(path, overlay_labels(image, mask.labels))
+    return path
+
+
+def frame_rate(times: Float[np.ndarray, "t"]) -> float:
+    """Frames a second of a video, near the recording's own."""
+    steps = np.diff(times)
+    return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
+
+
+class Film:
+    """Writes each camera's video and a few of its renders as views go by: `with Film(...) as film`."""
+
+    def __init__(self, folder: RunFolder, recording: Recording, num_frames: int, colors: np.ndarray):
+        """
+        Args:
+            num_frames: how many will be shown.
+            colors: the label that gives each group its colour, [K+1].
+        """
+        self._folder, self._frame_ids, self._colors = folder, recording.judged.frame_ids, colors
+        self._kept = set(np.linspace(0, num_frames - 1, RENDERS).round().astype(int).tolist())
+        self._fps = frame_rate(recording.judged.times)
+        self._stack = contextlib.ExitStack()
+        self._videos: dict[int, VideoWriter] = {}
+
+    def add(self, view: View) -> None:
+        """Append one view to its camera's video."""
+        if view.camera not in self._videos:
+            writer = VideoWriter(self._folder.video(view.camera), self._fps)
+            self._videos[view.camera] = self._stack.enter_context(writer)
+        panel = side_by_side(view.image, view.render, labels=self._colors[view.groups])
+        self._videos[view.camera].write(panel)
+        if view.t in self._kept:
+            path = self._folder.render(view.camera, self._frame_ids[view.t])
+            write_png(path, to_uint8(view.render))
+
+    def __enter__(self) -> "Film":
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._stack.__exit__(*exception)
+
+
+def write_plots(
+    folder: RunFolder,
+    tracking: Tracking,
+    recording: Recording,
+    scores: Scores,
+    motion: dict[int, ObjectScore],
+    names: dict[int, str],
+    colors: np.ndarray,
+) -> list[tuple[Path, str]]:
+    """Writes the plots; returns each one's path and what it shows."""
+    written = []
+
+    def keep(name: str, figure, caption: str) -> None:
+        written.append((plots.save(figure, folder.plot(name)), caption))
+
+    known = {names[label]: label for label in motion if label in names and motion[label].num_scored}
+    if tracking.num_frames > 1:
+        if known:
+            errors = {name: motion[label].centroid_errors_mm for name, label in known.items()}
+            figure = plots.error_over_frames(errors, known, limit_mm=5.0)
+            keep("centroid_error", figure, "How far each object's centroid is from the truth")
+        keep(
+            "update_time",
+            plots.update_time(np.array([np.nan, *tracking.update_s[1:]])),
+            "Time of each update; compiling apart",
+        )
+    if scores.num_frames > 1:
+        lines = {
+            kind: {
+                f"camera {camera}": np.asarray(found.values["psnr"])
+                for camera, found in scores.cameras.items()
+                if found.held_out == kind
+            }
+            for kind in (False, True)
+        }
+        keep(
+            "psnr",
+            plots.psnr_over_frames(lines[False], lines[True]),
+            "Rendered pictures against the camera's",
+        )
+    if tracking.num_frames > 1:
+        paths = _centroids(tracking, names, colors)
+        caption = "Centroids from above; ring: start, dot: end; thin lines: the truth"
+        figure = plots.trajectories(
+            paths,
+            {name: label for label, name in names.items()},
+            _true_paths(recording, tracking, paths, names),
+        )
+        keep("paths", figure, caption)
+    return written
+
+
+def _centroids(tracking: Tracking, names: dict[int, str], colors: np.ndarray) -> dict[str, np.ndarray]:
+    """Where the centroid of each object's Gaussians went, [T,3]."""
+    groups, means = np.asarray(tracking.scene.labels), tracking.means()
+    paths = {}
+    for label, name in names.items():
+        members = np.isin(groups, np.flatnonzero(colors == label))
+        if members.any():
+            paths[name] = means[:, members].mean(axis=1)
+    return paths
+
+
+def _true_paths(
+    recording: Recording, tracking: Tracking, paths: dict[str, np.ndarray], names: dict[int, str]
+) -> dict[str, np.ndarray]:
+    """Where the truth would have carried the same centroids."""
+    truth = recording.tracked.truth
+    if truth is None:
+        return {}
+    true = {}
+    for i, label in enumerate(truth.label_ids):
+        name = names.get(int(label))
+        if name in paths:
+            poses = truth.poses[: tracking.num_frames, i]
+            motion = poses @ np.linalg.inv(poses[0])
+            true[name] = motion[:, :3, :3] @ paths[name][0] + motion[:, :3, 3]
+    return true
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Writes an RGB picture [H,W,3] or a grey one [H,W], uint8.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    with atomic_write(path) as temporary:
+        rows = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        if not cv2.imwrite(str(temporary), rows):
+            raise OSError(f"{path}: the picture could not be written; is there space, and permission?")

@@ -1,0 +1,270 @@
+"""Scores of a run, added up view by view so that memory stays flat, and the metrics that come of them."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from gsjax.cli.recording import FirstMask, Recording, label_names
+from gsjax.cli.track.loop import Tracking
+from gsjax.cli.track.views import View
+from gsjax.methods.object_tracker.budget import Chosen
+from gsjax.metrics.image import depth_error, psnr, ssim
+from gsjax.metrics.segmentation import LabelOverlap
+from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
+
+SMALLEST_FOR_SSIM = 11
+
+
+@dataclass
+class CameraScores:
+    """Scores of one camera, one entry a frame; NaN where there was nothing to compare."""
+
+    held_out: bool
+    values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+    def mean(self, name: str) -> float | None:
+        """The mean over frames of those that are finite; None without any."""
+        values = np.asarray(self.values.get(name, []), np.float64)
+        values = values[np.isfinite(values)]
+        return float(values.mean()) if len(values) else None
+
+
+class Scores:
+    """Pictures, depth and labels against what the cameras saw.
+
+    Args:
+        values: the mask value that each group of the scene stands for, [K+1]; None scores no labels.
+        robot: the robot's mask value, or None.
+    """
+
+    def __init__(self, values: np.ndarray | None, robot: int | None):
+        self._values, self._robot = values, robot
+        self.cameras: dict[int, CameraScores] = {}
+        self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
+        self.num_frames = 0
+
+    def add(self, view: View) -> None:
+        """Score one view."""
+        self.num_frames = max(self.num_frames, view.t + 1)
+        camera = self.cameras.setdefault(view.camera, CameraScores(view.held_out))
+        scored = {"psnr": psnr(view.render, view.image), "coverage": float(view.covered.mean())}
+        scored["psnr_covered"] = psnr(view.render, view.image, view.covered)
+        if min(view.image.shape[:2]) >= SMALLEST_FOR_SSIM:
+            scored["ssim"] = ssim(view.render, view.image)
+        if view.depth is not None:
+            error = depth_error(view.render_depth, view.depth)
+            scored |= {"depth_error_mm": error.mean_abs_mm, "depth_within_1cm": error.within_1cm}
+        if view.mask is not None and self._robot is not None:
+            inside = view.mask == self._robot
+            scored["psnr_robot"] = psnr(view.render, view.image, inside)
+            if "ssim" in scored:
+                scored["ssim_robot"] = ssim(view.render, view.image, inside)
+            if view.depth is not None:
+                error = depth_error(view.render_depth, view.depth, inside)
+                scored["depth_error_robot_mm"] = error.mean_abs_mm
+        for name, value in scored.items():
+            camera.values[name].append(value)
+        if view.mask is not None and self._values is not None:
+            self.overlaps[view.held_out].add(self._values[view.groups], view.mask)
+
+
+CAMERA_SCORES = (
+    *("psnr", "ssim", "coverage", "psnr_covered", "depth_error_mm", "depth_within_1cm"),
+    *("psnr_robot", "ssim_robot", "depth_error_robot_mm"),
+)
+
+
+def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> np.ndarray | None:
+    """The mask value in the data's files that each group stands for, [K+1]; None if there are no files.
+
+    Groups of the segmenter stand for the value that most of their pixels have in the file's first mask.
+    """
+    values = np.asarray(tracking.scene.label_ids)
+    if mask.source != "segment":
+        return values
+    c = recording.tracked.camera_ids.index(mask.camera)
+    files = recording.tracked.mask(0, c)
+    if files is None or mask.labels is None:
+        return None
+    matched = [0]
+    for value in values[1:]:
+        found, counts = np.unique(files[mask.labels == value], return_counts=True)
+        matched.append(int(found[np.argmax(counts)]) if len(found) else 0)
+    return np.asarray(matched)
+
+
+def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectScore]:
+    """How each object of the truth was followed, by its mask value; empty without truth, depth or masks."""
+    sequence = recording.tracked
+    truth = sequence.truth
+    if truth is None or not (sequence.has_masks and sequence.has_depth) or tracking.num_frames < 2:
+        return {}  # the first frame is what errors are counted from
+    seen = [(sequence.mask(0, c), sequence.depth(0, c), c) for c in range(sequence.num_cameras)]
+    seen = [(mask, depth, c) for mask, depth, c in seen if mask is not None and depth is not None]
+    if not seen:
+        return {}
+    masks, depths, cameras = zip(*seen, strict=True)
+    means = tracking.means()
+    labels = true_labels(
+        means[0],
+        masks,
+        depths,
+        [sequence.viewmats[0, c] for c in cameras],
+        [sequence.Ks[0, c] for c in cameras],
+    )
+    poses = truth.poses[: tracking.num_frames]
+    return score_tracks(means, labels, {int(k): poses[:, i] for i, k in enumerate(truth.label_ids)})
+
+
+def metrics(
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    scores: Scores,
+    motion: dict[int, ObjectScore],
+    values: np.ndarray | None,
+) -> dict[str, Any]:
+    """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
+    though some Gaussian may lie on it. docs/tracker.md says what each score means."""
+    names = object_names(tracking, recording, mask, values)
+    motion = {label: score for label, score in motion.items() if _members(tracking, values, label).any()}
+    objects = {
+        name: {
+            "label": label,
+            "gaussians": _count_gaussians(tracking, values, label),
+            "mask_pixels": _pixels(mask, tracking, values, label),
+            "travelled_mm": _travelled_mm(tracking, values, label),
+            "frames_lost": _frames_lost(tracking, values, label),
+            "turn_unknown_from": turn_unknown_from(tracking, values, label),
+            **motion_metrics(motion.get(label)),
+        }
+        for label, name in names.items()
+    }
+    return {
+        "objects": objects,
+        "iou": _iou(scores, names, held_out=False),
+        "iou_held_out": _iou(scores, names, held_out=True),
+        **camera_metrics(scores),
+        "over_frames": {
+            "psnr": {str(camera): found.values["psnr"] for camera, found in scores.cameras.items()},
+            "centroid_error_mm": {
+                names[label]: score.centroid_errors_mm for label, score in motion.items() if label in names
+            },
+        },
+    }
+
+
+def camera_metrics(scores: Scores) -> dict[str, Any]:
+    """Each score's mean over frames, by camera, and over the cameras of each kind."""
+    cameras = {
+        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
+        for camera, found in scores.cameras.items()
+    }
+    kinds = {kind: _mean_of(cameras, tracked=kind == "tracked") for kind in ("tracked", "held_out")}
+    return {"cameras": cameras, **kinds}
+
+
+def budget_metrics(chosen: Chosen) -> dict[str, Any]:
+    """What was chosen for a budget, and why, for metrics.json."""
+    tried = {
+        name: {"base_ms": 1e3 * costs.base, "each_search_ms": 1e3 * costs.search}
+        for name, costs in chosen.tried.items()
+    }
+    return {"chosen": chosen.name, "fits": chosen.fits, "measured": tried}
+
+
+def object_names(
+    tracking: Tracking, recording: Recording, mask: FirstMask, values: np.ndarray | None
+) -> dict[int, str]:
+    """The name of each object that is tracked or in the truth, by mask value, background left out."""
+    known = label_names(recording, "files")
+    ids = tracking.scene.label_ids if values is None else values.tolist()
+    labels = sorted({*ids, *(known if values is not None else {})} - {0})
+    return {
+        label: known.get(label, f"object {label}") if values is not None else f"object {label}"
+        for label in labels
+    }
+
+
+def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
+    fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
+    scored = {name: getattr(score, name, None) for name in fields}
+    return scored | {"gaussians_scored": 0 if score is None else score.num_scored}
+
+
+def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
+    overlap = scores.overlaps[held_out]
+    return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
+
+
+def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]:
+    """Each score's mean over the cameras of one kind."""
+    chosen = [found for found in cameras.values() if found["tracked"] == tracked]
+    means = {}
+    for name in CAMERA_SCORES:
+        there = [found[name] for found in chosen if found[name] is not None]
+        means[name] = float(np.mean(there)) if there else None
+    return means
+
+
+def _members(tracking: Tracking, values: np.ndarray | None, label: int) -> np.ndarray:
+    """Which Gaussians the tracker takes for the object."""
+    ids = np.asarray(tracking.scene.label_ids) if values is None else values
+    return np.isin(np.asarray(tracking.scene.labels), np.flatnonzero(ids == label))
+
+
+def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) -> int:
+    return int(_members(tracking, values, label).sum())
+
+
+def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> float | None:
+    """How far the tracker moved the object's centroid from where it was first, at most."""
+    members = _members(tracking, values, label)
+    if not members.any():
+        return None
+    centroids = tracking.means()[:, members].mean(axis=1)
+    return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
+
+
+def _frames_lost(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    lost = lost_over_frames(tracking, values, label)
+    return int(lost.sum()) if _members(tracking, values, label).any() else None
+
+
+def lost_over_frames(
+    tracking: Tracking, values: np.ndarray | None, label: int
+) -> Bool[np.ndarray, "updates"]:
+    """In which updates the tracker held the object, or a part of it, for lost."""
+    return _of_object(tracking, tracking.lost, values, label).any(axis=1)
+
+
+def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
+    """After which updates the tracker did not know how the object, or a part of it, is turned."""
+    return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
+
+
+def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    """The frame from which on, to the end, the tracker did not know how the object is turned, lost or not;
+    None if it knew at the end."""
+    known = np.flatnonzero(~turn_unknown(tracking, values, label))
+    first = known[-1] + 2 if len(known) else 1
+    return int(first) if first < tracking.num_frames else None
+
+
+def _of_object(
+    tracking: Tracking, flags: list[np.ndarray], values: np.ndarray | None, label: int
+) -> Bool[np.ndarray, "updates parts"]:
+    """Of all flags those of one object's groups."""
+    ids = np.asarray(tracking.scene.label_ids) if values is None else values
+    return np.asarray(flags, bool).reshape(len(flags), len(ids) - 1)[:, ids[1:] == label]
+
+
+def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
+    if mask.labels is None:
+        return None
+    ids = np.asarray(tracking.scene.label_ids)
+    own = ids[values == label] if values is not None else [label]
+    return int(np.isin(mask.labels, [label] if mask.source == "files" else own).sum())

@@ -1,0 +1,60 @@
+"""What of a deforming scene's frames is scored, and against what."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.cli.deform.scores import OVER_TIME, classes_of_pixels, over_time
+from gsjax.methods.surgical import Look
+
+HEIGHT, WIDTH = 40, 48
+
+
+def frame(shift=0.0):
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    waves = np.sin((columns - shift) / 3) * np.cos(rows / 4)
+    return np.stack(
+        [0.5 + 0.4 * waves, 0.5 - 0.3 * waves, 0.5 + 0.2 * np.cos((columns - shift) / 5)], axis=-1
+    )
+
+
+def look(shift, counts=None):
+    bytes_ = np.round(255 * frame(shift)).astype(np.uint8)
+    return Look(bytes_, counts, None, np.eye(4), np.eye(3), 0.0)
+
+
+def test_the_recording_is_as_steady_as_itself():
+    looks = [look(0.0), look(1.0)]
+    row = over_time([(one.image / 255.0, one) for one in looks])
+    for name in OVER_TIME:
+        assert row[name] == row[f"{name}_true"]
+    assert row["t_ssim"] < 0.97
+    assert row["warped_ssim"] > row["t_ssim"]
+    assert row["flow_warp_share"] > 0.8
+
+
+def test_a_frozen_scene_is_steadier_than_the_recording():
+    row = over_time([(frame(0.5), look(0.0)), (frame(0.5), look(1.0))])
+    assert row["t_ssim"] == pytest.approx(1)
+    assert row["flow_warp_error"] == pytest.approx(0, abs=1e-6)
+    assert row["t_ssim_true"] < 0.97
+
+
+def test_what_does_not_count_changes_nothing():
+    counts = np.ones((HEIGHT, WIDTH), bool)
+    counts[10:20, 10:24] = False
+    looks = [look(0.0, counts), look(1.0, counts)]
+    odd = [np.where(counts[..., None], frame(i + 0.3), i) for i in (0, 1)]
+    plain = [np.where(counts[..., None], frame(i + 0.3), 0.5) for i in (0, 1)]
+    assert over_time(list(zip(odd, looks, strict=True))) == over_time(list(zip(plain, looks, strict=True)))
+
+
+def test_too_small_pictures_have_none():
+    small = Look(np.zeros((11, 11, 3), np.uint8), None, None, np.eye(4), np.eye(3), 0.0)
+    assert over_time([(np.zeros((11, 11, 3)), small)] * 2) == {}
+
+
+def test_pixels_are_of_the_class_whose_code_is_nearest():
+    codes = jnp.eye(3, 5)
+    features = jnp.array([[[0.1, 0.02, 0, 0, 0], [0, 0, 7.0, 0, 1], [0, 0, 0, 0, 0]]])  # nothing said at last
+    np.testing.assert_array_equal(classes_of_pixels(features, codes), [[0, 2, -1]])

@@ -1,0 +1,122 @@
+"""`gsjax deform` without depth: matched between two eyes, or on a plane."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gsjax.cli.deform.depth import with_depth
+from gsjax.cli.messages import Notes
+from gsjax.data import DataError, DataWarning, open_photographs, open_sequence
+from gsjax.data.ordered import in_order
+from gsjax.io.video import VideoWriter
+
+EYES = "simulated:tissue?width=96&height=80&frames=4"
+SMALL = ("--deform.warmup", 6, "--deform.iterations", 14, "--deform.start-pixels", 2.0, "--deform.nodes", 48)
+SMALL += ("--deform.deformation.resolution", 8, "--deform.deformation.levels", 1, "--deform.channels", 4)
+
+
+def metrics(run):
+    return json.loads((run / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """A pattern that shifts by a pixel a frame before a camera that stands still, as a video."""
+    noise = np.random.default_rng(0).uniform(30, 220, (16, 24, 3))
+    wide = cv2.resize(noise, (96, 64), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+    path = tmp_path_factory.mktemp("clip") / "pulled.mp4"
+    with VideoWriter(path, 10, quality=1) as writer:
+        for t in range(5):
+            writer.write(np.ascontiguousarray(wide[:48, t : t + 64]))
+    return path
+
+
+def test_two_eyes_without_depth_are_matched_and_poses_refined(gsjax, tmp_path):
+    run = tmp_path / "run"
+    code, said = gsjax("deform", EYES, "--out", run, "--depth", "stereo", "--deform.refine-poses", *SMALL)
+    assert code == 0, said
+    found = metrics(run)
+    assert found["depth"] == {"source": "stereo", "metric": True}
+    assert found["curve"][-1]["depth"] is not None
+    assert found["test"]["depth_mm"] < 5
+    assert found["tracks"]["points"] > 50  # the scene is in metres, as truth is
+    assert any("Depth is matched between cameras 0 and 1" in note for note in found["notes"])
+    assert any("Poses were refined (poses.npz)" in note for note in found["notes"])
+    stored, given = np.load(run / "poses.npz"), open_sequence(EYES).viewmats
+    assert stored["viewmats"].shape == given.shape
+    np.testing.assert_allclose(stored["viewmats"][0], given[0], atol=1e-6)  # the first stands as given
+    assert np.abs(stored["viewmats"][2] - given[2]).max() > 1e-6
+    assert 0 < found["poses"]["moved"]["max"] < 0.02
+
+
+def test_a_clip_begins_on_a_plane(gsjax, clip, tmp_path):
+    run = tmp_path / "run"
+    code, said = gsjax("deform", clip, "--out", run, *SMALL)
+    assert code == 0, said
+    found = metrics(run)
+    assert found["depth"] == {"source": "plane", "metric": False}
+    assert found["poses"] is None
+    assert found["test"]["depth_mm"] is None
+    assert {row["depth"] for row in found["curve"]} == {None}
+    assert found["test"]["psnr_masked"] > 18
+    assert (run / "test" / "000001.png").is_file()
+    notes = " ".join(found["notes"])
+    assert "the scene began on a plane 1 before the first camera" in notes
+    assert "The camera has one pose in all frames" in notes
+
+
+def test_what_is_known_in_metres_does_not_judge_a_plane():
+    notes = Notes(Console(quiet=True))
+    deep = with_depth(open_sequence(EYES), "plane", 0.1, notes)
+    assert (deep.sequence.has_depth, deep.sequence.truth, deep.sequence.num_cameras) == (False, None, 1)
+    assert any("tell about how far with --deform.plane-depth (now 0.1)" in note for note in notes.all)
+
+
+def test_what_there_is_is_taken_first():
+    notes, both = Notes(Console(quiet=True)), open_sequence(EYES)
+    assert with_depth(both, "auto", 1.0, notes).source == "data"
+    blind = replace(both, load_depth=None)
+    assert with_depth(blind, "auto", 1.0, notes).source == "stereo"
+    assert with_depth(blind.select(cameras=[0]), "auto", 1.0, notes).source == "plane"
+    dark = replace(blind, load_image=lambda t, c: np.full((80, 96, 3), 9 + c, np.uint8))
+    with pytest.warns(DataWarning, match="all of one colour"):
+        with_depth(dark, "auto", 1.0, notes)
+    assert "found depth in 0% of the first frame's pixels" in notes.all[-1]
+    together = replace(blind, viewmats=blind.viewmats[:, [0, 0]])
+    with pytest.raises(ValueError, match=r"cameras 0 and 1 cannot be matched: .* --depth plane begins"):
+        with_depth(together, "auto", 1.0, notes)
+
+
+def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
+    """What `gsjax poses` writes has an order, and no depth."""
+    table = shutil.copytree(photographs, tmp_path / "table")
+    told = json.loads((table / "transforms.json").read_text())
+    told["frames"] = [frame for frame in told["frames"] if "lost" not in frame["file_path"]][::-1]
+    (table / "transforms.json").write_text(json.dumps(told))
+    code, said = gsjax("deform", table, "--out", tmp_path / "run", "--frames", "0:3", "--depth", "data")
+    assert code == 2
+    assert "--depth data: table has none" in said
+    sequence = in_order(open_photographs(table))
+    assert (sequence.num_frames, sequence.camera_ids) == (9, (0,))
+    np.testing.assert_array_equal(sequence.image(1, 0), open_photographs(table).image(7))
+    some = open_photographs(table)
+    np.testing.assert_array_equal(sequence.viewmats[1, 0], some.viewmats[7])
+    sizes = some.sizes.copy()
+    sizes[3] += 2
+    with pytest.raises(DataError, match="frames of 48x36 as the first, found 50x38 in"):
+        in_order(replace(some, sizes=sizes))
+
+
+def test_what_is_not_there_is_named(gsjax, clip, tmp_path):
+    code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "data")
+    assert code == 2
+    assert "--depth data: pulled has none; leave it at auto" in said
+    code, said = gsjax("deform", clip, "--out", tmp_path / "run", "--depth", "stereo")
+    assert code == 2
+    assert "--depth stereo: pulled has one camera, 0; expected a second one beside it" in said
+    assert not (tmp_path / "run").exists()

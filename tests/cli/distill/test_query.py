@@ -1,0 +1,416 @@
+"""`gsjax query` on a field: what it finds, writes, refuses, and where it looks for what a field is of.
+
+The fields are made up, one row a class: that of a distillation is asked in test_field.py.
+"""
+
+import json
+import shutil
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.cli.distill import pictures as field_pictures
+from gsjax.cli.distill.saved import short_names
+from gsjax.cli.distill.source import Source
+from gsjax.geometry.cameras import Camera
+from gsjax.io.ply import read_ply, write_ply
+from gsjax.perception.closed_vocabulary import ClosedVocabulary
+from gsjax.perception.codebook import ClassCodebook
+from gsjax.scene.gaussians import gaussians_from_activated
+from gsjax.viz.viewer.drawing import Drawer
+from tests.cli.conftest import LABELS, first_picture, write_made_field
+
+CAN, CARTON, BALL = 3, 2, 4
+NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation counts them
+
+
+@pytest.fixture(scope="module")
+def scene(pristine, tmp_path_factory):
+    """A PLY file with labels, and these."""
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    gaussians, labels = first_picture(pristine)
+    write_ply(path, gaussians, labels=labels)
+    return path, labels
+
+
+@pytest.fixture(scope="module")
+def made(pristine, scene, tmp_path_factory):
+    """The field of the classes."""
+    book = ClassCodebook(NAMES)
+    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
+    return write_made_field(
+        tmp_path_factory.mktemp("fields") / "field",
+        scene[0],
+        pristine,
+        Source("classes", NAMES),
+        scene[1],
+        vectors,
+    )
+
+
+@pytest.fixture
+def field(made, tmp_path):
+    """A copy of it to ask and to corrupt."""
+    return shutil.copytree(made, tmp_path / "field")
+
+
+@pytest.fixture(scope="module")
+def closed(pristine, scene, tmp_path_factory):
+    """The field of colours, outlines and names."""
+    picture = cv2.imread(str(next((pristine / "ims" / "0").iterdir())))[..., ::-1]
+    seen = cv2.imread(str(pristine / "seg" / "0" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    vectors = ClosedVocabulary(NAMES, sizes=False).embed_objects(
+        picture, seen.astype(np.int32) + 1, len(NAMES)
+    )
+    return write_made_field(
+        tmp_path_factory.mktemp("fields") / "closed",
+        scene[0],
+        pristine,
+        Source("closed", NAMES),
+        scene[1],
+        vectors,
+    )
+
+
+def told_of(field):
+    return json.loads((field / "query" / "query.json").read_text())
+
+
+def change(field, how):
+    """What field.npz says about itself."""
+    told = dict(np.load(field / "field.npz"))
+    about = json.loads(str(told["about"]))
+    how(about)
+    np.savez(field / "field.npz", **{**told, "about": np.array(json.dumps(about))})
+
+
+def found_of(field):
+    with np.load(field / "query" / "selection.npz") as found:
+        return dict(found)
+
+
+def panels(folder):
+    """Those of overview.png, without what is written in the upper corners."""
+    picture = cv2.imread(str(folder / "overview.png"))
+    high, wide = 240, 320
+    assert picture.shape[0] == 2 * high
+    places = [(y, x) for y in (0, high) for x in range(0, picture.shape[1], wide)]
+    return [picture[y + 40 : y + high, x : x + wide] for y, x in places]
+
+
+# what it finds
+
+
+def test_a_text_gives_gaussians_masks_and_scenes(gsjax, field, scene, pristine):
+    code, said = gsjax("query", field, "can", "--move", 0, 0, 0.5)
+    assert code == 0, said
+    folder, (whole, labels) = field / "query", (read_ply(scene[0])[0], scene[1])
+    told, found = told_of(field), found_of(field)
+    np.testing.assert_array_equal(found["indices"], np.flatnonzero(labels == CAN))
+    rows = found["indices"]
+    assert told["gaussians"] == len(found["scores"])
+    assert (found["scores"] > told["threshold"]).all()
+    assert len(found["all_scores"]) == whole.num
+    np.testing.assert_array_equal(found["means"], np.asarray(whole.means)[rows])
+    parts = {n: read_ply(folder / f"{n}.ply") for n in ("object", "without", "recolored", "moved")}
+    for name, kept in (("object", labels == CAN), ("without", labels != CAN), ("moved", labels >= 0)):
+        np.testing.assert_array_equal(parts[name][1].labels, labels[kept], err_msg=name)
+    np.testing.assert_array_equal(np.asarray(parts["object"][0].means), found["means"])
+    gone = np.asarray(parts["moved"][0].means) - np.asarray(whole.means)
+    np.testing.assert_allclose(gone[rows], np.tile([0, 0, 0.5], (len(rows), 1)), atol=1e-6)
+    assert not np.delete(gone, rows, axis=0).any()
+    changed = (np.asarray(parts["recolored"][0].sh0) != np.asarray(whole.sh0)).any(axis=(1, 2))
+    np.testing.assert_array_equal(np.flatnonzero(changed), rows)
+    mask = cv2.imread(str(folder / "masks" / "0.png"), cv2.IMREAD_UNCHANGED) == 255
+    truth = cv2.imread(str(pristine / "seg" / "0" / "000000.png"), cv2.IMREAD_UNCHANGED) == CAN
+    assert (mask & truth).sum() > 0.6 * (mask | truth).sum()
+    assert told["pixels"] == {camera: told["pixels"][camera] for camera in ("0", "1", "2")}
+    assert told["pixels"]["0"] == mask.sum()
+    places = panels(folder)
+    assert len(places) == 6
+    assert all(place.any() for place in places)
+    # And in a few words.
+    center = ", ".join(f"{x:.3f}" for x in found["means"].mean(0))
+    assert f"found 'can': {len(rows):,} of {whole.num:,} Gaussians centre {center} m size" in said
+    assert "score above 0.50 (better than each negative)" in said
+    assert "seen in 3 of 3 photographs" in said
+    assert "s, of which the query took" in said
+
+
+def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, monkeypatch):
+    """Without something it has as many Gaussians as with it."""
+    drawers, drawer, read = [], field_pictures.Drawer, []
+
+    def kept(*args, **options):
+        drawers.append(drawer(*args, **options))
+        return drawers[-1]
+
+    monkeypatch.setattr(field_pictures, "Drawer", kept)
+    for module in ("run.files", "distill.scene"):
+        monkeypatch.setattr(f"gsjax.cli.{module}.read_ply", lambda file: read.append(file) or read_ply(file))
+    code, said = gsjax("query", field, "carton", "--move", 0, 0, 0.01)
+    assert code == 0, said
+    assert drawers[0]._program._cache_size() == 1
+    assert read == [scene[0]]
+
+
+def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
+    random = np.random.default_rng(0)
+    means, quats = random.uniform(-1, 1, (20, 3)), random.normal(size=(20, 4))
+    shN = random.normal(size=(20, 3, 3)) * 0.3
+    shiny = gaussians_from_activated(means, quats, np.full((20, 3), 0.2), np.full(20, 0.8), means**2, shN=shN)
+    pose, K = np.eye(4), np.array([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
+    pose[2, 3] = 4
+    camera = Camera(jnp.asarray(pose[None], float), jnp.asarray(K[None], float), 24, 18)
+    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_pictures._seen_from(shiny, camera)))
+    assert drawn.max() > 0.2
+    np.testing.assert_allclose(painted, drawn, atol=1e-5)
+
+
+def test_a_point_means_the_thing_that_it_shows(gsjax, field, scene, pristine):
+    truth = cv2.imread(str(pristine / "seg" / "1" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    inside = cv2.erode((truth == CARTON).astype(np.uint8), np.ones((3, 3)))
+    y, x = (int(places[len(places) // 2]) for places in np.nonzero(inside))
+    code, said = gsjax("query", field, "--point", f"{x},{y}", "--camera", 1)
+    assert code == 0, said
+    np.testing.assert_array_equal(found_of(field)["indices"], np.flatnonzero(scene[1] == CARTON))
+    told = told_of(field)
+    assert sorted(told["against"]) == sorted(set(LABELS.values()) - {"carton"})
+
+
+def test_negatives_are_what_it_is_held_against(gsjax, field, closed, tmp_path):
+    assert gsjax("query", field, "can", "--negatives", "ball", "--threshold", 0.9)[0] == 0
+    told = told_of(field)
+    assert (told["against"], told["rule"]) == (["ball"], "given")
+    code, said = gsjax("query", field, "can", "--negatives", "spoon")
+    assert code == 2
+    assert "'spoon'" in said
+    closed = shutil.copytree(closed, tmp_path / "closed")
+    point = ("--point", "40,30", "--camera", 0)
+    assert gsjax("query", closed, *point)[0] == 0
+    assert told_of(closed)["against"] == []
+    assert gsjax("query", closed, *point, "--negatives", "red", "--threshold", 0.1)[0] == 0
+    assert told_of(closed)["against"] == ["red"]
+
+
+def test_a_picture_of_a_red_thing_means_red_things(gsjax, closed, scene, tmp_path):
+    """However many things have names: in a picture it has none, and is not the background."""
+    field = shutil.copytree(closed, tmp_path / "closed")
+    assert gsjax("query", field, "red", "--threshold", 0.0)[0] == 0
+    by_word = found_of(field)["all_scores"]
+    assert scene[1][by_word.argmax()] == CARTON
+    picture = np.zeros((20, 20, 3), np.uint8)
+    picture[..., 2] = 200
+    cv2.imwrite(str(tmp_path / "red.png"), picture)
+    code, said = gsjax("query", field, "--image", tmp_path / "red.png")
+    assert code == 0, said
+    scores = found_of(field)["all_scores"]
+    assert scene[1][scores.argmax()] == CARTON
+    assert CARTON in scene[1][found_of(field)["indices"]]
+    code, said = gsjax("query", field, "spoon")
+    assert code == 2
+    assert "'spoon'" in said
+
+
+def test_everything_is_an_answer_with_a_warning(gsjax, field):
+    code, said = gsjax("query", field, "can", "--threshold", -1)
+    assert code == 0
+    assert "means all" in said
+    assert not (field / "query" / "without.ply").exists()
+    assert len(panels(field / "query")) == 4  # nor is there a picture of it
+
+
+# what it refuses
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), ("one of TEXT, --image and --point",)),
+        (("can", "--point", "1,1"), ("found 2",)),
+        (("cannon",), ("'cannon'", "carton")),
+        (("can", "--threshold", 0.99999), ("best score", "--threshold")),
+        (("can", "--threshold", 1), ("--threshold: expected a finite number below 1", "found 1")),
+        (("can", "--threshold", "nan"), ("--threshold: expected a finite number", "found nan")),
+        (("can", "--threshold", "-inf"), ("--threshold: expected a finite number", "found -inf")),
+        (("--point", "1,1"), ("--camera",)),
+        (("--point", "x", "--camera", "0"), ("X,Y", "'x'")),
+        (("--point", "999,1", "--camera", "0"), ("80x60", "999")),
+        (("--point", "1,1", "--camera", "7"), ("0, 1, 2", "7")),
+        (("can", "--camera", "7"), ("--camera: expected one of 0, 1, 2, found 7",)),
+        (("--image", "nowhere.png"), ("by name",)),
+        (("can", "--encoder", "clip"), ("--encoder",)),
+        (("can", "--color", 2, 0, 0), ("--color",)),
+        (("can", "--move", "nan", 0, 0), ("--move: expected three finite numbers, found nan 0 0",)),
+        (("can", "--weights", "x"), ("--weights", "classes")),
+        (("can", "--scene", "nowhere.ply"), ("nowhere.ply", "found no file")),
+        (("can", "--images", "nowhere"), ("--images nowhere",)),
+    ],
+)
+def test_a_question_that_cannot_be_answered_leaves_the_last_answer(gsjax, field, options, words):
+    (field / "query").mkdir()
+    (field / "query" / "query.json").write_text("{}")
+    code, said = gsjax("query", field, *options)
+    assert code == 2
+    for word in words:
+        assert word in said, said
+    assert said.endswith(f"({field / 'query'} still has an earlier answer)")
+    assert (field / "query" / "query.json").read_text() == "{}"
+
+
+def test_a_field_that_is_damaged_is_refused(gsjax, field):
+    with np.load(field / "field.npz") as stored:
+        arrays = dict(stored)
+    for name, wrong in {"vectors": np.nan, "lift": np.inf}.items():
+        np.savez(field / "field.npz", **{**arrays, name: np.full_like(arrays[name], wrong)})
+        code, said = gsjax("query", field, "can")
+        assert code == 2
+        assert name in said
+    np.savez(field / "field.npz", **{**arrays, "vectors": arrays["vectors"][1:]})
+    code, said = gsjax("query", field, "can")
+    assert code == 2
+    assert "Gaussians" in said
+    (field / "field.npz").write_bytes(b"no archive")
+    code, said = gsjax("query", field, "can")
+    assert code == 2
+    assert "field.npz" in said
+
+
+def test_a_run_without_a_field_is_told_how_to_get_one(gsjax, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yml").write_text("# gsjax run\nfit: {}\ntest_every: 8\n")
+    code, said = gsjax("query", run, "can")
+    assert code == 2
+    assert f"expected a field, found none; gsjax distill {run} makes one" in said
+    (run / "field").mkdir()
+    (run / "field" / "config.yml").write_text("# gsjax run\nscene: x\nfeatures: auto\nfield: {}\n")
+    for path in (run, run / "field"):
+        code, said = gsjax("query", path, "can")
+        assert code == 2
+        assert f"{run / 'field'}: expected field.npz, found none yet: it is still being distilled" in said
+
+
+# what it leaves as it was
+
+
+def test_a_folder_of_somebody_else_is_left_alone(gsjax, field, tmp_path):
+    mine = tmp_path / "mine"
+    (mine / "query").mkdir(parents=True)
+    shutil.copy(field / "field.npz", mine)
+    (mine / "query" / "precious.txt").write_text("mine")
+    code, said = gsjax("query", mine, "can")
+    assert code == 2
+    assert "query: expected what gsjax writes there or nothing" in said
+    assert "found precious.txt" in said
+    assert (mine / "query" / "precious.txt").read_text() == "mine"
+    (mine / "query" / "precious.txt").rename(mine / "precious.txt")
+    code, said = gsjax("query", mine, "can")
+    assert code == 0, said
+    assert told_of(mine)["pixels"].keys() == {"0", "1", "2"}  # the file says which photographs there were
+    assert sorted(path.name for path in mine.iterdir()) == ["field.npz", "precious.txt", "query"]
+
+
+@pytest.mark.parametrize("problem", [KeyboardInterrupt, OSError("no space")])
+def test_an_answer_that_is_not_whole_leaves_the_one_before(gsjax, field, monkeypatch, problem):
+    assert gsjax("query", field, "can", "--camera", 0)[0] == 0
+    before = told_of(field)
+
+    def stopped(*args, **options):
+        raise problem
+
+    monkeypatch.setattr("gsjax.cli.distill.pictures.in_rows", stopped)
+    code, _ = gsjax("query", field, "carton", "--camera", 0)
+    assert code == (130 if problem is KeyboardInterrupt else 2)
+    assert told_of(field) == before
+    assert (field / "query" / "overview.png").is_file()
+    assert sorted(path.name for path in field.iterdir()) == ["config.yml", "field.npz", "query"]
+
+
+def test_a_photograph_that_cannot_be_read_is_done_without(gsjax, field, pristine, tmp_path):
+    images = shutil.copytree(pristine, tmp_path / "images")
+    for picture in (images / "ims").rglob("000000.*"):
+        picture.write_bytes(b"no picture")
+    code, said = gsjax("query", field, "can", "--images", images)
+    assert code == 0, said
+    assert "overview.png shows a render in place of a photograph" in said
+    assert (field / "query" / "overview.png").is_file()
+
+
+# where it looks
+
+
+def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
+    """Where it was there is another one now; the run that was moved whole has it in canonical/."""
+    run = tmp_path / "run"
+    (run / "canonical").mkdir(parents=True)
+    moved = shutil.move(field, run / "field")
+    change(moved, lambda about: about["scene"].update(file=str(run / "scene.ply")))
+    gaussians, _ = read_ply(scene[0])
+    write_ply(run / "scene.ply", gaussians)
+    shutil.copy(scene[0], run / "canonical" / "scene.ply")
+    code, said = gsjax("query", moved, "can", "--camera", 0)
+    assert code == 0, said
+    assert "is not as it was" not in said
+    assert told_of(moved)["scene"] == str(run / "canonical" / "scene.ply")
+    np.testing.assert_array_equal(read_ply(moved / "query" / "object.ply")[1].labels, CAN)
+    # Without it the other one is better than nothing, and that is said.
+    (run / "canonical" / "scene.ply").unlink()
+    code, said = gsjax("query", moved, "can", "--camera", 0)
+    assert code == 0, said
+    assert f"{run / 'scene.ply'} is not as it was when the field in {moved} was distilled" in said
+    (run / "scene.ply").unlink()
+    code, said = gsjax("query", moved, "can")
+    assert code == 2
+    assert "--scene names it" in said
+    code, said = gsjax("query", moved, "can", "--camera", 0, "--scene", scene[0])
+    assert code == 0, said
+    assert "is not as it was" not in said
+
+
+def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene, tmp_path):
+    change(field, lambda about: about["scene"]["photographs"].update(images=str(tmp_path / "gone")))
+    code, said = gsjax("query", field, "can")
+    assert code == 0, said
+    assert "its photographs cannot be read, so nothing is drawn" in said
+    assert "--images says where they are now" in said
+    assert not (field / "query" / "masks").exists()
+    for options in (("can",), ("--point", "1,1")):
+        code, said = gsjax("query", field, *options, "--camera", 0)
+        assert code == 2
+        assert "--camera: expected photographs, found none" in said
+    code, said = gsjax("query", field, "can", "--images", pristine, "--camera", 2)
+    assert code == 0, said
+    assert [path.name for path in (field / "query" / "masks").iterdir()] == ["2.png"]
+    change(field, lambda about: about["scene"].pop("photographs"))
+    code, said = gsjax("query", field, "can")
+    assert code == 0, said
+    assert "field.npz: expected which photographs it learned from, found others" in said
+
+
+def test_rows_that_cannot_be_drawn_are_counted_and_rows_are_the_files(gsjax, pristine, scene, tmp_path):
+    gaussians, _ = read_ply(scene[0])
+    means = np.array(gaussians.means)
+    lost = np.flatnonzero(scene[1] == CAN)[:2]
+    means[lost, 0] = np.nan
+    file, book = tmp_path / "scene.ply", ClassCodebook(NAMES)
+    write_ply(file, eqx.tree_at(lambda g: g.means, gaussians, means), labels=scene[1])
+    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
+    left = np.delete(scene[1], lost)
+    field = write_made_field(tmp_path / "field", file, pristine, Source("classes", NAMES), left, vectors)
+    code, said = gsjax("query", field, "can", "--camera", 0)
+    assert code == 0, said
+    assert f"2 of {len(means)} Gaussians cannot be drawn" in said
+    found = found_of(field)
+    np.testing.assert_array_equal(found["indices"], np.flatnonzero(scene[1] == CAN)[2:])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["all_scores"])), lost)
+    assert read_ply(field / "query" / "without.ply")[0].num == (left != CAN).sum()
+
+
+def test_photographs_have_short_names():
+    assert short_names(["3/000000", "12/000000"]) == ("3", "12")
+    assert short_names(["images/a.jpg", "images/b.jpg"]) == ("images_a", "images_b")
+    assert short_names(["a.png", "a.jpg"]) == ("a.png", "a.jpg")

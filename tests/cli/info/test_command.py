@@ -1,0 +1,112 @@
+"""`gsjax info` on photographs; on recordings see test_main."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from gsjax.cli import main
+from gsjax.cli.info.picture import by_camera, by_split, scene_points
+from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
+from gsjax.viz.cameras import cameras_and_points
+
+
+def test_photographs_are_described_and_what_is_missing_is_counted(photographs, capfd):
+    assert main(["info", str(photographs)]) == 0
+    out, err = capfd.readouterr()
+    assert "9: images/00.png to images/22.png" in out
+    assert "48 x 36" in out
+    assert "points" in out
+    assert "of 10 listed photographs 1 that have no file" in err
+
+
+def test_what_a_layout_leaves_open_is_asked_for_and_taken(tmp_path, capfd):
+    matrix = np.column_stack([np.eye(3), np.zeros(3), [36, 48, 50]])  # right, up, back
+    rows = np.tile([*matrix.ravel(), 0.1, 10.0], (2, 1))
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    (tmp_path / "images").mkdir()
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((36, 48, 3), 40 * i, np.uint8))
+    assert main(["info", str(tmp_path)]) == 2
+    assert "give axes (--read.axes), llff" in capfd.readouterr().err
+    assert main(["info", str(tmp_path), "--read.axes", "endonerf"]) == 0
+    out, _ = capfd.readouterr()
+    assert "2: 0.png to 1.png" in out
+    assert "51° wide" in out
+
+
+def test_a_picture_shows_what_becomes_of_each_photograph(photographs, capfd, tmp_path, monkeypatch):
+    drawn = {}
+
+    def draw(groups, points, colors, **words):
+        drawn.update(groups=groups, points=points, **words)
+        return cameras_and_points(groups, points, colors, **words)
+
+    monkeypatch.setattr("gsjax.viz.cameras.cameras_and_points", draw)
+    path = tmp_path / "deep/scene.png"
+    assert main(["info", str(photographs), "--picture", str(path)]) == 0
+    assert f"wrote {path}" in capfd.readouterr().out
+    assert cv2.imread(str(path)).shape[1] > 1000
+    assert list(path.parent.iterdir()) == [path]
+    counts = {name: len(group.viewmats) for name, group in drawn["groups"].items()}
+    assert counts == {"fitted": 7, "held out": 2}
+    assert drawn["points"] is None
+    assert drawn["unit"] == "units of the data"
+
+
+def test_the_split_of_the_data_is_shown_too(photographs, tmp_path, monkeypatch):
+    meta = json.loads((photographs / "transforms.json").read_text())
+    names = [frame["file_path"] for frame in meta["frames"]]
+    meta |= {"train_filenames": names[:5], "val_filenames": names[5:7], "test_filenames": names[7:]}
+    folder = tmp_path / "table"
+    shutil.copytree(photographs, folder)
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    with pytest.warns(DataWarning):
+        groups = by_split(open_photographs(folder))
+    assert {name: indices.tolist() for name, indices in groups.items()} == {
+        "fitted": [0, 1, 2, 3, 4],
+        "held out": [7, 8],
+        "not used": [5, 6],
+    }
+
+
+def test_a_recording_is_drawn_by_camera_with_points_of_its_depth(capfd, tmp_path):
+    sequence = open_sequence("simulated:tabletop?frames=4&width=48&height=36")
+    groups = by_camera(sequence)
+    scene = photographs_of(sequence)
+    assert list(groups) == ["camera 0", "camera 1", "camera 2"]
+    for c, indices in enumerate(groups.values()):
+        np.testing.assert_array_equal(scene.viewmats[indices], sequence.viewmats[:, c])
+    points, colors = scene_points(scene)
+    assert points.shape == colors.shape
+    on_table = np.abs(points[:, 2]) < 0.002  # which stands at height 0
+    assert 0.2 < on_table.mean() < 1
+    code = main(
+        ["info", "simulated:tabletop?frames=2&width=48&height=36", "--picture", str(tmp_path / "a.svg")]
+    )
+    assert code == 0
+    text = (tmp_path / "a.svg").read_text()
+    assert "camera 2 (2)" in text
+    assert "z (m)" in text
+
+
+def test_a_run_is_no_dataset(capfd, tmp_path):
+    (tmp_path / "config.yml").write_text("# gsjax run\n")
+    assert main(["info", str(tmp_path)]) == 2
+    assert "found the folder of a run; open its report.html" in " ".join(capfd.readouterr().err.split())
+
+
+def test_pictures_of_another_kind_are_refused_before_anything_is_read(capfd):
+    assert main(["info", "nowhere", "--picture", "scene.bmp"]) == 2
+    said = capfd.readouterr().err
+    assert "--picture: expected a name that ends in .png, .svg, .pdf, found 'scene.bmp'" in said
+
+
+def test_a_recording_that_is_also_photographs_is_told_as_what_it_is_over_time(shared_data, capfd):
+    """EndoNeRF's folders have poses_bounds.npy as LLFF's do."""
+    assert main(["info", str(shared_data / "tissue_0")]) == 0
+    out = capfd.readouterr().out
+    assert "60" in out
+    assert "tracks of 784 points" in out

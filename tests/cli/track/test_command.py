@@ -1,0 +1,252 @@
+"""`gsjax track` from end to end, on a tiny recording."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+import gsjax.cli.track.loop
+from gsjax.cli.recording import parse_frames
+from gsjax.data import Sequence
+from gsjax.io.ply import read_ply
+from gsjax.io.video import read_video_frames
+
+CARTON, CAN, BALL = 2, 3, 4
+QUICK = ("--tracker.start.iterations", "2")
+CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """(frame, camera) of each mask that is opened, and when tracking had ended, None."""
+    log = []
+    mask, follow = Sequence.mask, gsjax.cli.track.loop.follow
+
+    def watched(sequence, t, c):
+        log.append((sequence.frame_ids[t], sequence.camera_ids[c]))
+        return mask(sequence, t, c)
+
+    def followed(*arguments, **options):
+        result = follow(*arguments, **options)
+        log.append(None)
+        return result
+
+    monkeypatch.setattr(Sequence, "mask", watched)
+    monkeypatch.setattr("gsjax.cli.track.command.follow", followed)
+    return log
+
+
+def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
+    code, said = gsjax_track(pristine, *CAMERAS, *QUICK)
+    assert code == 0, said
+    run = tmp_path / "run"
+    assert "carton" in said
+    assert "report.html" in said
+
+    # No mask but the first of the mask's camera was opened before tracking ended.
+    assert opened[: opened.index(None)] == [(0, 1)]
+    assert len(opened) > 2
+
+    with np.load(run / "trajectory.npz") as file:
+        saved = dict(file)
+    frames, count, _ = saved["means"].shape
+    assert frames == 4
+    assert saved["labels"].shape == (count,)
+    assert saved["label_ids"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert set(saved["labels"]) == set(range(6))
+    assert saved["times"] == pytest.approx(np.arange(4) / 30)
+    assert saved["update_s"][0] == 0
+    assert (saved["update_s"][1:] > 0).all()
+    assert np.isfinite(saved["means"]).all()
+    still = saved["labels"] == 0
+    assert (saved["means"][:, still] == saved["means"][0, still]).all()
+
+    gaussians, report = read_ply(run / "scene.ply")
+    assert report.labels.tolist() == saved["labels"].tolist()
+    np.testing.assert_allclose(gaussians.means, saved["means"][0])
+
+    found = json.loads((run / "metrics.json").read_text())
+    assert found["complete"] is True
+    assert list(found["objects"]) == ["robot", "carton", "can", "ball", "block"]
+    # The can, which is all that moves in these frames, is ahead of one that was left behind.
+    can = found["objects"]["can"]
+    assert can["moved_mm"] > 15
+    assert can["centroid_error_mm"] < 0.5 * can["moved_mm"]
+    assert found["objects"]["robot"]["centroid_error_mm"] is None
+    assert 0 < found["iou"]["robot"] <= 1
+    assert 0 < found["iou_held_out"]["robot"] <= 1
+    assert {name: scored["tracked"] for name, scored in found["cameras"].items()} == {
+        "0": True,
+        "1": True,
+        "2": False,
+    }
+    for scored in found["cameras"].values():
+        assert all(scored[name] is not None for name in ("psnr", "ssim", "depth_error_mm", "psnr_robot"))
+    seconds = found["seconds"]
+    parts = sum(seconds[name] for name in ("planning", "compile", "updates", "loading", "loop_rest"))
+    assert parts == pytest.approx(seconds["loop_wall"])
+    assert seconds["updates"] == pytest.approx(saved["update_s"].sum())
+    assert seconds["loop_rest"] < 0.1 * seconds["loop_wall"]
+
+    config = yaml.safe_load((run / "config.yml").read_text())
+    assert config["cameras"] == [0, 1]
+    assert config["tracker"]["start"]["iterations"] == 2
+    for camera in (0, 1, 2):
+        assert len(read_video_frames(run / f"video_{camera}.mp4")) == 4
+        assert len(list((run / "renders" / str(camera)).glob("*.png"))) == 4
+    for plot in ("centroid_error.svg", "update_time.svg", "psnr.svg", "paths.svg", "first_mask.png"):
+        assert (run / "plots" / plot).stat().st_size > 1000
+    page = (run / "report.html").read_text()
+    assert page.count("data:video/mp4") == 3
+    assert "the truth holds no pose of it" in page
+
+
+def test_ctrl_c_leaves_a_usable_run(pristine, tmp_path, gsjax_track, still, monkeypatch):
+    frame = Sequence.frame
+
+    def interrupted(sequence, t):
+        if t == 2 and sequence.num_cameras == 2:
+            raise KeyboardInterrupt
+        return frame(sequence, t)
+
+    monkeypatch.setattr(Sequence, "frame", interrupted)
+    code, said = gsjax_track(pristine, "--cameras", "0", "1", "--eval-cameras", "2")
+    assert code == 130
+    assert "stopped: by Ctrl-C after 2 of 4 frames" in said
+    run = tmp_path / "run"
+    found = json.loads((run / "metrics.json").read_text())
+    assert (found["complete"], found["stopped"]) == (False, "Ctrl-C")
+    assert (found["frames"]["tracked"], found["frames"]["scored"]) == (2, 2)
+    assert np.load(run / "trajectory.npz")["means"].shape[0] == 2
+    assert "partial run" in (run / "report.html").read_text()
+    assert len(read_video_frames(run / "video_2.mp4")) == 2
+
+
+def test_ctrl_c_while_scoring_keeps_what_was_scored(pristine, tmp_path, gsjax_track, still, monkeypatch):
+    frame = Sequence.frame
+
+    def interrupted(sequence, t):
+        if t == 3 and sequence.num_cameras == 3:
+            raise KeyboardInterrupt
+        return frame(sequence, t)
+
+    monkeypatch.setattr(Sequence, "frame", interrupted)
+    code, said = gsjax_track(pristine, "--cameras", "0", "1", "--eval-cameras", "2")
+    assert code == 0
+    assert "scoring was stopped after 3 of 4 frames by Ctrl-C" in said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (found["frames"]["tracked"], found["frames"]["scored"], found["complete"]) == (4, 3, False)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_sigint_stops_the_program(pristine, tmp_path):
+    command = [sys.executable, "-m", "gsjax.cli", "track", str(pristine), "--out", str(tmp_path / "run")]
+    process = subprocess.Popen([*command, *QUICK], stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "run" / "config.yml").exists():
+        time.sleep(0.05)
+        assert process.poll() is None
+    time.sleep(0.5)  # it is compiling now, where JAX's own callbacks drop exceptions
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    assert "stopped" in said
+
+
+def test_objects_found_without_masks(recording, tmp_path, gsjax_track, still):
+    for mask in recording.glob("seg/*/*.png"):
+        mask.unlink()
+    for folder in (recording / "seg").iterdir():
+        folder.rmdir()
+    code, said = gsjax_track(recording, "--cameras", "1")
+    assert code == 0, said
+    assert "labels from the weight-free segmenter in camera 1" in said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["mask"] == {"source": "segment", "camera": 1}
+    assert next(iter(found["objects"])) == "object 1"
+    assert found["iou"] == {}
+    notes = " ".join(found["notes"])
+    assert "weight-free segmenter" in notes
+    assert "the recording has no masks" in notes
+
+
+def test_segmented_objects_are_scored_as_what_they_cover(pristine, tmp_path, gsjax_track, still):
+    code, said = gsjax_track(pristine, "--cameras", "1", "--masks", "segment")
+    assert code == 0, said
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert set(found["iou"]) >= {"robot", "carton"}
+    assert found["objects"]["carton"]["point_error_mm"] is not None
+
+
+def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
+    pristine, tmp_path, gsjax_track, still, monkeypatch
+):
+    """The can is lost in update 1 alone, as is the ball, whose turn is then known for one more update; from
+    update 3 on it is not. How the carton is turned is not known since it was lost, in update 2."""
+    ids: list[int] = []
+
+    def flagged(scene, first, frames, config, **how):
+        ids[:] = scene.label_ids[1:]
+        for t, update in enumerate(still(scene, first, frames, config), 1):
+            lost, known = np.zeros(len(ids), bool), np.ones(len(ids), bool)
+            lost[[ids.index(CAN), ids.index(BALL)]] = t == 1
+            lost[ids.index(CARTON)] = t == 2
+            known[ids.index(BALL)] = t == 2
+            known[ids.index(CARTON)] = t < 2
+            yield update._replace(info=update.info | {"lost": lost, "turn_known": known})
+
+    monkeypatch.setattr(gsjax.cli.track.loop, "track", flagged)
+    assert gsjax_track(pristine, "--cameras", "1")[0] == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [
+        "carton: lost in 1 frames, from 2 to 2.",
+        "carton: from frame 2 on it is not known how it is turned: it was lost then.",
+        "can: lost in 1 frames, from 1 to 1.",
+        "ball: lost in 1 frames, from 1 to 1.",
+        "ball: from frame 3 on it is not known how it is turned: other turns agree as well.",
+    ]
+    objects = found["objects"]
+    lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}
+    assert lost == {"carton": 1, "can": 1, "ball": 1}
+    unknown = {name: o["turn_unknown_from"] for name, o in objects.items() if o["turn_unknown_from"]}
+    assert unknown == {"carton": 2, "ball": 3}
+    with np.load(tmp_path / "run" / "trajectory.npz") as stored:
+        objects = stored["label_ids"][1:].tolist()
+        frames, of = np.nonzero(stored["lost"])
+        assert {(t, objects[k]) for t, k in zip(frames, of, strict=True)} == {
+            (1, CAN),
+            (1, BALL),
+            (2, CARTON),
+        }
+        frames, of = np.nonzero(~stored["turn_known"])
+        unknown = {(t, objects[k]) for t, k in zip(frames, of, strict=True)}
+        assert unknown == {(1, BALL), (3, BALL), (2, CARTON), (3, CARTON)}
+
+
+def test_finished_run_is_kept_unless_asked(pristine, tmp_path, gsjax_track, still):
+    options = ("--cameras", "1", "--frames", "0:1")
+    assert gsjax_track(pristine, *options)[0] == 0
+    code, said = gsjax_track(pristine, *options)
+    assert code == 2
+    assert "finished run" in said
+    assert gsjax_track(pristine, *options, "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "frames"),
+    [("0:60", range(60)), (":30", range(30)), ("0:9:2", range(0, 9, 2)), ("7:8", [7]), (":", range(100))],
+)
+def test_frames_are_slices(text, frames):
+    assert list(range(100))[parse_frames(text)] == list(frames)
+
+
+@pytest.mark.parametrize("text", ["", "7", "a:b", "1:2:3:4", "0:10:-1", "0:10:0"])
+def test_other_words_are_no_frames(text):
+    with pytest.raises(ValueError, match="--frames"):
+        parse_frames(text)

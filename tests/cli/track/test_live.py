@@ -1,0 +1,122 @@
+"""`gsjax live` around a tracker that stands still: what is counted, written and said."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsjax.cli.track.live
+import gsjax.data.stream
+from gsjax.cli import main
+from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+
+
+def standing_still(scene, first, frames, config, *, budget_ms):
+    """`track` for objects that never move."""
+    groups = scene.num_objects
+    info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
+    info["lost"] = jnp.arange(groups) == groups - 1
+    info["turn_known"] = jnp.arange(groups) > 0
+    for count, _ in enumerate(frames):
+        now = info | {"skipped": count == 2}
+        yield Tracked(scene, first_pose(scene), None, now, 0.001, 0.0, None, 2)
+
+
+def unfitted(frame, mask, camera, config):
+    """`start_scene` without the optimisation."""
+    return start_scene(frame, mask, camera, replace(config, start=replace(config.start, iterations=0)))
+
+
+@pytest.fixture
+def live(tmp_path, capfd, monkeypatch):
+    """Runs `gsjax live` in this process; returns the exit code, what was said, and the run's folder."""
+    monkeypatch.setattr(gsjax.cli.track.live, "track", standing_still)
+    monkeypatch.setattr(gsjax.cli.track.live, "start_scene", unfitted)
+
+    def call(source, *options: str):
+        code = main(["live", str(source), "--out", str(tmp_path / "run"), *options])
+        out, err = capfd.readouterr()
+        assert "Traceback" not in out + err
+        return code, out + err, tmp_path / "run"
+
+    return call
+
+
+def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live):
+    code, said, folder = live(pristine, "--seconds", "0.5", "--hz", "20", "--cameras", "0", "1")
+    assert code == 0, said
+    found = json.loads((folder / "metrics.json").read_text())
+    frames = found["frames"]
+    assert frames["offered"] == 10
+    assert frames["used"] + frames["dropped"] == 10
+    assert found["complete"]
+    assert found["skipped"] == 1
+    assert "1 updates came to nothing finite" in said
+    assert found["latency_ms"]["median"] > 0
+    assert found["memory_mb"]["max"] > 10
+    assert "10 offered" in said
+    *followed, last = found["objects"].values()  # the last group is said to be lost in every frame
+    assert found["frames_lost"] == {**dict.fromkeys(followed, 0), last: frames["used"]}
+    assert f"{last} in {frames['used']} updates" in said
+    with np.load(folder / "trajectory.npz") as stored:
+        assert len(stored["times"]) == len(stored["centers"]) == frames["used"]
+        np.testing.assert_allclose(stored["quats"], np.broadcast_to([1, 0, 0, 0], stored["quats"].shape))
+        assert stored["lost"][:, -1].all()
+        assert not stored["lost"][:, :-1].any()
+        assert not stored["turn_known"][:, 0].any()
+        assert stored["turn_known"][:, 1:].all()
+    code, said, _ = live(pristine, "--seconds", "0.5", "--cameras", "0", "1")
+    assert code == 2
+    assert "holds a finished run" in said
+
+
+def test_a_group_goes_where_it_is_carried_whatever_joins_it():
+    """Its own middle shifts with what joins: by 2 cm here, while it turns by 90 degrees and moves by 1 m."""
+    log = gsjax.cli.track.live.Log((0, 5), {})
+    still, turn = np.zeros((1, 6)), np.array([[1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]])
+    start, joined, moved = (np.array([[x, 0.0, 0.0]]) for x in (0.1, 0.12, 1.12))
+    places = [
+        log._carried(still, start),
+        log._carried(still, joined),
+        log._carried(turn, moved),
+    ]
+    np.testing.assert_allclose(places[0][0, :3], [0.1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(places[1], places[0], atol=1e-6)
+    np.testing.assert_allclose(
+        places[2][0, :3], [1.12, -0.02, 0], atol=1e-6
+    )  # 2 cm behind its middle, turned
+    np.testing.assert_allclose(places[2][0, 3:], np.sqrt([0.5, 0, 0, 0.5]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "says"),
+    [
+        ("camera:x", (), "expected camera:NUMBER"),
+        ("camera:97", (), "replay a folder"),
+        ("camera:0", ("--cameras", "1"), "--cameras: is of recordings"),
+        (None, ("--hz", "0"), "--hz: expected more than 0"),
+        (None, ("--cameras", "9"), "has no camera 9"),
+    ],
+)
+def test_what_cannot_be_followed_is_said(pristine, live, source, options, says):
+    code, said, _ = live(pristine if source is None else source, *options)
+    assert code == 2
+    assert says in " ".join(said.split())
+
+
+def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatch):
+    def failing(frames, hz, seconds):
+        yield from gsjax.data.stream.replay(frames, hz, 0.2)
+        raise OSError("the camera was unplugged")
+
+    monkeypatch.setattr(gsjax.cli.track.live, "replay", failing)
+    code, said, folder = live(pristine, "--cameras", "0", "--hz", "20")
+    assert code == 2
+    assert "unplugged" in said
+    found = json.loads((folder / "metrics.json").read_text())
+    assert not found["complete"]
+    assert "unplugged" in found["stopped"]
+    assert (folder / "trajectory.npz").exists()

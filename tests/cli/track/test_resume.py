@@ -1,0 +1,106 @@
+"""A run that was stopped goes on where it was, and ends as if it had not been stopped."""
+
+import errno
+import json
+import warnings
+from unittest.mock import Mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsjax.cli.track.loop
+import gsjax.cli.track.resume
+import gsjax.methods.object_tracker
+from gsjax.cli.track.loop import Tracking
+from gsjax.methods.object_tracker import Pose, Tracked, track
+
+OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--tracker.start.iterations", "5")
+
+
+def interrupted(after: int):
+    """`track` that is stopped by Ctrl-C after some updates."""
+
+    def call(*arguments, **options):
+        for count, update in enumerate(track(*arguments, **options), start=1):
+            yield update
+            if count == after:
+                raise KeyboardInterrupt
+
+    return call
+
+
+@pytest.mark.slow
+def test_a_stopped_run_goes_on_and_ends_alike_to_the_bit(pristine, gsjax_track, tmp_path, monkeypatch):
+    assert gsjax_track(pristine, *OPTIONS)[0] == 0
+    whole = np.load(tmp_path / "run" / "trajectory.npz")
+    (tmp_path / "run").rename(tmp_path / "whole")
+
+    monkeypatch.setattr(gsjax.cli.track.loop, "track", interrupted(1))
+    assert gsjax_track(pristine, *OPTIONS)[0] == 130
+    assert (tmp_path / "run" / "resume" / "state.npz").exists()
+    monkeypatch.setattr(gsjax.cli.track.loop, "track", track)
+    code, said = gsjax_track(pristine, *OPTIONS, "--resume")
+    assert code == 0, said
+    resumed = np.load(tmp_path / "run" / "trajectory.npz")
+    for name in ("means", "quats", "labels", "times"):
+        np.testing.assert_array_equal(resumed[name], whole[name], err_msg=name)
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["complete"]
+    assert any("Resumed after 2 frames" in note for note in found["notes"])
+    assert not (tmp_path / "run" / "resume").exists()
+
+
+def test_there_must_be_something_to_resume(pristine, gsjax_track, still):
+    code, said = gsjax_track(pristine, "--cameras", "0", "--mask-camera", "0", "--resume")
+    assert code == 2
+    assert "expected a run to resume, found none" in said
+
+
+def test_other_options_are_no_resuming(pristine, gsjax_track, still, tmp_path):
+    assert gsjax_track(pristine, "--cameras", "0", "--frames", "0:2")[0] == 0
+    (tmp_path / "run" / "report.html").unlink()
+    code, said = gsjax_track(pristine, "--cameras", "0", "--frames", "0:3", "--resume")
+    assert code == 2
+    assert "was begun with frames '0:2', now it is '0:3'" in " ".join(said.split())
+    code, said = gsjax_track(pristine, "--cameras", "0", "--frames", "0:2", "--resume")
+    assert code == 2
+    assert "was stopped before its state was saved" in " ".join(said.split())
+
+
+def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, monkeypatch):
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(gsjax.cli.track.resume, "EVERY_S", -1.0)
+    monkeypatch.setattr(gsjax.cli.track.resume, "write_npz", full)
+    code, said = gsjax_track(pristine, "--cameras", "0")
+    assert code == 0, said
+    assert "could not save what --resume needs" in said
+    assert "no space left on device" in said.lower()
+
+
+def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatch):
+    """The poses fit on the disk, the larger state does not; or a run is killed between the two."""
+
+    def tracked_up_to(frames: int):
+        rows = [Pose(jnp.full((3, 3), float(t)), jnp.full((3, 4), float(t))) for t in range(frames)]
+        notes = {"joined": 0, "update_s": [], "skipped": 0, "visible": [], "lost": [], "turn_known": []}
+        return Mock(spec=Tracking, poses=rows, num_frames=frames, scene=None, everywhere=[], **notes)
+
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    update = Mock(spec=Tracked, scene=None, pose=None, state=None, chosen=None)
+    monkeypatch.setattr(gsjax.cli.track.resume, "_shapes", lambda scene: {})
+    monkeypatch.setattr(gsjax.cli.track.resume, "_chosen_metadata", lambda chosen: None)
+    saver, written = gsjax.cli.track.resume.Saver(tmp_path), []
+    for frames, save in ((10, written.append), (20, full), (30, written.append)):
+        monkeypatch.setattr(gsjax.cli.track.resume, "save_checkpoint", lambda path, *_, save=save: save(path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            saver(tracked_up_to(frames), update, True)
+    assert len(written) == 2
+    saved = gsjax.cli.track.resume._saved_poses(tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0]))
+    assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))
