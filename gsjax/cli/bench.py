@@ -8,11 +8,13 @@ from typing import Annotated
 
 import tyro
 
+from gsjax.cli.options import Common
+
 SUITE = Path("benchmarks", "suite.py")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax bench` is told."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ()
@@ -28,8 +30,6 @@ class Options:
     out: Path | None = None
     """Folder for bench.json, results.md and growth.png. benchmarks/results for the whole suite, which is
     committed, and runs/bench for a part of it."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import Common, Overwriting
 from gsjax.data import Photographs, open_photographs, read_colmap
 from gsjax.data.alignment import align_cameras
 from gsjax.data.stills import write_stills
@@ -33,21 +34,17 @@ REPORT = "poses.json"
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common, Overwriting):
     """What `gsjax poses` is told."""
 
     images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
     """Folder of photographs, or a video."""
     out: Path
     """Folder for the dataset: images/ and COLMAP's sparse/0/."""
-    frames: int = 100
-    """Of a video, so many frames: the sharpest of as many equal stretches."""
+    stills: int = 100
+    """Of a video, so many pictures: the sharpest of as many equal stretches."""
     compare: str | None = None
     """A dataset that has poses of the same photographs, by name, to say how far from them these are."""
-    overwrite: bool = False
-    """Replace what an earlier `gsjax poses` wrote there."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
     place: Annotated[MotionConfig, tyro.conf.arg(name="")] = field(default_factory=MotionConfig)
     """How photographs are placed."""
 
@@ -77,7 +74,7 @@ def run(options: Options) -> int:
             if of_video:
                 folder = work / "images"
                 with stage(console, f"choosing frames of {options.images}"):
-                    names = write_stills(options.images, folder, options.frames)
+                    names = write_stills(options.images, folder, options.stills)
             placed = place_photographs(
                 folder,
                 names,

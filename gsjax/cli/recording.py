@@ -103,17 +103,10 @@ def open_recording(
 
 
 def _scaled(sequence: Sequence, scale: float) -> Sequence:
-    expect_scale(scale)
     smaller = sequence.scaled(scale)
     sizes = (sequence.width, sequence.height), (smaller.width, smaller.height)
     expect_enough_left(scale, "pictures", *sizes)
     return smaller
-
-
-def expect_scale(scale: float) -> None:
-    """Raises ValueError where --scale makes nothing smaller."""
-    if not 0 < scale <= 1:
-        raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
 
 
 def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:

@@ -13,6 +13,7 @@ from rich.text import Text
 from gsjax.cli.compare.comparison import Aspect, Comparison, Group, compare
 from gsjax.cli.compare.pictures import shows_the_same, write_strip
 from gsjax.cli.messages import counted
+from gsjax.cli.options import Common
 from gsjax.cli.run.folder import expect_ours, fresh_folder, is_run
 from gsjax.cli.run.records import read_record
 from gsjax.cli.run.report import Media, Table, format_number, write_report
@@ -27,7 +28,7 @@ _LOG_WIDTH = 200
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax compare` is told."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN RUN [RUN ...]")]
@@ -35,8 +36,6 @@ class Options:
     out: Path | None = None
     """Folder for comparison.json and report.html, with curves and pictures; without, only the tables are
     printed. It must be new, empty, or hold an earlier comparison, which is replaced."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

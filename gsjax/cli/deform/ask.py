@@ -12,6 +12,7 @@ from rich.table import Table
 
 from gsjax.cli.deform.file import NAME, StoredDeformation, read_deformation, warn_of_partial
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import Common
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.surgical import (
     QUESTIONS,
@@ -30,7 +31,7 @@ HELP = (
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax ask` is told."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -39,8 +40,6 @@ class Options:
     """In plain English. Unless given, what can be asked is listed."""
     json: bool = False
     """Print JSON: the answer, its value and unit, and the facts that it rests on."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

@@ -1,8 +1,7 @@
 """`gsjax deform`: a scene that deforms, seen by one moving camera, and what is what in it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, make_dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
@@ -22,11 +21,22 @@ from gsjax.cli.deform.scores import judge
 from gsjax.cli.distill.teacher import Asked, Masks
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import (
+    OF_NO_BEARING,
+    Common,
+    DatasetAndOut,
+    HeldOutFrames,
+    Resuming,
+    Seeded,
+    Selection,
+    Timed,
+    preset_options,
+)
 from gsjax.cli.recording import located, open_recording
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.data import Photographs
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
+from gsjax.data.open import is_of_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_in_time
 from gsjax.io.ply import write_ply
 from gsjax.methods.surgical import (
@@ -46,28 +56,14 @@ _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal"
 _HARDLY = 0.95  # of the error of a scene that stands still
 NOBODY = "none"  # of features: there is no teacher
 _UNLIKE = 0.6  # an IoU
-_OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
     """What `gsjax deform` is told."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of a recording over time (EndoNeRF's layout, say), or a built-in scene: simulated:tissue."""
-    out: Path
-    """Folder for the run."""
-    method: Literal["surst", "clin"] = "surst"
-    """Whose recipe: SurstSplat's or GaussianClin's. What is said of --deform counts more."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Which frames, as Python slices them."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID")] = ()
-    """Id of the one camera to learn from. The first, unless given; the next one only judges."""
-    scale: float = 1.0
-    """Learn from pictures at this fraction of their size (width and height); time goes with the number of
-    pixels."""
-    test_every: int = 8
-    """Hold out frame i, to judge by, where i - 1 is a multiple of this; 0 holds out none."""
+    preset: Literal["surst", "clin"] = "surst"
+    """Whose recipe, unless given by --deform: SurstSplat's or GaussianClin's."""
     tools: Tools = "leave-out"
     """What masks call a tool, by the names of their values, or without names all but 0: leave out, or draw it
     too."""
@@ -90,26 +86,13 @@ class Options:
     """Folder of CLIP's weights, in the layout of Hugging Face."""
     level: Literal["default", "small", "medium", "large"] = "default"
     """Of LangSplat's files, which size of objects."""
-    resume: bool = False
-    """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    """What the layout of the data leaves open."""
     deform: SurgicalConfig = field(default_factory=lambda: PRESETS["surst"])
     """How it is learned."""
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options whose defaults are those of the method that is named."""
-    named = [word for before, word in pairwise(arguments) if before == "--method"]
-    named += [a.removeprefix("--method=") for a in arguments if a.startswith("--method=")]
-    if not named or named[-1] not in PRESETS:
-        return Options, arguments
-    learned = ("deform", SurgicalConfig, field(default=PRESETS[named[-1]]))
-    return make_dataclass("Options", [learned], bases=(Options,), frozen=True), arguments
+    """The options whose defaults are those of the recipe that is named."""
+    return preset_options(Options, arguments, "deform", PRESETS)
 
 
 def run(options: Options) -> int:
@@ -126,7 +109,7 @@ def run(options: Options) -> int:
         elsewhere = {} if asked is None else asked.located()
         settings = replace(options, dataset=located(options.dataset), **elsewhere)
         if options.resume:
-            folder.check_config(settings, but=_OF_NO_BEARING)
+            folder.check_config(settings, but=OF_NO_BEARING)
         deep = _recording(options, notes)
         told = (options.test_every, options.tools, asked, options.deform.channels)
         data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
@@ -146,11 +129,15 @@ def run(options: Options) -> int:
                 notes.warn(f"{folder.path / 'query'} is an answer of the scene as it was; ask again")
         folder.write_config(settings)  # from here on an earlier run is gone
         course = Course("reconstructing", config.warmup + config.iterations, ("psnr", *_LOSSES), _told)
-        learning = learn(reconstruct(problem, learning.state), learning, course, folder, console)
+        learning = learn(
+            reconstruct(problem, learning.state), learning, course, folder, console, options.minutes
+        )
         data, refined = as_refined(folder, problem, learning.state.scene, data, notes)
         write_scene(folder, learning.state, data, deep.metric)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
+        if learning.state.step < course.total and learning.stopped is None:
+            notes.add(f"Stopped by --minutes after {learning.state.step:,} of {course.total:,} steps.")
         if learning.skipped:
             notes.warn(f"{learning.skipped} steps met numbers that are not finite and changed nothing")
         tracks = judged["tracks"]
@@ -164,7 +151,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "deform",
             "dataset": data.sequence.name,
-            "method": options.method,
+            "preset": options.preset,
             "num_gaussians": learning.state.scene.gaussians.num,
             "frames": {"learned": len(data.train), "held_out": len(data.test)},
             "size": (data.sequence.width, data.sequence.height),
@@ -235,8 +222,6 @@ def _checked(options: Options) -> Asked | None:
     """Whose features are asked for, once all options fit; None: nobody's."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
-    if options.test_every < 0 or options.test_every == 1:
-        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
     asked = Asked(options.features, options.masks, options.sam, options.weights, options.level)
     option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
     if option is not None and asked.features not in ("closed", "clip"):

@@ -17,6 +17,7 @@ from gsjax.cli.distill.scene import FieldScene, SceneOptions, open_scene
 from gsjax.cli.distill.teacher import Asked, Masks, Second, Teaching
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed
 from gsjax.cli.recording import located
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
@@ -29,11 +30,10 @@ HELP = (
     f"were shown, in {cache_folder()}; delete that folder to have it said anew, or for its space."
 )
 _LOSSES = ("rec", "cos", "contrast", "tv")
-_OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is learned
 
 
-@dataclass(frozen=True)
-class Options(SceneOptions):
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, Timed, Seeded, SceneOptions):
     """What `gsjax distill` is told."""
 
     out: Path | None = None
@@ -56,12 +56,6 @@ class Options(SceneOptions):
     """Folder of CLIP's weights, in the layout of Hugging Face."""
     level: Literal["default", "small", "medium", "large"] = "default"
     """Of LangSplat's files, which size of objects."""
-    resume: bool = False
-    """Go on with the unfinished field in the same folder, given the same options, to the same bits."""
-    overwrite: bool = False
-    """Replace an earlier field in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """How it is learned."""
 
@@ -89,7 +83,7 @@ def run(options: Options) -> int:
         folder = RunFolder(_out(options, scene.file), overwrite=options.overwrite, resume=options.resume)
         settings = _settings(options, asked)
         if options.resume:
-            folder.check_config(settings, but=_OF_NO_BEARING)
+            folder.check_config(settings, but=OF_NO_BEARING)
         cache, photographs = FeatureCache(), scene.photographs
         teaching = Teaching(photographs, scene.taught, asked, cache, console)
         if asked.features == "auto":
@@ -111,7 +105,7 @@ def run(options: Options) -> int:
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
         course = Course("distilling", options.field.iterations, _LOSSES, _told)
-        learning = learn(distill(problem, learning.state), learning, course, folder, console)
+        learning = learn(distill(problem, learning.state), learning, course, folder, console, options.minutes)
         told = asdict(settings)
         stored = StoredField(
             learning.state.field,

@@ -1,7 +1,7 @@
 """The scene that a field is distilled for, and the photographs of it: those of a run, or of a PLY file that
 others made."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from gsjax.cli.options import HeldOutFrames, Selection
 from gsjax.cli.photographs import choose_photographs, photographs_of_run, smaller, split
-from gsjax.cli.recording import expect_scale
 from gsjax.cli.run.files import read_arrays, reopen
 from gsjax.cli.run.folder import expect_run
 from gsjax.cli.run.records import read_record
@@ -26,28 +26,20 @@ _OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  #
 
 
 @dataclass(frozen=True)
-class SceneOptions:
-    """Which scene, and which photographs of it."""
+class SceneAndImages:
+    """A scene that stands, and where its photographs are."""
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
     or a PLY file that anybody made, with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`. Of a run: where
-    they are now."""
-    scale: float = 1.0
-    """Learn from photographs at this fraction of their size (width and height), as in 0.5; time goes with the
-    number of pixels."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Of --images: which photographs, or which frame of a recording, as Python slices them."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Of --images, a recording: ids of the cameras to learn from. All that are not held out, unless given."""
-    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Of --images, a recording: ids of cameras that only judge."""
-    test_every: int = 8
-    """Of --images: hold out every N-th photograph where the data has no split; 0 holds out none."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    """Of --images: what the layout of the data leaves open."""
+    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`, of which --frames,
+    --cameras, --eval-cameras and --test-every choose. Of a run, which has chosen: where they are now."""
+
+
+@dataclass(frozen=True)
+class SceneOptions(HeldOutFrames, Selection, SceneAndImages):
+    """Which scene, and which photographs of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +73,10 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
     Raises:
         ValueError, OSError: they are not there, or options are given that a run has chosen itself.
     """
-    expect_scale(options.scale)
     path = options.scene
     if path.is_file():
         if options.images is None:
             raise ValueError(f"{path}: a PLY file has no photographs; --images names a folder of them")
-        if options.test_every < 0 or options.test_every == 1:
-            raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
         chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
         scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
     else:

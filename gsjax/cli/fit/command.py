@@ -2,16 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, make_dataclass, replace
-from difflib import get_close_matches
-from itertools import pairwise
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Annotated
+from typing import Literal
 
 import jax
 import numpy as np
-import tyro
 from jaxtyping import Float
 from rich.console import Console
 
@@ -24,10 +20,20 @@ from gsjax.cli.fit.tensorboard import TensorBoard
 from gsjax.cli.fit.worth import parts
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
+from gsjax.cli.options import (
+    OF_NO_BEARING,
+    Common,
+    DatasetAndOut,
+    HeldOutFrames,
+    Resuming,
+    Seeded,
+    Selection,
+    Timed,
+    preset_options,
+)
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
-from gsjax.cli.recording import expect_scale, located
+from gsjax.cli.recording import located
 from gsjax.cli.run.folder import RunFolder
-from gsjax.data.open import ReadOptions
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
 from gsjax.methods.reconstruction import (
@@ -42,37 +48,17 @@ from gsjax.methods.reconstruction import (
 )
 from gsjax.scene.gaussians import Gaussians, take
 
-_OF_NO_BEARING = ("resume", "overwrite", "debug", "out", "tensorboard", "save_every")  # on what is fitted
-
-HELP = (
-    " Settings have names, to be said before the dataset, as in `gsjax fit quick DATASET --out RUN`: quick "
-    "(a first look), classic (cloning and splitting, as in 3DGS), depth (for RGB-D), published (those of "
-    "3DGS-MCMC, for a GPU or a night). What else is given counts more."
-)
+HELP = " All frames of a recording are taken as photographs of one scene."
+_OF_NO_BEARING = (*OF_NO_BEARING, "tensorboard", "save_every")  # on what is fitted
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
     """What `gsjax fit` is told."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of photographs or of a recording, all of whose frames are taken as photographs of one scene."""
-    out: Path
-    """Folder for the run."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Which frames of a recording, or which photographs, as Python slices them: 4:5 is the fifth alone."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of the cameras of a recording to fit. All that are not held out, unless given."""
-    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of cameras of a recording that are held out, instead of every N-th photograph."""
-    scale: float = 1.0
-    """Fit photographs at this fraction of their size (width and height), as in 0.25; time goes with the
-    number of pixels."""
-    test_every: int = 8
-    """Hold out every N-th photograph, to judge by, where the data has no split; 0 holds out none."""
-    minutes: float | None = None
-    """Stop after so many minutes of steps, compiling included: how many there are follows from their pace.
-    The first fit on a machine compiles for about a minute; programs are kept for later ones."""
+    preset: Literal["default", "quick", "classic", "depth", "published"] = "default"
+    """How the scene is fitted unless given: quick (a first look), classic (cloning and splitting, as in
+    3DGS), depth (for RGB-D), published (those of 3DGS-MCMC, for a GPU or a night)."""
     until_psnr: float | None = None
     """Stop when held-out photographs are seen with so many dB."""
     judge_every: int = 500
@@ -81,34 +67,13 @@ class Options:
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
     """Write the curve for TensorBoard too, into RUN/tensorboard."""
-    resume: bool = False
-    """Go on with the unfinished run in the same folder, given the same options, to the same bits."""
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    """What the layout of the data leaves open."""
     fit: FitConfig = field(default_factory=FitConfig)
     """How the scene is fitted."""
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options where the first word is that of a preset: how the scene is fitted is then that preset's
-    unless given."""
-    if not arguments or arguments[0] not in PRESETS:
-        if len(arguments) > 1 and not arguments[0].startswith("-") and not arguments[1].startswith("-"):
-            meant = get_close_matches(arguments[0], PRESETS, 1)
-            raise ValueError(
-                f"expected a dataset, or a preset and a dataset, found {arguments[0]!r} and {arguments[1]!r}"
-                f"; presets are {', '.join(PRESETS)}" + (f": did you mean {meant[0]}?" if meant else "")
-            )
-        for before, word in pairwise(arguments):
-            if word in PRESETS and not before.startswith("-"):
-                raise ValueError(f"presets are said first: gsjax fit {word} DATASET --out RUN")
-        return Options, arguments
-    fitted = ("fit", FitConfig, field(default=PRESETS[arguments[0]]))
-    return make_dataclass("Options", [fitted], bases=(Options,), frozen=True), arguments[1:]
+    """The options whose defaults are those of the preset that is named."""
+    return preset_options(Options, arguments, "fit", PRESETS)
 
 
 def run(options: Options) -> int:
@@ -222,13 +187,10 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    for name in ("minutes", "until_psnr", "judge_every", "save_every"):
+    for name in ("until_psnr", "judge_every", "save_every"):
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
-    expect_scale(options.scale)
-    if options.test_every < 0 or options.test_every == 1:
-        raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {options.test_every}")
 
 
 class Aside:

@@ -17,6 +17,7 @@ from gsjax.cli.fit.results import Seen, look, mean_scores, write_panel
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import Common
 from gsjax.cli.photographs import photographs_of_run, read_views, split
 from gsjax.cli.run.folder import replaced_folder
 from gsjax.cli.run.records import EVALUATION, Record, digest, read_record
@@ -50,7 +51,7 @@ _PER_PHOTOGRAPH = {"exposure": "an exposure", "refine_poses": "a pose"}
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax eval` is told."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -61,8 +62,6 @@ class Options:
     """Where the photographs are now; where they were for the fit, unless given."""
     lpips_weights: Path | None = None
     """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without, there is no LPIPS."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 class Chosen(NamedTuple):

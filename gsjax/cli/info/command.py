@@ -1,7 +1,7 @@
 """`gsjax info`: what is understood of a recording or of photographs, before anything is made of them."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +12,9 @@ from rich.table import Table
 
 from gsjax.cli.info.picture import by_camera, by_split, write_picture
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import Common, Reading
 from gsjax.cli.run.folder import expect_dataset
-from gsjax.data import Photographs, ReadOptions, Sequence, open_photographs, open_sequence, photographs_of
+from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.open import is_of_photographs, is_recording
 from gsjax.methods.reconstruction import extent_of
 
@@ -22,17 +23,13 @@ MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common, Reading):
     """What `gsjax info` is told."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    """What the layout of the data leaves open."""
     picture: Path | None = None
     """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

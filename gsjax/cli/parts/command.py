@@ -3,23 +3,31 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jaxtyping import Bool, Int
 from rich.console import Console
 
 from gsjax.cli.fit import command as fit_command
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import (
+    OF_NO_BEARING,
+    Common,
+    DatasetAndOut,
+    HeldOut,
+    Resuming,
+    Seeded,
+    Selection,
+)
 from gsjax.cli.parts.loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts.results import finished, print_results, write_results
 from gsjax.cli.parts.resume import Saver, load
 from gsjax.cli.recording import Recording, located, open_recording, parse_frames
 from gsjax.cli.run.folder import RunFolder, expect_dataset, expect_run, is_run
-from gsjax.data import ReadOptions, Sequence
+from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
 from gsjax.methods.motion_parts import (
     Anchor,
@@ -41,26 +49,12 @@ from gsjax.scene.gaussians import Gaussians
 FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000))
 """How the canonical scene is fitted unless told."""
 _EVERYTHING = 0.6  # share of pixels that change
-_OF_NO_BEARING = ("resume", "overwrite", "debug", "out")  # on what is found
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, Seeded, HeldOut, Selection, DatasetAndOut):
     """What `gsjax parts` is told."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of a recording by synchronised cameras, or a built-in scene such as simulated:articulated."""
-    out: Path
-    """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of the cameras to look through. All that are not held out, unless given."""
-    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of cameras that are held out: only judged, in the end."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
-    scale: float = 1.0
-    """Look at pictures at this fraction of their size (width and height), as in 0.5; all of them, the
-    held-out ones too."""
     anchor: int | None = None
     """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
     masks: Literal["segment", "files"] = "segment"
@@ -72,14 +66,6 @@ class Options:
     scene: Path | None = None
     """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Fitted unless
     given, into RUN/canonical."""
-    resume: bool = False
-    """Go on with the unfinished run in the same folder, given the same options."""
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
-    read: ReadOptions = field(default_factory=ReadOptions)
-    """What the layout of the data leaves open."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
@@ -108,7 +94,7 @@ def run(options: Options) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
-            folder.check_config(settings, but=_OF_NO_BEARING)
+            folder.check_config(settings, but=OF_NO_BEARING)
         given = None if options.scene is None else _read_scene(options.scene)
         seconds: dict[str, float] = {}
         tracked = recording.tracked

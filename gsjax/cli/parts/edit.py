@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes, stage
+from gsjax.cli.options import Common, Overwriting
 from gsjax.cli.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
 from gsjax.cli.parts.saved import open_parts_run
 from gsjax.methods.motion_parts.operations import OPERATIONS
@@ -23,7 +24,7 @@ _UNNAMED = "ops"
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common, Overwriting):
     """What `gsjax edit` is told."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -39,10 +40,6 @@ class Options:
     """Id of the camera to film from. The one to which the edits change most, unless given."""
     ply: bool = False
     """Write the Gaussians of each frame of the film too, as ply/000000.ply and so on."""
-    overwrite: bool = False
-    """Replace an earlier film in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

@@ -16,10 +16,11 @@ from gsjax.cli.deform.query import DeformQuestion, answer_deformation
 from gsjax.cli.distill.query import Question, answer
 from gsjax.cli.distill.saved import Whereabouts, field_of, open_field_run, unfinished_field_of
 from gsjax.cli.messages import USER_ERRORS, Notes, describe, stage
+from gsjax.cli.options import Common
 from gsjax.cli.query.selected import Changes
 from gsjax.cli.run.folder import expect_folder, is_run
 from gsjax.cli.run.records import read_config, read_record
-from gsjax.cli.track.query import Asked, ask_for_object
+from gsjax.cli.track.query import ObjectQuery, ask_for_object
 
 HELP = (
     ' Of a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; of whatever has '
@@ -87,7 +88,7 @@ class TrackOptions:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax query` is told."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -101,8 +102,6 @@ class Options:
     one, else the first; of a field all, unless given."""
     weights: Path | None = None
     """Folder of CLIP's weights, in the layout of Hugging Face; of what CLIP taught, where they are now."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
     gaussians: Annotated[GaussianOptions, tyro.conf.OmitArgPrefixes] = GaussianOptions()
     """Of a field, or a run of `gsjax deform`."""
     field: Annotated[FieldOptions, tyro.conf.OmitArgPrefixes] = FieldOptions()
@@ -310,7 +309,7 @@ def _spaced(numbers: tuple[float, ...]) -> str:
     return " ".join(f"{number:g}" for number in numbers)
 
 
-def _asked(options: Options) -> Asked:
+def _asked(options: Options) -> ObjectQuery:
     """What is asked of a tracked run, checked.
 
     Raises:
@@ -331,6 +330,6 @@ def _asked(options: Options) -> Asked:
             raise ValueError(f"--camera: expected the id of a camera, a number, found {options.camera!r}")
         camera = int(options.camera)
     told = options.track
-    return Asked(
+    return ObjectQuery(
         options.run, options.text, camera, told.encoder, options.weights, told.min_score, options.debug
     )

@@ -75,6 +75,10 @@ class Learning:
     skipped: int = 0
     stopped: BaseException | None = None
 
+    def is_over(self, minutes: float | None) -> bool:
+        """Whether so many minutes are used up."""
+        return minutes is not None and self.seconds + self.compile_seconds >= 60 * minutes
+
     def metadata(self) -> dict[str, Any]:
         """What is saved beside the state."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
@@ -141,9 +145,14 @@ def load(folder: Path, first: Learning, form_at: Callable[[Any, int], Any] | Non
 
 
 def learn(
-    steps: Iterator[Made], learning: Learning, course: Course, folder: RunFolder, console: Console
+    steps: Iterator[Made],
+    learning: Learning,
+    course: Course,
+    folder: RunFolder,
+    console: Console,
+    minutes: float | None = None,
 ) -> Learning:
-    """Go on until all steps are made, Ctrl-C or an error.
+    """Go on until all steps are made, the time is up, Ctrl-C or an error.
 
     Args:
         steps: those that go on from the state of `learning`.
@@ -151,6 +160,7 @@ def learn(
         course: what is to be learned.
         folder: of the run.
         console: that shows it.
+        minutes: of steps, compiling included, after which it is enough.
     """
     save, total = Saver(folder.resume / _STATE, course.doing), course.total
     columns = (TextColumn(course.doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
@@ -161,9 +171,9 @@ def learn(
     with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=total, completed=learning.state.step)
         try:
-            while undisturbed(_made_one_more, steps, learning):
+            while not learning.is_over(minutes) and undisturbed(_made_one_more, steps, learning):
                 step = learning.state.step
-                if step % _LOGGED_EVERY == 0 or step == total:
+                if step % _LOGGED_EVERY == 0 or step == total or learning.is_over(minutes):
                     undisturbed(_add_row, learning, course, folder)
                 if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
                     bar.update(task, completed=step, description=course.told(learning.rows[-1]))

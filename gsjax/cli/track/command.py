@@ -1,9 +1,7 @@
 """`gsjax track`: from a recording to a run folder."""
 
 import dataclasses
-import itertools
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
@@ -13,6 +11,16 @@ from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import FITTING, Notes, reason, say_error, stage
+from gsjax.cli.options import (
+    OF_NO_BEARING,
+    Common,
+    DatasetAndOut,
+    HeldOut,
+    Resuming,
+    Selection,
+    checked,
+    preset_options,
+)
 from gsjax.cli.recording import (
     FirstMask,
     Recording,
@@ -43,36 +51,17 @@ from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, s
 from gsjax.scene.frame import Frame
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, HeldOut, Selection, DatasetAndOut):
     """What `gsjax track` is told."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of a recording, or a built-in scene such as simulated:tabletop."""
-    out: Path
-    """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of the cameras to track with. All that are not held out, unless given."""
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
-    eval_cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of cameras that are held out: only judged, after tracking."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Which frames, as Python slices them: 0:60, 0:60:2, :30."""
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     budget_ms: float | None = None
     """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given, only
     how the scene starts and how much may join it count."""
-    cores: int | None = None
-    """How many of the processor's cores to use, for everything; updates are steadiest on 1. All unless given.
-    They are the last ones: for two programs at once, taskset each to its own."""
-    resume: bool = False
-    """Go on with the unfinished run in the same folder, given the same options."""
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
     """The tracker's settings unless given: for small errors, between, for 30 Hz, or as in the paper."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
@@ -82,14 +71,10 @@ class Options:
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
     """The options where a preset is named: the tracker's are those of the preset unless given. A budget names
     `fast`, for a scene of fewer Gaussians to start from."""
-    named = [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
-    named += [after for a, after in itertools.pairwise(arguments) if a == "--preset"]
-    if not named and any(a.split("=")[0].replace("_", "-") == "--budget-ms" for a in arguments):
-        named = ["fast"]
-    if not named or named[-1] not in PRESETS:
-        return Options, arguments
-    tracker = ("tracker", TrackerConfig, field(default=PRESETS[named[-1]]))
-    return dataclasses.make_dataclass("Options", [tracker], bases=(Options,), frozen=True), arguments
+    flags = [argument.split("=")[0].replace("_", "-") for argument in arguments]
+    if "--budget-ms" in flags and "--preset" not in flags:
+        return preset_options(Options, [*arguments, "--preset", "fast"], "tracker", PRESETS)
+    return preset_options(Options, arguments, "tracker", PRESETS)
 
 
 def run(options: Options) -> int:
@@ -98,18 +83,26 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything tracked before that is on disk.
     """
+    options = checked(options)
     if options.budget_ms is not None and not options.budget_ms > 0:
         raise ValueError(f"--budget-ms: expected more than 0, found {options.budget_ms}")
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        recording = open_recording(options.dataset, options.cameras, options.eval_cameras, options.frames)
+        recording = open_recording(
+            options.dataset,
+            options.cameras,
+            options.eval_cameras,
+            options.frames,
+            options.read,
+            options.scale,
+        )
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = dataclasses.replace(
             options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids
         )
         if options.resume:
-            folder.check_config(settings, but=("resume", "overwrite", "debug", "out", "cores"))
+            folder.check_config(settings, but=OF_NO_BEARING)
         folder.write_config(settings)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         draw_ahead(recording, console)

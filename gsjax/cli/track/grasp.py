@@ -16,10 +16,11 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import Seeded
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.folder import replaced_folder
 from gsjax.cli.track.outputs import frame_rate, write_png
-from gsjax.cli.track.query import Answer, Asked, ask, progress, show
+from gsjax.cli.track.query import Answer, ObjectQuery, ask, progress, show
 from gsjax.cli.track.saved import SavedRun
 from gsjax.cli.track.views import views
 from gsjax.geometry.cameras import project
@@ -37,7 +38,7 @@ _FEASIBLE, _IN_THE_WAY = (84, 222, 130), (235, 110, 90)
 
 
 @dataclass(frozen=True)
-class Options(Asked):
+class Options(Seeded, ObjectQuery):
     """What `gsjax grasp` is told."""
 
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ("robot",)
@@ -47,9 +48,7 @@ class Options(Asked):
     max_angle: float = 0.5
     """How far it may be off that direction, radians."""
     samples: int = 512
-    """Grasps tried in each frame."""
-    seed: int = 0
-    """Which grasps are tried. They ride with the object, so those of one frame are those of the next."""
+    """Grasps tried in each frame. They ride with the object, so those of one frame are those of the next."""
     gripper: Gripper = field(default_factory=Gripper)
     """The gripper, in metres; a Franka Panda's hand unless told."""
 
@@ -137,7 +136,7 @@ def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Cons
         ),
         compiler_options=host_options(),
     )
-    key = jax.random.key(options.seed)
+    key = jax.random.key(options.seed or 0)
     there, others = np.ones(points.shape[1], bool), np.ones(obstacles.shape[1], bool)
     frames = track(range(len(means)), "grasping", console=console, transient=True)
     found = [jax.device_get(best(key, points[t], normals[t], there, obstacles[t], others)) for t in frames]

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import resident_mb
 from gsjax.cli.messages import FITTING, MEASURING, Notes, reason, stage
+from gsjax.cli.options import Common, Overwriting, Selection, checked
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.track.scoring import budget_metrics
@@ -32,36 +33,31 @@ CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the b
 
 
 @dataclass(frozen=True)
-class Options:
-    """What `gsjax live` is told."""
+class SourceAndOut:
+    """What is followed, and where that is kept."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
     out: Path
     """Folder for the run: a new one, or that of an earlier run with --overwrite."""
-    seconds: float = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Overwriting, Selection, SourceAndOut):
+    """What `gsjax live` is told."""
+
+    minutes: float = 1.0
     """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
     hz: float = 30.0
     """Frames a second: of the replay, and what the budget comes from."""
     budget_ms: float | None = None
     """What an update may take; the time between two frames unless given."""
-    cameras: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")] = ()
-    """Ids of the recording's cameras to track with. All unless given."""
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the camera whose first mask names the objects. The first that has masks, unless given."""
-    frames: Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")] = ":"
-    """Which frames of the recording are replayed."""
     masks: Literal["auto", "files", "segment"] = "auto"
     """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
-    cores: int | None = None
-    """How many of the processor's cores to use, for everything; updates are steadiest on 1. All unless given.
-    They are the last ones: for two programs at once, taskset each to its own."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 class Source(NamedTuple):
@@ -86,6 +82,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; what was followed before that is on disk.
     """
+    options = checked(options)
     _check(options)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
@@ -114,13 +111,13 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    for name in ("seconds", "hz", "patience", "budget_ms"):
+    for name in ("minutes", "hz", "patience", "budget_ms"):
         found = getattr(options, name)
         if found is not None and not found > 0:
             raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {found}")
     if options.source.startswith(CAMERA_PREFIX):
-        for name in ("cameras", "mask_camera", "frames", "masks"):
-            if getattr(options, name) != getattr(Options, name):
+        for name in ("cameras", "mask_camera", "frames", "masks", "scale", "read"):
+            if getattr(options, name) != getattr(Options(options.source, options.out), name):
                 option = name.replace("_", "-")
                 raise ValueError(
                     f"--{option}: is of recordings, and {options.source} is a camera; leave it out"
@@ -143,7 +140,9 @@ def _open(options: Options, console: Console) -> Source:
         with stage(console, FITTING):
             scene = start_scene(first, mask.astype(np.int32), 0, CONFIG)
         return Source(first, scene, {}, stream)
-    recording = open_recording(options.source, options.cameras, (), options.frames)
+    recording = open_recording(
+        options.source, options.cameras, (), options.frames, options.read, options.scale
+    )
     mask = first_mask(recording.tracked, options.mask_camera, options.masks)
     if mask.labels is None:
         raise ValueError(
@@ -154,7 +153,7 @@ def _open(options: Options, console: Console) -> Source:
     with stage(console, FITTING):
         scene = start_scene(frames[0], mask.labels, recording.tracked.camera_ids.index(mask.camera), CONFIG)
     names = label_names(recording, mask.source)
-    return Source(frames[0], scene, names, replay(frames, options.hz, options.seconds))
+    return Source(frames[0], scene, names, replay(frames, options.hz, 60 * options.minutes))
 
 
 class Log:
@@ -281,7 +280,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         for arrival in newest:
             arrived[:] = [arrival]
             yield arrival.snapshot.frame
-            if perf_counter() - begun > options.seconds:
+            if perf_counter() - begun > 60 * options.minutes:
                 return
 
     try:

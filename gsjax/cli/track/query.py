@@ -15,6 +15,7 @@ from rich.progress import track
 from rich.table import Table
 
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import Common
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
 from gsjax.cli.track.outputs import frame_rate, write_png
 from gsjax.cli.track.saved import SavedRun, open_run
@@ -31,7 +32,7 @@ _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 
 @dataclass(frozen=True)
-class Asked:
+class ObjectQuery(Common):
     """What is asked of a run, and how it is understood."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -46,8 +47,6 @@ class Asked:
     """Folder of CLIP's weights, in the layout of Hugging Face."""
     min_score: float | None = None
     """Cosine below which the text means none of the objects. The encoder's own unless given."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 class Answer(NamedTuple):
@@ -70,7 +69,7 @@ class Answer(NamedTuple):
     rows: Int[np.ndarray, "n"]
 
 
-def ask_for_object(options: Asked, console: Console) -> None:
+def ask_for_object(options: ObjectQuery, console: Console) -> None:
     """Answer, and write query/ into the run folder.
 
     Raises:
@@ -112,7 +111,7 @@ def ask_for_object(options: Asked, console: Console) -> None:
     print(f"query   {folder}")
 
 
-def ask(options: Asked, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
+def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
     """Open the run and find the object; prints the scores of all.
 
     Raises:
@@ -166,7 +165,7 @@ def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) ->
         yield frame[0]
 
 
-def _check_encoder(options: Asked) -> None:
+def _check_encoder(options: ObjectQuery) -> None:
     if options.encoder == "clip" and options.weights is None:
         raise ValueError(
             "--encoder clip: expected --weights PATH as well, a folder of CLIP's weights, found none"
@@ -175,7 +174,7 @@ def _check_encoder(options: Asked) -> None:
         raise ValueError("--weights: the closed vocabulary has none; they are for --encoder clip")
 
 
-def _encoder(options: Asked, saved: SavedRun) -> LanguageEncoder:
+def _encoder(options: ObjectQuery, saved: SavedRun) -> LanguageEncoder:
     if options.encoder == "closed":
         return ClosedVocabulary(saved.names)
     from gsjax.perception.clip import load_clip

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from gsjax.cli.distill.saved import Whereabouts
 from gsjax.cli.messages import Notes, say_error, stage
+from gsjax.cli.options import Common
 from gsjax.cli.track.outputs import write_png
 from gsjax.cli.view.viewables import open_viewable
 from gsjax.io.atomic import write_new
@@ -25,7 +26,7 @@ _NUMBERED = re.compile(r"(\d+)_")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Common):
     """What `gsjax view` is told."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE.ply")]
@@ -46,8 +47,6 @@ class Options:
     """Of a field or a fit: where the photographs are now."""
     weights: Path | None = None
     """Of what CLIP taught: the folder of its weights, where it is now."""
-    debug: bool = False
-    """Show Python's traceback when something fails."""
 
 
 def run(options: Options) -> int:

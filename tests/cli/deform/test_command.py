@@ -97,7 +97,7 @@ def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
 def test_a_recipe_by_its_name(gsjax, tmp_path):
     """GaussianClin's turns are differences of quaternions; with tools left out there is one class."""
     run = tmp_path / "run"
-    code, said = gsjax("deform", SCENE, "--method", "clin", "--out", run, "--scale", 0.5, *SMALL)
+    code, said = gsjax("deform", SCENE, "--preset", "clin", "--out", run, "--scale", 0.5, *SMALL)
     assert code == 0, said
     assert read_deformation(run / "deformation.npz").scene.field.config.rotation == "add"
     assert metrics(run)["names"] == []

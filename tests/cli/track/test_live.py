@@ -46,18 +46,18 @@ def live(tmp_path, capfd, monkeypatch):
 
 
 def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live):
-    code, said, folder = live(pristine, "--seconds", "0.5", "--hz", "20", "--cameras", "0", "1")
+    code, said, folder = live(pristine, "--minutes", "0.01", "--hz", "20", "--cameras", "0", "1")
     assert code == 0, said
     found = json.loads((folder / "metrics.json").read_text())
     frames = found["frames"]
-    assert frames["offered"] == 10
-    assert frames["used"] + frames["dropped"] == 10
+    assert frames["offered"] == 12
+    assert frames["used"] + frames["dropped"] == 12
     assert found["complete"]
     assert found["skipped"] == 1
     assert "1 updates came to nothing finite" in said
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
-    assert "10 offered" in said
+    assert "12 offered" in said
     *followed, last = found["objects"].values()  # the last group is said to be lost in every frame
     assert found["frames_lost"] == {**dict.fromkeys(followed, 0), last: frames["used"]}
     assert f"{last} in {frames['used']} updates" in said
@@ -68,7 +68,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
         assert not stored["lost"][:, :-1].any()
         assert not stored["turn_known"][:, 0].any()
         assert stored["turn_known"][:, 1:].all()
-    code, said, _ = live(pristine, "--seconds", "0.5", "--cameras", "0", "1")
+    code, said, _ = live(pristine, "--minutes", "0.01", "--cameras", "0", "1")
     assert code == 2
     assert "holds a finished run" in said
 

@@ -1,0 +1,84 @@
+"""What commands share: an option of one name means the same thing wherever it stands."""
+
+import dataclasses
+import inspect
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import get_args, get_origin
+
+import pytest
+
+from gsjax.cli import COMMANDS
+from gsjax.cli.options import Common, HeldOutFrames, Seeded, Selection, Timed, checked, preset_options
+
+SHARED = ("frames", "cameras", "eval_cameras", "test_every", "scale", "seed", "minutes", "read")
+SHARED += ("resume", "overwrite", "cores", "debug")
+OWN = {
+    ("query", "frames"),  # those of which pictures are made; a run has chosen its own
+    ("live", "minutes"),  # of a stream, which has no other end
+}
+
+
+def options_of(command: str) -> list[type]:
+    """The dataclasses of a command's options: one, or one a subcommand."""
+    kinds = import_module(COMMANDS[command][0]).Options
+    members = [kinds] if isinstance(kinds, type) else get_args(kinds)
+    return [get_args(m)[0] if get_origin(m) else m for m in members]
+
+
+def home_of(kind: type, name: str) -> type:
+    """The class that declares a field."""
+    return next(c for c in kind.__mro__ if name in inspect.get_annotations(c))
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "experiment"])
+def test_what_commands_share_is_declared_once(command):
+    for kind in options_of(command):
+        assert issubclass(kind, Common)
+        for name in SHARED:
+            if (command, name) not in OWN and name in {f.name for f in dataclasses.fields(kind)}:
+                assert home_of(kind, name).__module__ == "gsjax.cli.options", f"gsjax {command}: {name}"
+
+
+@dataclass(frozen=True)
+class Config:
+    size: int = 1
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Timed, Seeded, HeldOutFrames, Selection):
+    first: Config = field(default_factory=Config)
+    second: Config = Config(2)
+
+
+def test_a_seed_is_that_of_every_configuration():
+    assert checked(Options(first=Config(seed=3))).first == Config(seed=3)
+    seeded = checked(Options(seed=5, first=Config(seed=3)))
+    assert (seeded.first, seeded.second) == (Config(1, 5), Config(2, 5))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"minutes": 0.0}, "--minutes: expected more than 0, found 0.0"),
+        ({"minutes": float("nan")}, "--minutes: expected more than 0, found nan"),
+        ({"scale": 1.5}, "--scale: expected above 0 and at most 1, found 1.5"),
+        ({"test_every": 1}, "--test-every: expected 0 .none. or 2 and more, found 1"),
+    ],
+)
+def test_what_cannot_be_is_said(given, said):
+    with pytest.raises(ValueError, match=said):
+        checked(Options(**given))
+
+
+@pytest.mark.parametrize("words", [["--preset", "large"], ["x", "--preset=large"]])
+def test_a_preset_changes_the_defaults(words):
+    kind, left = preset_options(Options, words, "first", {"large": Config(9)})
+    assert (kind().first, kind().second, left) == (Config(9), Config(2), words)
+    assert kind(first=Config(4)).first == Config(4)
+
+
+def test_without_a_known_preset_nothing_changes():
+    for words in ([], ["--preset", "unknown"], ["--preset"]):
+        assert preset_options(Options, words, "first", {"large": Config(9)}) == (Options, words)
