@@ -8,6 +8,10 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+
+DEFAULT_RATE_HZ = 30.0
+"""Frames a second, where the data do not say when they were taken."""
+
 _NUMBER = re.compile(r"\d+")
 
 

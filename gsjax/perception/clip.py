@@ -11,9 +11,14 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from gsjax.perception.pictures import square_crop, to_bytes
-from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
-
-_FILES = ("preprocessor_config.json|processor_config.json", "tokenizer.json|vocab.json")
+from gsjax.perception.weights import (
+    LOCAL_FILES,
+    LOCAL_WEIGHTS,
+    PROCESSOR,
+    foundation_modules,
+    image_processor,
+    weights_folder,
+)
 
 
 @dataclass(frozen=True)
@@ -78,11 +83,11 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    folder = weights_folder(path, "CLIP's weights", _FILES, "openai/clip-vit-large-patch14")
+    files = (PROCESSOR, "tokenizer.json|vocab.json")
+    folder = weights_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")
     torch, transformers = foundation_modules("CLIP")
     model = transformers.CLIPModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
-    # The processor that needs no torchvision.
-    processor = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
+    processor = image_processor(transformers, folder)
     tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **LOCAL_FILES)
     return ClipEncoder(model, processor, tokenizer, torch, device)
 

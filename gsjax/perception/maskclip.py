@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from gsjax.perception.clip import ClipEncoder, load_clip
-from gsjax.perception.pictures import to_bytes
+from gsjax.perception.pictures import in_patches
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,9 @@ class MaskClipEncoder:
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:
         """A vector a patch of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen."""
-        height, width = images.shape[1:3]
         vision, torch = self.clip.model.vision_model, self.clip.torch
         patch = self.clip.model.config.vision_config.patch_size
-        scale = self.resolution / min(height, width)
-        rows, columns = (max(1, round(size * scale / patch)) for size in (height, width))
-        size = {"height": rows * patch, "width": columns * patch}
-        pixels = self.clip.processor(
-            [to_bytes(image) for image in images], size=size, do_center_crop=False, return_tensors="pt"
-        )["pixel_values"]
+        pixels, rows, columns = in_patches(images, self.clip.processor, patch, self.resolution)
         with torch.inference_mode():
             seen = vision(
                 pixel_values=pixels.to(self.clip.device),

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import LOCAL_WEIGHTS, foundation_modules, weights_folder
+from gsjax.perception.weights import LOCAL_WEIGHTS, PROCESSOR, foundation_modules, weights_folder
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,7 @@ def load_sam2(path: str | os.PathLike, device: str = "cpu") -> Sam2Propagator:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = ("preprocessor_config.json|processor_config.json",)
-    folder = weights_folder(path, "SAM2's weights", files, "facebook/sam2.1-hiera-tiny")
+    folder = weights_folder(path, "SAM2's weights", (PROCESSOR,), "facebook/sam2.1-hiera-tiny")
     torch, transformers = foundation_modules("SAM2")
     model = transformers.Sam2VideoModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
     # SAM2's own processor needs torchvision. ViT's does the same to a picture: resize, rescale, normalise.

@@ -289,3 +289,14 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     # Where each tile stands in the batches; what fills up the last batch, -1, is the largest of keys.
     place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[: lists.counts.shape[0]]
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
+
+
+def untile(
+    tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, ...], plan: Plan
+) -> Float[Array, "*shape height width channels"]:
+    """The images of what was composited tile by tile, `shape` of them, each of the plan's size."""
+    channels, edge, y = tiles.shape[1], plan.tile_size, len(shape)
+    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
+    image = image.transpose(*range(y + 1), y + 3, y + 1, y + 4, y + 2)
+    image = image.reshape(*shape, plan.tiles_y * edge, plan.tiles_x * edge, channels)
+    return image[..., : plan.height, : plan.width, :]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.binning import bin_gaussians
-from gsjax.rasterize.compositing import Lists, Splats
+from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
@@ -125,15 +125,7 @@ def paint_shown(
     splats = Splats(view.means2d, view.conics, view.opacities, values)
     lists = Lists(view.ids, view.starts, view.counts)
     tiles, transmittance, _ = composite(splats, lists, None, plan)
-    return _untiled(tiles, plan), 1 - _untiled(transmittance[:, None], plan)[..., 0]
-
-
-def _untiled(
-    tiles: Float[Array, "tiles channels pixels"], plan: Plan
-) -> Float[Array, "height width channels"]:
-    edge = plan.tile_size
-    image = tiles.reshape(plan.tiles_y, plan.tiles_x, -1, edge, edge).transpose(0, 3, 1, 4, 2)
-    return image.reshape(plan.tiles_y * edge, plan.tiles_x * edge, -1)[: plan.height, : plan.width]
+    return untile(tiles, (), plan), 1 - untile(transmittance[:, None], (), plan)[..., 0]
 
 
 def _shown(view: FrozenView) -> FrozenView:

@@ -11,8 +11,9 @@ import pytest
 from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
 from gsjax.perception.clip import load_clip
 from gsjax.perception.dinov2 import load_dinov2
-from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
+from gsjax.perception.grounded_sam import load_grounded_sam
 from gsjax.perception.maskclip import load_maskclip
+from gsjax.perception.masks import labels_of_masks
 from gsjax.perception.sam import load_sam
 from gsjax.perception.sam2 import load_sam2
 from gsjax.perception.weights import weights_folder
