@@ -1,4 +1,4 @@
-"""What the fuzzer puts into the rasterizer: seeded scenes, the ends of what floats hold, and where each goes."""
+"""What the fuzzer poisons and with what: seeded scenes, the ends of what floats hold, and every place."""
 
 import dataclasses
 import functools

@@ -47,7 +47,7 @@ def faults(node: Definition) -> Iterator[str]:
         given = node.args
         arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs]
         arguments = [a for a in arguments if a.arg not in ("self", "cls")]
-        silent = [a.arg for a in arguments if not tells_of(text, a.arg)]
+        silent = [a.arg for a in arguments if not (tells_of(text, a.arg) or is_of_its_class(a))]
         if len(arguments) > FEW and silent and not re.search(r"[Aa]rguments (as for|of) `", text):
             yield f"does not tell of {', '.join(silent)}"
         open_ = [a.arg for a in arguments if a.annotation and OPEN_SHAPE.search(ast.unparse(a.annotation))]
@@ -61,7 +61,16 @@ def faults(node: Definition) -> Iterator[str]:
 def tells_of(text: str, name: str) -> bool:
     """Whether a docstring has a parameter's name, or each word of it, also in the plural or the singular."""
     words = [word.removesuffix("s") for word in name.split("_") if word]
-    return all(re.search(rf"\b{re.escape(word)}", text, re.IGNORECASE) for word in words)
+    return all(re.search(rf"(?<![a-zA-Z]){re.escape(word)}", text, re.IGNORECASE) for word in words)
+
+
+def is_of_its_class(argument: ast.arg) -> bool:
+    """Whether an argument is called as its class is, `config: TrackerConfig`: the class tells of it."""
+    if argument.annotation is None:
+        return False
+    classes = re.findall(r"[A-Z]\w*", ast.unparse(argument.annotation).split("[")[0])
+    spelled = argument.arg.replace("_", "").removesuffix("s").lower()
+    return any(name.removesuffix("s").lower().endswith(spelled) for name in classes if len(spelled) > 3)
 
 
 def raises(function: ast.FunctionDef) -> Iterator[str]:

@@ -96,7 +96,13 @@ def read_clip(
 
 
 def is_clip(root: Path, images: str = "images", masks: str | None = None) -> bool:
-    """Whether it is a video, or a folder of frames with masks."""
+    """Whether it is a video, or a folder of frames with masks.
+
+    Args:
+        root: the file or folder.
+        images: the folder of frames in it.
+        masks: the folder of masks, where the user names one.
+    """
     if root.suffix.lower() in SUFFIXES and root.is_file():
         return True
     return (find_masks(root) is not None or masks is not None) and bool(_frames_in(root, images))

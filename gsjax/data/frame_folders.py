@@ -25,7 +25,11 @@ def pictures(folder: Path) -> list[Path]:
 
 def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
     """As many pictures as there are frames: the masks or depth images of a recording, by order of name.
-    `frames` is what the frames' folder or file is called.
+
+    Args:
+        folder: of the pictures.
+        count: how many frames there are.
+        frames: what their folder or file is called, for messages.
 
     Raises:
         DataError: there are more or fewer.

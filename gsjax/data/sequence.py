@@ -296,7 +296,12 @@ class Sequence:
         return f"camera {self.camera_ids[c]} in frame {self.frame_ids[t]}"
 
     def where(self, kind: str, t: int, c: int) -> str:
-        """What errors call the image, depth or mask of camera `c` in frame `t`: its path, if it has one."""
+        """What errors call the image, depth or mask of camera `c` in frame `t`: its path, if it has one.
+
+        Args:
+            kind: "image", "depth", "mask" or "flow".
+            t, c: frame and camera, counted from 0.
+        """
         if self.locate is not None:
             return self.locate(kind, t, c)
         return f"{self.name}, {kind} of {self._camera_in_frame(t, c)}"

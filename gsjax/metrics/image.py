@@ -88,7 +88,13 @@ def with_matched_colors(
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width 3"]:
     """The image under the affine map of its colours that brings it nearest to the target, by least squares:
-    what is left is no difference in exposure or white balance."""
+    what is left is no difference in exposure or white balance.
+
+    Args:
+        image: colours 0 to 1.
+        target: what it is brought near to.
+        mask: pixels by which the map is found; all unless given. It is applied to all.
+    """
     counted = np.ones(image.shape[:2], bool) if mask is None else mask
     colors = np.concatenate([image[counted], np.ones((int(counted.sum()), 1))], axis=1)
     map_ = np.linalg.lstsq(colors, target[counted], rcond=None)[0]

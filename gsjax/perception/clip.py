@@ -66,6 +66,11 @@ class ClipEncoder:
         """The vector of a square crop around each of the labels 1 to `count`; zeros for one without pixels.
 
         What surrounds an object stays in its crop: CLIP was trained on pictures, not on cut-outs.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            labels: of its pixels, 0 the background.
+            count: the largest label that is asked for.
         """
         vectors = np.zeros((count, self.model.config.projection_dim), np.float32)
         there = [label for label in range(1, count + 1) if (labels == label).any()]

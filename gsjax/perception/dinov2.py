@@ -55,6 +55,11 @@ class Dinov2Encoder:
 def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 518) -> Dinov2Encoder:
     """DINOv2, with or without registers, from a folder of weights in the layout of Hugging Face.
 
+    Args:
+        path: the folder.
+        device: of torch, "cpu" or "cuda".
+        resolution: pixels of the shorter side that the model is to see.
+
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.

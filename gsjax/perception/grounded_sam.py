@@ -110,6 +110,12 @@ def load_grounded_sam(
 ) -> GroundedSam:
     """Grounding DINO and SAM from two folders of weights in the layout of Hugging Face.
 
+    Args:
+        detector: the folder of Grounding DINO.
+        segmenter: the folder of SAM.
+        device: of torch, "cpu" or "cuda".
+        prompt: what to look for.
+
     Raises:
         FileNotFoundError: a folder or a file of it is missing.
         ValueError: a folder leads to weights that are a pickle.

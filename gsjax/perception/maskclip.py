@@ -33,6 +33,7 @@ class MaskClipEncoder:
 
     @property
     def min_score(self) -> float:
+        """A query whose best cosine is less means nothing that is seen; as of `ClipEncoder`."""
         return self.clip.min_score
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:
@@ -64,6 +65,11 @@ class MaskClipEncoder:
 
 def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int = 448) -> MaskClipEncoder:
     """CLIP from a folder of weights in the layout of Hugging Face, for patches.
+
+    Args:
+        path: the folder.
+        device: of torch, "cpu" or "cuda".
+        resolution: pixels of the shorter side that the model is to see.
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.

@@ -41,7 +41,13 @@ def labels_of_masks(
 def name_by_size(
     labels: Int[np.ndarray, "H W"], min_pixels: int = 1, background: int = 0
 ) -> Int[np.ndarray, "H W"]:
-    """Labels renamed 1, 2, ... from the largest to the smallest; those under `min_pixels` become 0."""
+    """Labels renamed 1, 2, ... from the largest to the smallest; those under `min_pixels` become 0.
+
+    Args:
+        labels: any integers.
+        min_pixels: of what keeps a name.
+        background: the label that becomes 0, however large it is.
+    """
     names, inverse, counts = np.unique(labels, return_inverse=True, return_counts=True)
     kept = np.flatnonzero((names != background) & (counts >= min_pixels))
     renamed = np.zeros(len(names), np.int32)

@@ -25,6 +25,11 @@ def square_crop(
     """The smallest square around a mask, `margin` of its side wider on all sides; what sticks out of the
     picture repeats its border.
 
+    Args:
+        image: which the mask is of.
+        mask: True on what is cut out.
+        margin: share of the square's side.
+
     Raises:
         ValueError: the mask is empty.
     """

@@ -58,8 +58,8 @@ def freeze_views(
 ) -> tuple[FrozenView, Plan]:
     """The views [C, ...] of C cameras, and the plan that they are painted with. On the host.
 
-    Arguments and options as for `gsjax.rasterization`; gradients stop here. Gaussians that cannot be drawn
-    are in no list.
+    Arguments as for `gsjax.rasterization`, its options too; gradients stop here. Gaussians that cannot be
+    drawn are in no list.
 
     Raises:
         ValueError: as `gsjax.plan`.
@@ -76,8 +76,14 @@ def freeze_views(
 
 
 def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
-    """One view with so many `rows` and `ids`, at least as many as it has: by the first of the N Gaussians,
-    which no tile lists for it. On the host."""
+    """One view with longer `rows` and `ids`, so that views can be stacked: by the first of the N Gaussians,
+    which no tile lists for it. On the host.
+
+    Args:
+        view: of one camera.
+        seen: length that `rows` and what goes with it are to have.
+        pairs: length that `ids` is to have.
+    """
 
     def more(a: np.ndarray, length: int) -> np.ndarray:
         return np.concatenate([a, np.zeros((length - len(a), *a.shape[1:]), a.dtype)])
@@ -88,7 +94,13 @@ def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
 
 
 def rows_within(megabytes: float, numbers: int, plan: Plan) -> int:
-    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least."""
+    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least.
+
+    Args:
+        megabytes: what the pixels of a strip may take.
+        numbers: floats a pixel, of 4 bytes.
+        plan: of the view.
+    """
     a_row = 4 * numbers * plan.tile_size * plan.width
     return int(max(1, min(plan.tiles_y, megabytes * 2**20 // a_row)))
 

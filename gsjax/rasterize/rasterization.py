@@ -194,7 +194,16 @@ def _options(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def planned_for(views, bare: Plan, headroom: float) -> Plan:
-    """`bare` with a capacity that holds what these checked inputs need, times `headroom`."""
+    """`bare` with a capacity that holds what these checked inputs need, times `headroom`.
+
+    Args:
+        views: as `check_inputs` returns them.
+        bare: has the options.
+        headroom: 1 or more.
+
+    Raises:
+        ValueError: values are traced, or `headroom` is below 1.
+    """
     values = jax.lax.stop_gradient(views)
     if not is_concrete(values):
         raise ValueError(

@@ -59,7 +59,13 @@ class Primitive:
 def intersect(
     primitive: Primitive, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, "n"]:
-    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity."""
+    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity.
+
+    Args:
+        primitive: what is to be met.
+        origin: of all rays, metres.
+        directions: of any length, of which s is a multiple.
+    """
     match primitive.shape:
         case "box":
             near, far = _slabs(primitive.size, origin, directions, axes=(0, 1, 2))
