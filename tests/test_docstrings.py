@@ -24,14 +24,20 @@ Definition = ast.Module | ast.ClassDef | ast.FunctionDef
 
 
 def definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
-    """All that is public in a module, and the module itself, by name."""
+    """All that is public in a module, and the module itself; no method that a base class documents."""
     yield "the module", tree
+    told: dict[str, set[str]] = {}  # by class, the methods that it or its bases document
     for node in tree.body:
-        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef):
+            continue
+        if not node.name.startswith("_"):
             yield node.name, node
-            inner = node.body if isinstance(node, ast.ClassDef) else ()
-            methods = (member for member in inner if isinstance(member, ast.FunctionDef))
-            yield from ((f"{node.name}.{m.name}", m) for m in methods if not m.name.startswith("_"))
+        if isinstance(node, ast.ClassDef):
+            methods = [member for member in node.body if isinstance(member, ast.FunctionDef)]
+            inherited = set().union(*(told.get(ast.unparse(base), set()) for base in node.bases))
+            told[node.name] = inherited | {m.name for m in methods if ast.get_docstring(m)}
+            public = [m for m in methods if not (m.name.startswith("_") or m.name in inherited)]
+            yield from ((f"{node.name}.{m.name}", m) for m in public if not node.name.startswith("_"))
 
 
 def faults(node: Definition) -> Iterator[str]:

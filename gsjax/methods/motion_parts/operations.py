@@ -89,7 +89,16 @@ class TimeEdit(Edit):
     """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
 
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Those that still move at `from`: what is over stands still, whatever is done to all."""
+        """Those that still move at `from`: what is over stands still, whatever is done to all.
+
+        Args:
+            trajectory: of all parts.
+            parts: that the edit names.
+            lasts: when each part of the scene comes to rest, seconds.
+
+        Raises:
+            ValueError: none of them moves any more.
+        """
         begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
         moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
         if not moving:
@@ -109,7 +118,13 @@ class TimeEdit(Edit):
         return self.begin or 0.0, last if self.end is None else self.end
 
     def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
-        """The trajectory after it."""
+        """The trajectory after it.
+
+        Args:
+            trajectory: of all parts.
+            parts: whose time is changed.
+            begin, end: between which it is, seconds.
+        """
         raise NotImplementedError
 
 
@@ -193,7 +208,13 @@ class LookEdit(Edit):
         return edits.during(film[0].trajectory.times, self.begin, self.end, self.ease)
 
     def changed(self, layer: Layer, parts: list[int], share: Float[Array, "T"]) -> Trajectory:
-        """The layer's trajectory after it."""
+        """The layer's trajectory after it.
+
+        Args:
+            layer: the scene and its trajectory.
+            parts: that are changed.
+            share: of the change in each frame, 0 to 1.
+        """
         raise NotImplementedError
 
 
