@@ -1,8 +1,9 @@
 """A graph over nodes seen at several times, and what a teacher's features ask of it (papers/003, section 2.3,
 and papers/004, section 3.3).
 
-Nodes are points picked from those of each frame. Frames, nodes and edges are as many everywhere, with masks
-for what is absent. Edges lead to the nearest nodes of the same frame and to those of others that match:
+Nodes are points picked from those of each frame (`gsjax.geometry.sampling`). Frames, nodes and edges are as
+many everywhere, with masks for what is absent. Edges lead to the nearest nodes of the same frame and to those
+of others that match:
 
     edges = spatial_edges(positions, k=8) | temporal_edges(teacher, k=4, window=2)
     weights = edge_weights(positions, teacher, times, edges, tau_x=0.02, tau_t=0.5)
@@ -22,7 +23,6 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import groupby
 from operator import or_
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,52 +38,6 @@ Features = Float[Array, "t n d"]
 There = Bool[Array, "t n"]
 
 _LEAST = 1e-12  # squared: what is shorter has no direction
-
-
-# -- nodes ---------------------------------------------------------------------------------------------------
-
-
-class Sample(NamedTuple):
-    """Points picked from many: their indices, and False where none was left to pick."""
-
-    indices: Int[Array, "count"]
-    valid: Bool[Array, "count"]
-
-
-def farthest_points(points: Float[Array, "n c"], count: int, valid: Bool[Array, "n"] | None = None) -> Sample:
-    """Points that cover all: the one farthest from the mean, then always the one farthest from those picked.
-    So none is farther from the nearest picked one than any two of those are from each other.
-
-    Args:
-        points: positions. One that is not finite is not picked, nor a second one at the same place.
-        count: how many.
-        valid: which may be picked; all unless given.
-
-    Raises:
-        ValueError: `count` is below 1.
-    """
-    if count < 1:
-        raise ValueError(f"count={count}: expected 1 or more")
-    points, there = _present(points, valid)
-    axes, places = tuple(points.T), jnp.arange(len(points))
-    mean = points.sum(axis=0) / jnp.maximum(there.sum(), 1)
-
-    # A sum over a short last axis, and argmax, would take seven times as long on a CPU.
-    def squared_to(point):
-        return sum((axis - at) ** 2 for axis, at in zip(axes, point, strict=True))
-
-    def farthest(apart):
-        return jnp.min(jnp.where(apart == apart.max(), places, len(points) - 1))
-
-    def pick(carry, _):
-        apart, picked, found = carry
-        apart = jnp.minimum(apart, squared_to(points[picked]))
-        following = farthest(apart)
-        return (apart, following, apart[following] > 0), (picked, found)
-
-    first = farthest(jnp.where(there, squared_to(mean), -1.0))
-    start = jnp.where(there, jnp.inf, -1.0).astype(points.dtype), first, there.any()
-    return Sample(*jax.lax.scan(pick, start, length=count)[1])
 
 
 # -- edges ---------------------------------------------------------------------------------------------------

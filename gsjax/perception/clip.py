@@ -10,15 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Num
 
+from gsjax.perception import weights
 from gsjax.perception.pictures import square_crop, to_bytes
-from gsjax.perception.weights import (
-    LOCAL_FILES,
-    LOCAL_WEIGHTS,
-    PROCESSOR,
-    foundation_modules,
-    image_processor,
-    weights_folder,
-)
 
 
 @dataclass(frozen=True)
@@ -88,12 +81,12 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = (PROCESSOR, "tokenizer.json|vocab.json")
-    folder = weights_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")
-    torch, transformers = foundation_modules("CLIP")
-    model = transformers.CLIPModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
-    processor = image_processor(transformers, folder)
-    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **LOCAL_FILES)
+    files = (weights.PROCESSOR, "tokenizer.json|vocab.json")
+    folder = weights.model_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")
+    torch, transformers = weights.foundation_modules("CLIP")
+    model = transformers.CLIPModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    processor = weights.image_processor(transformers, folder)
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **weights.LOCAL_FILES)
     return ClipEncoder(model, processor, tokenizer, torch, device)
 
 

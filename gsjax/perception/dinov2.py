@@ -10,14 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num
 
+from gsjax.perception import weights
 from gsjax.perception.pictures import in_patches
-from gsjax.perception.weights import (
-    LOCAL_WEIGHTS,
-    PROCESSOR,
-    foundation_modules,
-    image_processor,
-    weights_folder,
-)
 
 
 @dataclass(frozen=True)
@@ -65,7 +59,7 @@ def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    folder = weights_folder(path, "DINOv2's weights", (PROCESSOR,), "facebook/dinov2-base")
-    torch, transformers = foundation_modules("DINOv2")
-    model = transformers.AutoModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
-    return Dinov2Encoder(model, image_processor(transformers, folder), torch, device, resolution)
+    folder = weights.model_folder(path, "DINOv2's weights", (weights.PROCESSOR,), "facebook/dinov2-base")
+    torch, transformers = weights.foundation_modules("DINOv2")
+    model = transformers.AutoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    return Dinov2Encoder(model, weights.image_processor(transformers, folder), torch, device, resolution)

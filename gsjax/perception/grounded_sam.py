@@ -11,16 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
+from gsjax.perception import weights
 from gsjax.perception.masks import Found, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import (
-    LOCAL_FILES,
-    LOCAL_WEIGHTS,
-    PROCESSOR,
-    foundation_modules,
-    image_processor,
-    weights_folder,
-)
 
 
 @dataclass(frozen=True)
@@ -121,20 +114,22 @@ def load_grounded_sam(
         ValueError: a folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = (PROCESSOR, "tokenizer.json|vocab.txt")
-    boxes = weights_folder(detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny")
-    masks = weights_folder(segmenter, "SAM's weights", (PROCESSOR,), "facebook/sam-vit-base")
-    torch, transformers = foundation_modules("Grounded SAM")
-    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **LOCAL_FILES)
-    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **LOCAL_WEIGHTS)
-    sam = transformers.SamModel.from_pretrained(masks, **LOCAL_WEIGHTS)
+    files = (weights.PROCESSOR, "tokenizer.json|vocab.txt")
+    boxes = weights.model_folder(
+        detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny"
+    )
+    masks = weights.model_folder(segmenter, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
+    torch, transformers = weights.foundation_modules("Grounded SAM")
+    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **weights.LOCAL_FILES)
+    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **weights.LOCAL_WEIGHTS)
+    sam = transformers.SamModel.from_pretrained(masks, **weights.LOCAL_WEIGHTS)
     return GroundedSam(
         detector=dino.eval().to(device),
         detector_processor=transformers.GroundingDinoProcessor(
-            image_processor(transformers, boxes), tokenizer
+            weights.image_processor(transformers, boxes), tokenizer
         ),
         segmenter=sam.eval().to(device),
-        segmenter_processor=transformers.SamProcessor(image_processor(transformers, masks)),
+        segmenter_processor=transformers.SamProcessor(weights.image_processor(transformers, masks)),
         torch=torch,
         device=device,
         prompt=prompt,

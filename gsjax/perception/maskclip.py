@@ -67,13 +67,7 @@ def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int 
     """CLIP from a folder of weights in the layout of Hugging Face, for patches.
 
     Args:
-        path: the folder.
-        device: of torch, "cpu" or "cuda".
+        path, device: as for `gsjax.perception.clip.load_clip`, with its errors.
         resolution: pixels of the shorter side that the model is to see.
-
-    Raises:
-        FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
     """
     return MaskClipEncoder(load_clip(path, device), resolution)

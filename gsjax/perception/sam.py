@@ -13,15 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8
 from PIL import Image
 
+from gsjax.perception import weights
 from gsjax.perception.masks import Found, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import (
-    LOCAL_WEIGHTS,
-    PROCESSOR,
-    foundation_modules,
-    image_processor,
-    weights_folder,
-)
 
 
 @dataclass(frozen=True)
@@ -143,10 +137,10 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    folder = weights_folder(path, "SAM's weights", (PROCESSOR,), "facebook/sam-vit-base")
-    torch, transformers = foundation_modules("SAM")
-    model = transformers.SamModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval()
-    pictures = image_processor(transformers, folder)
+    folder = weights.model_folder(path, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
+    torch, transformers = weights.foundation_modules("SAM")
+    model = transformers.SamModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval()
+    pictures = weights.image_processor(transformers, folder)
     pipeline = transformers.pipeline("mask-generation", model=model, image_processor=pictures, device=device)
     return SamSegmenter(pipeline, transformers.SamProcessor(pictures), torch)
 

@@ -25,7 +25,7 @@ PROCESSOR = "preprocessor_config.json|processor_config.json"
 """The file that says how pictures are resized and normalised, under either of its names."""
 
 
-def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
+def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
     """The folder of a model in the layout of Hugging Face, checked.
 
     Args:

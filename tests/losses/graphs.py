@@ -11,7 +11,6 @@ from gsjax.losses.graph import (
     affinities,
     edge_affinities,
     edge_weights,
-    farthest_points,
     similar_edges,
     spatial_edges,
     temporal_edges,
@@ -52,7 +51,6 @@ def graph(positions, teacher, times, valid, **_):
 matrices = jax.jit(affinities, static_argnums=1)
 edge_values = jax.jit(edge_affinities)
 matching_of = jax.jit(sinkhorn)
-pick = jax.jit(farthest_points, static_argnums=1)
 
 
 def listed(edges: Edges) -> set[tuple[int, int, int, int]]:

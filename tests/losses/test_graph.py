@@ -1,12 +1,10 @@
 """Nodes, edges and affinities of graphs against what they mean, written out in loops in float64."""
 
-import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from gsjax.losses.graph import (
     Matching,
@@ -30,36 +28,6 @@ from tests.losses.graphs import (
     matching_of,
     matrices,
 )
-
-# -- nodes ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("x64")
-@given(SEEDS, st.integers(1, 12))
-def test_picked_points_cover_the_others_and_keep_apart(seed, there):
-    random = np.random.default_rng(seed)
-    points, valid = random.normal(size=(12, 3)), random.permutation(12) < there
-    points[~valid] *= 100
-    points[np.nonzero(~valid)[0][:1]] = np.nan
-    sample = pick(jnp.asarray(points), 5, jnp.asarray(valid))
-    picked = np.asarray(sample.indices)[np.asarray(sample.valid)]
-    assert len(set(picked)) == len(picked) == min(there, 5)
-    assert valid[picked].all()
-    center = points[valid].mean(0)
-    far = np.where(valid, np.linalg.norm(points - center, axis=1), -1)
-    np.testing.assert_allclose(far[picked[0]], far.max())  # of two, both are as far from their middle
-    for i in range(1, len(picked)):  # each is the farthest from those before it
-        apart = np.where(valid, cdist(np.nan_to_num(points), points[picked[:i]]).min(1), -1)
-        np.testing.assert_allclose(apart[picked[i]], apart.max())
-
-
-def test_points_at_one_place_are_picked_once_and_none_where_there_is_none():
-    points = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]])
-    assert pick(points, 4, None).valid.tolist() == [True, True, False, False]
-    assert pick(points[:1], 4, None).valid.tolist() == [True, False, False, False]
-    assert not pick(points, 4, jnp.zeros(4, bool)).valid.any()
-    assert not pick(points * jnp.nan, 4, None).valid.any()
-
 
 # -- edges ---------------------------------------------------------------------------------------------------
 

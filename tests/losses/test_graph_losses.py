@@ -11,7 +11,6 @@ from gsjax.losses.graph import (
     affinities,
     all_edges,
     edge_affinities,
-    farthest_points,
     node_loss,
     orthonormal_projection,
     similarity_loss,
@@ -30,7 +29,6 @@ from tests.losses.graphs import (
     edge_values,
     graph,
     listed,
-    pick,
 )
 
 
@@ -228,9 +226,6 @@ def test_a_batch_is_a_loop():
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *many)
     together = jax.vmap(compiled)(stacked["features"], stacked)
     np.testing.assert_allclose(together, [compiled(one["features"], one) for one in many], rtol=1e-4)
-    sampled = jax.vmap(lambda p: pick(p, 4, None))(many[0]["positions"])
-    for t in range(T):
-        np.testing.assert_array_equal(sampled.indices[t], pick(many[0]["positions"][t], 4, None).indices)
 
 
 def test_float32_is_near_to_float64():
@@ -245,5 +240,3 @@ def test_mistakes_are_named():
     told = arrays(case(0))
     with pytest.raises(ValueError, match=r"window=0.*1 frame or more"):
         temporal_edges(told["teacher"], 2, 0)
-    with pytest.raises(ValueError, match=r"count=0.*1 or more"):
-        farthest_points(told["positions"][0], 0)

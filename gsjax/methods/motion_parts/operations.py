@@ -89,16 +89,7 @@ class TimeEdit(Edit):
     """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
 
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Those that still move at `from`: what is over stands still, whatever is done to all.
-
-        Args:
-            trajectory: of all parts.
-            parts: that the edit names.
-            lasts: when each part of the scene comes to rest, seconds.
-
-        Raises:
-            ValueError: none of them moves any more.
-        """
+        """Those that still move at `from`: what is over stands still, whatever is done to all."""
         begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
         moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
         if not moving:
