@@ -16,136 +16,43 @@ Run it with
 
 import argparse
 import collections
-import dataclasses
 import functools
-import itertools
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.scenes import ARRAYS, make_scene, relative_error
-from benchmarks.scenes import case as seeded
+from benchmarks.poisons import (
+    HEIGHT,
+    MODES,
+    NEAR,
+    NUM,
+    PER_GAUSSIAN,
+    POISONS,
+    WIDTH,
+    Case,
+    cases,
+    plan_of,
+    poisoned,
+    scene_of,
+)
+from benchmarks.scenes import ARRAYS, relative_error
 from gsjax.cli import machine
-from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
 RESULT = Path(__file__).parent / "results" / "fuzz.json"
-WIDTH, HEIGHT, NUM = 33, 17, 40
-NEAR = 0.01
-PER_GAUSSIAN = (*ARRAYS[:5], "features")
 TOLERANCE = 1e-3  # of the image's largest value: far above rounding, far below one Gaussian left out
-
-
-class Mode(NamedTuple):
-    """One compiled program."""
-
-    options: dict[str, Any]
-    dtype: str = "float32"  # of colours and features
-    feature_channels: int = 2
-
-
-MODES = {
-    "rgb": Mode({}),
-    "depth": Mode({"render_mode": "RGB+ED"}),
-    "antialiased": Mode({"render_mode": "RGB+ED", "rasterize_mode": "antialiased"}),
-    "harmonics": Mode({"rasterize_mode": "antialiased", "sh_degree": 3}),
-    "bfloat16": Mode({}, "bfloat16"),
-    "float16": Mode({}, "float16"),
-    "channels": Mode({"render_mode": "RGB+D"}, feature_channels=16),  # composited by matmuls
-    "forward": Mode({"render_mode": "RGB+ED", "sh_degree": 3, "derivative": "forward"}),
-}
-
-_F32 = np.finfo(np.float32)
-POISONS = {
-    "nan": np.nan,
-    "inf": np.inf,
-    "-inf": -np.inf,
-    "largest": _F32.max,
-    "1e38": 1e38,
-    "-1e38": -1e38,
-    "1e19": 1e19,
-    "1e12": 1e12,
-    "-1e6": -1e6,
-    "denormal": _F32.smallest_subnormal,
-    "smallest": _F32.tiny,
-    "1e-19": 1e-19,
-    "1e-12": 1e-12,
-    "1e-6": 1e-6,
-    "0": 0.0,
-    "-0": -0.0,
-    "1": 1.0,
-    "-1": -1.0,
-    "1/255": np.float32(1 / 255),
-    "below 1/255": np.nextafter(np.float32(1 / 255), np.float32(0)),
-    "0.99": np.float32(0.99),
-    "above 0.99": np.nextafter(np.float32(0.99), np.float32(1)),
-    "near": NEAR,
-    "eps2d": 0.3,
-    "1e5": 1e5,
-    "1e10": 1e10,
-}
-# Places of a mean on the optical axis, as depths.
-PLACES = {
-    "at 0": 0.0,
-    "at near": NEAR,
-    "below near": NEAR * (1 - 1e-6),
-    "above near": NEAR * (1 + 1e-3),
-    "behind": -1.0,
-    "far": 1e10,
-}
-INTEGERS = {"0": 0, "-1": -1, "1": 1, "largest": 2**31 - 1, "smallest": -(2**31), "999": 999}
-INPUTS = (*PER_GAUSSIAN, "means2d_offset", "viewmats", "Ks", "backgrounds", "reads")
-
-
-class Case(NamedTuple):
-    """Which poison goes where. Printed with colons between, it is what `--case` takes."""
-
-    mode: str
-    seed: int
-    input: str
-    row: int
-    column: int  # into the row, flattened; -1 for the whole row
-    poison: str
-
-    def __str__(self) -> str:
-        return ":".join(map(str, self))
-
-    @classmethod
-    def parse(cls, text: str) -> "Case":
-        mode, seed, name, row, column, poison = text.split(":")
-        return cls(mode, int(seed), name, int(row), int(column), poison)
 
 
 class Outcome(NamedTuple):
     images: list[np.ndarray]  # colours, alphas, features
     derivatives: dict[str, np.ndarray]  # gradients by input; or the images' tangents
     culled: int
-
-
-def _plan(mode: Mode) -> Plan:
-    return Plan(WIDTH, HEIGHT, 4096, near_plane=NEAR, **mode.options)
-
-
-@functools.lru_cache(maxsize=8)
-def scene_of(name: str, seed: int) -> dict[str, np.ndarray]:
-    """A small scene that has every input."""
-    mode = MODES[name]
-    fields = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB", "channels": 3}
-    fields |= {"sh_degree": mode.options.get("sh_degree"), "feature_channels": mode.feature_channels}
-    scene = make_scene(dataclasses.replace(seeded(seed, NUM), **fields))
-    scene = {k: np.float32(v) for k, v in scene.items()}
-    for painted in ("colors", "features"):
-        scene[painted] = scene[painted].astype(jnp.dtype(mode.dtype))
-    scene["means2d_offset"] = np.zeros((1, NUM, 2), np.float32)
-    scene["reads"] = np.zeros((1, _plan(mode).num_tiles), np.int32)
-    return scene
 
 
 def _random_like(tree, seed: int):
@@ -156,7 +63,7 @@ def _random_like(tree, seed: int):
 @functools.cache
 def _program(name: str):
     """scene -> images, derivatives, culled: the one program of a mode."""
-    plan = _plan(MODES[name])
+    plan = plan_of(MODES[name])
 
     def images_of(scene, reads):
         colors, alphas, meta = rasterization(**scene, reads=reads, width=WIDTH, height=HEIGHT, plan=plan)
@@ -211,7 +118,7 @@ def _reference_program(name: str):
 @functools.cache
 def _in_float64(name: str):
     """The rasterizer itself, for what the reference cannot tell; forward only."""
-    plan = _plan(MODES[name])
+    plan = plan_of(MODES[name])
 
     def images_of(scene):
         colors, alphas, meta = rasterization(**scene, width=WIDTH, height=HEIGHT, plan=plan)
@@ -230,22 +137,6 @@ def _error(
         want, doubtful = judge(name)(exact)
     certain = ~np.asarray(doubtful)[..., None]
     return max(relative_error(a[0], np.asarray(b), certain) for a, b in zip(images, want, strict=True))
-
-
-def poisoned(case: Case) -> dict[str, np.ndarray]:
-    """The scene of a case."""
-    scene = scene_of(case.mode, case.seed)
-    array = scene[case.input].copy()
-    rows = array if case.input in PER_GAUSSIAN else array[0]
-    if case.poison in PLACES:
-        viewmat = np.float64(scene["viewmats"][0])
-        rows[case.row] = (np.array([0, 0, PLACES[case.poison]]) - viewmat[:3, 3]) @ viewmat[:3, :3]
-    else:
-        table = INTEGERS if case.input == "reads" else POISONS
-        at = case.row if case.column < 0 else (case.row, *np.unravel_index(case.column, rows.shape[1:]))
-        with np.errstate(over="ignore"):  # 1e38 is an infinity in float16
-            rows[at] = np.asarray(table[case.poison]).astype(rows.dtype)
-    return scene | {case.input: array}
 
 
 @functools.lru_cache(maxsize=64)
@@ -327,23 +218,6 @@ def check(case: Case) -> tuple[str, str]:
 
 def _said(what: str, names: list[str]) -> str:
     return f"{what}: {', '.join(names)}" if names else ""
-
-
-def cases(seed: int) -> Iterator[Case]:
-    """Without end: scene after scene in every mode, every poison in a random row of every input."""
-    for scene_seed in itertools.count(seed):
-        for mode in MODES:
-            rng = np.random.default_rng([scene_seed, len(mode)])
-            for name in INPUTS:
-                shape = scene_of(mode, scene_seed)[name].shape
-                shape = shape if name in PER_GAUSSIAN else shape[1:]
-                columns = {-1, int(rng.integers(np.prod(shape[1:], dtype=int)))} if len(shape) > 1 else {-1}
-                row = int(rng.choice([0, shape[0] - 1, *rng.integers(shape[0], size=4)]))
-                poisons = INTEGERS if name == "reads" else POISONS
-                for column, poison in itertools.product(sorted(columns), poisons):
-                    yield Case(mode, scene_seed, name, row, column, poison)
-                for place in PLACES if name == "means" else ():
-                    yield Case(mode, scene_seed, name, row, -1, place)
 
 
 def main() -> None:

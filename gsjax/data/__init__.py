@@ -5,13 +5,14 @@ from gsjax.data.colmap import read_colmap
 from gsjax.data.endonerf import read_endonerf
 from gsjax.data.endovis import read_endovis
 from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.objects import PointModel, Truth
 from gsjax.data.open import ReadOptions, open_photographs, open_sequence
 from gsjax.data.open3d_rgbd import read_open3d
 from gsjax.data.panoptic import read_panoptic, write_panoptic
 from gsjax.data.photographs import Cloud, Photographs, photographs_of
 from gsjax.data.poses_bounds import read_dynerf, read_llff
 from gsjax.data.push_t import read_push_t
-from gsjax.data.sequence import PointModel, Sequence, Truth
+from gsjax.data.sequence import Sequence
 from gsjax.data.seven_scenes import read_seven_scenes
 from gsjax.data.transforms import read_transforms
 from gsjax.data.tum import read_tum

@@ -20,7 +20,7 @@ def associate(
 
     Args:
         path: what messages name.
-        streams: the times of each in seconds, by name. The first one's frames are those of the recording.
+        streams: the times of each [n] in seconds, by name. The first one's frames are those of the recording.
         max_skew: seconds. What moves at 1 m/s is seen that many metres beside itself at most.
 
     Returns:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_image, read_mask
 from gsjax.data.frame_folders import (
+    DEFAULT_RATE_HZ,
     expect_one_size,
     frame_numbers,
     pictures,
@@ -26,9 +27,6 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, Tool, check_tool, find_masks, tool_labels
 from gsjax.data.video import Video, describe_video
 from gsjax.geometry.cameras import intrinsics
-
-DEFAULT_RATE_HZ = 30.0
-"""Of frames in a folder, which do not say it."""
 
 FIELD_OF_VIEW_DEGREES = 60.0
 """From left to right, of a camera of which nothing is known: about that of a da Vinci robot's endoscope."""
@@ -98,7 +96,13 @@ def read_clip(
 
 
 def is_clip(root: Path, images: str = "images", masks: str | None = None) -> bool:
-    """Whether it is a video, or a folder of frames with masks."""
+    """Whether it is a video, or a folder of frames with masks.
+
+    Args:
+        root: the file or folder.
+        images: the folder of frames in it.
+        masks: the folder of masks, where the user names one.
+    """
     if root.suffix.lower() in SUFFIXES and root.is_file():
         return True
     return (find_masks(root) is not None or masks is not None) and bool(_frames_in(root, images))

@@ -20,16 +20,17 @@ from gsjax.data import poses_bounds
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_arrays, read_depth, read_image, read_json, read_mask
 from gsjax.data.frame_folders import (
+    DEFAULT_RATE_HZ,
     expect_one_size,
     frame_numbers,
     pictures,
     pictures_beside,
     warn_of_single_frame,
 )
-from gsjax.data.sequence import Sequence, Truth
+from gsjax.data.objects import Truth
+from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TOOL, Tool, check_tool, find_masks, tool_labels
 
-DEFAULT_RATE_HZ = 30.0
 DEFAULT_DEPTH_UNIT_M = 0.001
 RIGHT = "right"
 """The folder of the other eye."""

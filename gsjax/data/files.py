@@ -86,6 +86,10 @@ def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height
     """An 8-bit colour image, RGB, as its pixels are stored: that is how cameras are calibrated, whatever its
     EXIF data says of its orientation.
 
+    Args:
+        path: the file.
+        width, height: that it has to have, pixels.
+
     Raises:
         DataError: the file is missing, cut off, not an image, or not of this size.
     """
@@ -96,6 +100,10 @@ def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height
 
 def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width channels"]:
     """An image with 3 channels, RGB, or 4 where it is transparent somewhere; 16 bits become 8.
+
+    Args:
+        path: the file.
+        width, height: that it has to have, pixels.
 
     Raises:
         DataError: the file is missing, cut off, not an image, or not of this size.
@@ -114,9 +122,14 @@ def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height 
 
 
 def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.ndarray, "height width"]:
-    """Depth in metres (float32, 0 = invalid) from a 16-bit image in units of `unit_m` metres.
+    """Depth in metres (float32, 0 = invalid) from a 16-bit image.
 
     0 and 65535 are invalid.
+
+    Args:
+        path: the file.
+        unit_m: metres of one step.
+        width, height: that it has to have, pixels.
 
     Raises:
         DataError: the file is missing, cut off, not a 16-bit single-channel image, or not of this size.
@@ -132,6 +145,10 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
 
 def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
     """Integer labels, int32. A mask saved as a grey image of three equal channels is read as one.
+
+    Args:
+        path: the file.
+        width, height: that it has to have, pixels.
 
     Raises:
         DataError: the file is missing, cut off, of several differing channels, or not of this size.

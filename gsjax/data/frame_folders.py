@@ -8,6 +8,10 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+
+DEFAULT_RATE_HZ = 30.0
+"""Frames a second, where the data do not say when they were taken."""
+
 _NUMBER = re.compile(r"\d+")
 
 
@@ -21,7 +25,11 @@ def pictures(folder: Path) -> list[Path]:
 
 def pictures_beside(folder: Path, count: int, frames: str) -> list[Path]:
     """As many pictures as there are frames: the masks or depth images of a recording, by order of name.
-    `frames` is what the frames' folder or file is called.
+
+    Args:
+        folder: of the pictures.
+        count: how many frames there are.
+        frames: what their folder or file is called, for messages.
 
     Raises:
         DataError: there are more or fewer.

@@ -35,6 +35,9 @@ class Lens(NamedTuple):
 def matrix_of(K: Float[np.ndarray, "..."] | tuple[float, ...]) -> Float[np.ndarray, "3 3"]:
     """Intrinsics that were given as a matrix or as fx, fy, cx, cy.
 
+    Args:
+        K: [3, 3], or [4] with fx, fy, cx, cy; pixels.
+
     Raises:
         ValueError: they are neither.
     """
@@ -54,8 +57,14 @@ def shrunk(
     """K, which is of a photograph of the size that a calibration says, for the size that it has: photographs
     are often made smaller after calibration.
 
+    Args:
+        K: of the size that was calibrated.
+        said: width and height that the calibration says, pixels.
+        actual: width and height of the photograph, pixels.
+        where: what messages name.
+
     Raises:
-        DataError: the calibration's size is none, or of another shape; `where` says of what.
+        DataError: the calibration's size is none, or of another shape.
     """
     if min(said) <= 0:
         found = f"{said[0]:g}x{said[1]:g}"
@@ -74,6 +83,10 @@ def straighten(
     lens: Lens, width: int, height: int
 ) -> tuple[Float[np.ndarray, "3 3"], Callable[[np.ndarray, int], np.ndarray]]:
     """A pinhole camera that sees only what the photograph shows, of the same size, and how to get its view.
+
+    Args:
+        lens: that bent the photograph.
+        width, height: of the photograph, pixels.
 
     Returns:
         K of that camera, and (picture, interpolation of OpenCV) -> picture as that camera sees it.

@@ -18,12 +18,12 @@ from jaxtyping import Float
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.lens import matrix_of
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
 
 DEPTH_UNIT_M = 0.001
-_RATE_HZ = 30.0
 _IMAGES = ("image", "color", "rgb")
 _TRAJECTORIES = (
     "trajectory.log",
@@ -95,7 +95,7 @@ def read_open3d(
         camera_ids=(0,),
         width=width,
         height=height,
-        times=np.array(numbers) / _RATE_HZ,
+        times=np.array(numbers) / DEFAULT_RATE_HZ,
         frame_ids=tuple(numbers),
         Ks=np.broadcast_to(matrix, (len(numbers), 1, 3, 3)),
         viewmats=np.linalg.inv(to_world),

@@ -21,10 +21,21 @@ _MILLIMETRE = 1e-3
 class Capture(Protocol):
     """What is used of `cv2.VideoCapture`."""
 
-    def isOpened(self) -> bool: ...
-    def get(self, propId: int) -> float: ...
-    def grab(self) -> bool: ...
-    def retrieve(self, *, flag: int = 0) -> tuple[bool, np.ndarray]: ...
+    def isOpened(self) -> bool:
+        """Whether there is such a camera."""
+        ...
+
+    def get(self, propId: int) -> float:
+        """A property by OpenCV's number; 0 where it has none."""
+        ...
+
+    def grab(self) -> bool:
+        """Take the next frame; False where none comes."""
+        ...
+
+    def retrieve(self, *, flag: int = 0) -> tuple[bool, np.ndarray]:
+        """One picture of the frame taken, [H,W] or [H,W,3], and whether there is one."""
+        ...
 
 
 class RgbdCamera(NamedTuple):
@@ -56,7 +67,16 @@ def open_camera(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) -> 
 
 
 def described(index: int, capture: Capture, viewmat: Float[np.ndarray, "4 4"]) -> RgbdCamera:
-    """`capture` with its intrinsics. Raises DataError as `open_camera` does."""
+    """An RGB-D camera that is open, with its intrinsics.
+
+    Args:
+        index: as OpenCV counts it, for messages.
+        capture: the open camera.
+        viewmat: world to camera, OpenCV axes.
+
+    Raises:
+        DataError: as `open_camera`.
+    """
     what, expected = f"camera {index}", "an RGB-D camera of OpenCV's OpenNI 2 backend"
     if not capture.isOpened():
         found = "none that opens"

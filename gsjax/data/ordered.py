@@ -6,13 +6,11 @@ import re
 import numpy as np
 
 from gsjax.data.errors import DataError
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
-
-DEFAULT_RATE_HZ = 30.0
-"""Of photographs, where the data do not say when they were taken."""
 
 
 def open_in_time(dataset: str, read: ReadOptions | None = None) -> Sequence:

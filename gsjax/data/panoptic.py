@@ -20,12 +20,13 @@ import numpy as np
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import SATURATED_DEPTH, read_arrays, read_depth, read_image, read_json, read_mask
-from gsjax.data.sequence import Sequence, Truth
+from gsjax.data.frame_folders import DEFAULT_RATE_HZ
+from gsjax.data.objects import Truth
+from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses
 from gsjax.geometry.joints import Joint
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
-DEFAULT_RATE_HZ = 30.0
 DEFAULT_DEPTH_UNIT_M = 0.001
 _JOINTS = {"slide": "prismatic", "hinge": "revolute"}
 _JOINT_KEYS = ("axis_world", "point_world")

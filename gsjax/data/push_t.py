@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from gsjax.data.association import associate
 from gsjax.data.errors import DataError
 from gsjax.data.files import read_arrays, read_json
-from gsjax.data.sequence import PointModel, Sequence
+from gsjax.data.objects import PointModel
+from gsjax.data.sequence import Sequence
 from gsjax.data.video import Video
 from gsjax.geometry.cameras import viewmat_from_opengl
 from gsjax.geometry.neighbors import neighbor_spacing

@@ -17,6 +17,11 @@ def write_stills(video: Path, folder: Path, count: int) -> list[str]:
     """Write the sharpest frame of each of `count` equal stretches of a video as frame_NUMBER.jpg, upright as
     players show it; all frames where it has fewer.
 
+    Args:
+        video: the file.
+        folder: where pictures go; it is made.
+        count: how many, at most.
+
     Returns:
         Their names, in order of time.
 

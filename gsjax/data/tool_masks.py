@@ -62,6 +62,12 @@ def check_tool(load: Callable[[int], np.ndarray], frames: int, tool: Tool, where
 
     Warns with DataWarning where the tool covers more than half of the picture in more than half of them.
 
+    Args:
+        load: frame to labels, as `tool_labels` gives them.
+        frames: how many there are.
+        tool: what it is in masks, "white" or "black".
+        where: what messages name.
+
     Raises:
         DataError: it covers all of every picture.
     """

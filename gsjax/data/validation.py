@@ -16,7 +16,13 @@ FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
 
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless `array` has `shape`."""
+    """Raises ValueError unless an array has a shape.
+
+    Args:
+        name: of the array, for the message.
+        array: what is looked at.
+        shape: what it has to be.
+    """
     if np.shape(array) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(array)}")
 
@@ -25,6 +31,12 @@ def check_poses(
     name: str, poses: Float[np.ndarray, "frames things 4 4"], where: Callable[[int, int], str], advice: str
 ) -> None:
     """Checks that every matrix is a rigid motion.
+
+    Args:
+        name: what the matrices are called.
+        poses: of things in frames.
+        where: (frame, thing) to words, for the message.
+        advice: with which it ends.
 
     Raises:
         ValueError: a matrix is not finite, its last row is not 0 0 0 1, or its upper left 3x3 is no rotation;

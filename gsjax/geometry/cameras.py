@@ -62,13 +62,25 @@ def look_at(
 def intrinsics(
     focal: float, width: int, height: int, center: tuple[float, float] | None = None
 ) -> Float[np.ndarray, "3 3"]:
-    """K of a camera with square pixels; the principal point is the middle of the image unless told."""
+    """K of a camera with square pixels; the principal point is the middle of the image unless told.
+
+    Args:
+        focal: pixels, of both axes.
+        width, height: of the image, pixels.
+        center: principal point (cx, cy), pixel centres at +0.5.
+    """
     cx, cy = center or (width / 2, height / 2)
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
 
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
-    """The same view in pictures of another size, whose pixels are 1 / `scale` times as wide."""
+    """The same view in pictures of another size, whose pixels are 1 / `scale` times as wide.
+
+    Args:
+        camera: of the pictures as they are.
+        scale: pixels of the new ones for each of these.
+        width, height: of the new ones, pixels.
+    """
     K = camera.K * jnp.array([[scale], [scale], [1.0]])
     return Camera(camera.viewmat, K, width, height, camera.near)
 
@@ -81,7 +93,13 @@ def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) 
 def project(
     points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
-    """Pixel positions and depths of world points in one camera; those nearer than 1e-6 m as if there."""
+    """Pixel positions and depths of world points in one camera; those nearer than 1e-6 m as if there.
+
+    Args:
+        points: world, metres.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics, pixels.
+    """
     local = world_to_camera(points, viewmat)
     z = local[..., 2]
     homogeneous = jnp.matmul(local, K.T, precision="highest")
@@ -132,7 +150,13 @@ def unproject(
     viewmat: Float[Array, "4 4"],
     K: Float[Array, "3 3"],
 ) -> Float[Array, "*n 3"]:
-    """World points at z-depth `depths` behind `pixels` of one camera; the inverse of `project`."""
+    """World points at z-depth `depths` behind `pixels` of one camera; the inverse of `project`.
+
+    Args:
+        pixels: (x, y), centres at +0.5.
+        depths: along the optical axis, metres.
+        viewmat, K: of the camera, as for `project`.
+    """
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * (pixels[..., 1] - K[1, 2]) / K[1, 1]) / K[0, 0]
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     local = jnp.stack([x, y, jnp.ones_like(x)], axis=-1) * depths[..., None]

@@ -60,6 +60,11 @@ def distort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv")
     Far out the polynomials fold back, and a point that the camera cannot see may land in the image. What is
     not finite, or so far out that r^6 is not, becomes NaN with gradients of zero; if coefficients are not
     finite, all points do.
+
+    Args:
+        points: normalised, (X/Z, Y/Z).
+        coeffs: of the lens, in the order above.
+        model: "opencv" or "opencv_fisheye".
     """
     c, sound = _padded(coeffs, model)
     r2 = jnp.sum(points * points, axis=-1, keepdims=True)
@@ -76,6 +81,10 @@ def undistort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv
     Not valid are points beyond the fold (nothing is distorted to there), those nearer to it than a condition
     number of 1e4, those 90 degrees off axis, and what is not finite; no point is if coefficients are not.
     There the result is finite and its gradients are zero.
+
+    Args:
+        points: normalised, as the lens shows them.
+        coeffs, model: of the lens, as for `distort`.
     """
     c, sound = _padded(coeffs, model)
     dtype = jnp.result_type(points, c)
@@ -143,8 +152,14 @@ def distort_image(
     """A rendered pinhole image as the camera with this lens sees it: how a lens is fitted to photographs.
 
     Differentiable in image, K, pinhole_K and coeffs. What a lens pulls in from outside the frame has to be
-    rendered too: render with `with_margin`, and ask for the `size` (width, height) of the photograph. Do not
+    rendered too: render with `with_margin`, and ask for the `size` of the photograph. Do not
     leave out of a loss what is not valid: a lens that folds everything away would cost nothing.
+
+    Args:
+        image: the rendered one.
+        K, coeffs, model: of the camera with the lens, as for `undistort_map`.
+        pinhole_K: of the rendered image; K unless given.
+        size: (width, height) of the result, the image's unless given.
     """
     width, height = size or image.shape[1::-1]
     pixels, valid = distort_map(K, coeffs, width, height, pinhole_K, model)

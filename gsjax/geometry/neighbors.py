@@ -8,7 +8,13 @@ from scipy.spatial import cKDTree
 def nearest(
     queries: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"], max_distance: float = np.inf
 ) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-    """Index of the nearest point of each query, and its distance in metres; -1 and inf where none is near."""
+    """Index of the nearest point of each query, and its distance in metres; -1 and inf where none is near.
+
+    Args:
+        queries: metres.
+        points: among which they look, metres.
+        max_distance: farther ones are none, metres.
+    """
     if len(points) == 0:
         return np.full(len(queries), -1), np.full(len(queries), np.inf)
     distances, indices = cKDTree(points).query(queries, distance_upper_bound=max_distance)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 MIN_SQUARED_NORM = 1e-12
-"""Below this |q|^2 a quaternion names no rotation (RASTERIZER.md, constants)."""
+"""Below this |q|^2 a quaternion names no rotation; the rasterizer culls a Gaussian that has it."""
 
 
 def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:

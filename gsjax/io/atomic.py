@@ -70,6 +70,11 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
 def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
     """Write named arrays as an .npz that loads with `allow_pickle=False`, compressed unless told.
 
+    Args:
+        path: the file; its folder has to be there.
+        arrays: by name.
+        compress: smaller, and slower to write.
+
     Raises:
         ValueError: an array holds Python objects, which only pickle could store.
     """

@@ -60,6 +60,11 @@ def write_ply(
 ) -> None:
     """Write Gaussians (and their `labels`) as a binary little-endian PLY of float32; atomic.
 
+    Args:
+        path: the file.
+        gaussians: on the host or a device.
+        labels: integers [N], which become a column.
+
     Raises:
         ValueError: `labels` are not one integer a Gaussian.
     """

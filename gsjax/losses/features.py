@@ -55,7 +55,13 @@ def likeness(
 def likeness_to_map(
     rendered: Float[Array, "*pixels c"], weights: Float[Array, "d c"], target: Float[Array, "*pixels d"]
 ) -> Likeness:
-    """Of pixels to a feature of their own each."""
+    """Of pixels to a feature of their own each.
+
+    Args:
+        rendered: g.
+        weights: W.
+        target: e.
+    """
     lifted = jnp.matmul(rendered, weights.T, precision="highest")
     return Likeness(
         jnp.sum(lifted**2, axis=-1), jnp.sum(lifted * target, axis=-1), jnp.sum(target**2, axis=-1)
@@ -69,6 +75,11 @@ def feature_error(
 
     What is half transparent is to show half a feature, else Gaussians at the rim of the scene would have to
     have larger ones than their neighbours.
+
+    Args:
+        likeness: of W g to e.
+        alphas: how opaque each pixel is drawn.
+        dimension: D.
     """
     squared, product, target = likeness
     return (squared - 2 * alphas * product + alphas**2 * target) / dimension

@@ -1,8 +1,9 @@
 """A graph over nodes seen at several times, and what a teacher's features ask of it (papers/003, section 2.3,
 and papers/004, section 3.3).
 
-Nodes are points picked from those of each frame. Frames, nodes and edges are as many everywhere, with masks
-for what is absent. Edges lead to the nearest nodes of the same frame and to those of others that match:
+Nodes are points picked from those of each frame (`gsjax.geometry.sampling`). Frames, nodes and edges are as
+many everywhere, with masks for what is absent. Edges lead to the nearest nodes of the same frame and to those
+of others that match:
 
     edges = spatial_edges(positions, k=8) | temporal_edges(teacher, k=4, window=2)
     weights = edge_weights(positions, teacher, times, edges, tau_x=0.02, tau_t=0.5)
@@ -22,7 +23,6 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import groupby
 from operator import or_
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,52 +38,6 @@ Features = Float[Array, "t n d"]
 There = Bool[Array, "t n"]
 
 _LEAST = 1e-12  # squared: what is shorter has no direction
-
-
-# -- nodes ---------------------------------------------------------------------------------------------------
-
-
-class Sample(NamedTuple):
-    """Points picked from many: their indices, and False where none was left to pick."""
-
-    indices: Int[Array, "count"]
-    valid: Bool[Array, "count"]
-
-
-def farthest_points(points: Float[Array, "n c"], count: int, valid: Bool[Array, "n"] | None = None) -> Sample:
-    """Points that cover all: the one farthest from the mean, then always the one farthest from those picked.
-    So none is farther from the nearest picked one than any two of those are from each other.
-
-    Args:
-        points: positions. One that is not finite is not picked, nor a second one at the same place.
-        count: how many.
-        valid: which may be picked; all unless given.
-
-    Raises:
-        ValueError: `count` is below 1.
-    """
-    if count < 1:
-        raise ValueError(f"count={count}: expected 1 or more")
-    points, there = _present(points, valid)
-    axes, places = tuple(points.T), jnp.arange(len(points))
-    mean = points.sum(axis=0) / jnp.maximum(there.sum(), 1)
-
-    # A sum over a short last axis, and argmax, would take seven times as long on a CPU.
-    def squared_to(point):
-        return sum((axis - at) ** 2 for axis, at in zip(axes, point, strict=True))
-
-    def farthest(apart):
-        return jnp.min(jnp.where(apart == apart.max(), places, len(points) - 1))
-
-    def pick(carry, _):
-        apart, picked, found = carry
-        apart = jnp.minimum(apart, squared_to(points[picked]))
-        following = farthest(apart)
-        return (apart, following, apart[following] > 0), (picked, found)
-
-    first = farthest(jnp.where(there, squared_to(mean), -1.0))
-    start = jnp.where(there, jnp.inf, -1.0).astype(points.dtype), first, there.any()
-    return Sample(*jax.lax.scan(pick, start, length=count)[1])
 
 
 # -- edges ---------------------------------------------------------------------------------------------------
@@ -120,7 +74,13 @@ class Matching:
 
 
 def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: There | None = None) -> Edges:
-    """From each node to its `k` nearest of the same frame."""
+    """From each node to its `k` nearest of the same frame.
+
+    Args:
+        positions: metres, of n nodes in t frames.
+        k: edges from each node.
+        valid: which nodes are there; all unless given.
+    """
     positions, there = _present(positions, valid)
     return _strongest(lambda _: -_squared_distances(positions), there, k)
 
@@ -131,6 +91,13 @@ def temporal_edges(
     """From each node to the `k` of highest affinity in every other frame at most `window` away (Algorithm 1).
 
     One matrix serves both ways, its rows for the later frame and its columns for the earlier.
+
+    Args:
+        features: of n nodes in t frames.
+        k: edges from each node into each other frame.
+        window: frames.
+        valid: which nodes are there; all unless given.
+        matching: how features become affinities.
 
     Raises:
         ValueError: `window` is below 1.
@@ -143,7 +110,14 @@ def temporal_edges(
 
 def similar_edges(features: Features, k: int, window: int = 0, valid: There | None = None) -> Edges:
     """From each node to the `k` of highest cosine in its own frame (papers/004, eq. 7), or with a `window` in
-    every other frame at most that far away. None from or to a feature without a length."""
+    every other frame at most that far away. None from or to a feature without a length.
+
+    Args:
+        features: of n nodes in t frames.
+        k: edges from each node into each frame.
+        window: frames; 0 for the own one.
+        valid: which nodes are there; all unless given.
+    """
     features, there = _present(features, valid)
     squared = jnp.sum(features**2, axis=-1)
     there &= squared > _LEAST
@@ -198,6 +172,12 @@ def affinities(
     layer-normalised features, at temperature tau sqrt(d).
 
     No node is matched with itself: that score is the highest there is, and would take most of its row.
+
+    Args:
+        features: of n nodes in t frames.
+        offset: frames between the two that are matched, 0 or more.
+        valid: which nodes are there; all unless given.
+        matching: temperature, slack and iterations.
     """
     features, there = _present(features, valid)
     scores = _products(_layer_normalized(features), offset)
@@ -225,6 +205,12 @@ def edge_affinities(
 
     For rows of A sum to 1: with twice the nodes its entries, and a loss of them, would be half of what they
     were.
+
+    Args:
+        features: of n nodes in t frames.
+        edges: between them.
+        valid: which nodes are there; all unless given.
+        matching: how features become affinities.
     """
     _, there = _present(features, valid)
     known = {reach: affinities(features, reach, there, matching) for reach in {*map(abs, edges.offsets)}}
@@ -244,7 +230,13 @@ def edge_affinities(
 
 def orthonormal_projection(key: PRNGKeyArray, channels: int, width: int) -> Float[Array, "width channels"]:
     """A random map of `channels` numbers to `width`, for a teacher's features: V = F W^T. Its rows are
-    orthonormal, or its columns where `width` is the larger."""
+    orthonormal, or its columns where `width` is the larger.
+
+    Args:
+        key: another one gives another map.
+        channels: of the teacher.
+        width: of what comes out.
+    """
     return jax.nn.initializers.orthogonal()(key, (width, channels))
 
 
@@ -253,7 +245,13 @@ def node_loss(
     teacher: Float[Array, "*nodes d"],
     valid: Bool[Array, "*nodes"] | None = None,
 ) -> Float[Array, ""]:
-    """L_node (eq. 11): the mean over nodes of |V^G - V^F|."""
+    """L_node (eq. 11): the mean over nodes of |V^G - V^F|.
+
+    Args:
+        features: V^G, those that learn.
+        teacher: V^F, which gets no gradient.
+        valid: which nodes are there; all unless given.
+    """
     teacher, known = _present(jax.lax.stop_gradient(teacher), valid)
     features, there = _present(features, known)
     squared = jnp.where(there, jnp.sum((features - teacher) ** 2, axis=-1), 0.0)
@@ -275,8 +273,12 @@ def structure_loss(
     Over `all_edges` without weights it is the mean L1 distance between rows of A, 0 to 2.
 
     Args:
+        features: those that learn.
+        edges: of the graph.
         wanted: the teacher's, from `edge_affinities`.
         weights: of edges, from `edge_weights`; all alike unless given.
+        valid: which nodes are there; all unless given.
+        matching: how features become affinities, as for `wanted`.
     """
     features, there = _present(features, valid)
     live = _live(edges, there) * 1.0
@@ -290,6 +292,11 @@ def similarity_loss(features: Features, edges: Edges, valid: There | None = None
 
     L_s and L_t are this of `similar_edges` of the teacher, within frames and with a window, each with its own
     weight. Features that are all alike have no such loss: something else has to tell them apart.
+
+    Args:
+        features: those that learn.
+        edges: between nodes that are to be alike.
+        valid: which nodes are there; all unless given.
     """
     features, there = _present(features, valid)
     cosines, known = _edge_cosines(features, edges, there)

@@ -23,7 +23,13 @@ def l1_loss(
     target: Float[Array, "*n channels"],
     weights: Float[Array, "*n"] | None = None,
 ) -> Float[Array, ""]:
-    """Mean absolute difference over channels and (weighted) pixels."""
+    """Mean absolute difference over channels and (weighted) pixels.
+
+    Args:
+        image: what is drawn.
+        target: what was recorded.
+        weights: of pixels; all alike unless given.
+    """
     difference = jnp.abs(image - target).mean(-1)
     return difference.mean() if weights is None else weighted_mean(difference, weights)
 
@@ -31,7 +37,14 @@ def l1_loss(
 def truncated_l1(
     values: Float[Array, "*n"], targets: Float[Array, "*n"], weights: Float[Array, "*n"], limit: float
 ) -> Float[Array, ""]:
-    """Weighted mean of min(|difference|, limit): what is further off is of something else."""
+    """Weighted mean of min(|difference|, limit): what is further off is of something else.
+
+    Args:
+        values: what is drawn, depths say.
+        targets: what was recorded.
+        weights: 0 where nothing was.
+        limit: in the unit of the values.
+    """
     return weighted_mean(jnp.minimum(jnp.abs(values - targets), limit), weights)
 
 
@@ -125,6 +138,12 @@ def _slope(x: Float[Array, "n h w"], y: Float[Array, "n h w"], m: _Moments) -> F
 def photometric_loss(
     image: Float[Array, "c h w k"], target: Float[Array, "c h w k"], dssim_weight: float = 0.2
 ) -> Float[Array, ""]:
-    """(1 - w) L1 + w (1 - SSIM) / 2."""
+    """(1 - w) L1 + w (1 - SSIM) / 2 (Kerbl et al. 2023, eq. 7).
+
+    Args:
+        image: C pictures, 0 to 1.
+        target: what was recorded.
+        dssim_weight: w, 0 to 1.
+    """
     dssim = (1 - ssim(image, target)) / 2
     return (1 - dssim_weight) * l1_loss(image, target) + dssim_weight * dssim

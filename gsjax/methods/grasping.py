@@ -153,6 +153,11 @@ def sample_poses(
 
     The draws are made relative to the object (a direction across the normal is that to another of its
     points), so the poses turn with it; only `approach` is the world's.
+
+    Args:
+        key: of the draws.
+        points, normals, valid, gripper, approach, max_angle: as for `best_grasp`.
+        samples: how many poses, static.
     """
     points, normals, valid = _usable(points, normals, valid)
     where, toward, tilt, roll, insert = jax.random.split(key, 5)
@@ -189,7 +194,8 @@ def score_grasp(
     The fingers close along y on all points that are as far along x and z as they are, and the grasp's pose is
     `pose` moved along y to the middle of those. It is feasible if they fit between the open fingers, both
     contacts are in friction's cone, and neither the palm nor the fingers on their way from open to closed hit
-    anything. The arguments are those of `best_grasp`.
+    anything. Arguments as for `best_grasp`, and `pose`, the
+    tool's in the world.
     """
     points, normals, valid = _usable(points, normals, valid)
     sound = jnp.isfinite(pose).all()

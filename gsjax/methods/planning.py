@@ -51,6 +51,9 @@ def straight_line(
         funnel: half the angle of the cone about the approach line in which the tool may come nearer, radians.
         lift: how far the closed gripper rises along `up`, metres.
         steps: waypoints of each of the four legs, static.
+        start: where the tool is.
+        grasp: the goal.
+        up: direction of the lift, world.
     """
     goal = jaxlie.SE3.from_matrix(grasp.pose)
     approach = grasp.pose[:3, 2]

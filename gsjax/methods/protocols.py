@@ -92,7 +92,13 @@ class LanguageEncoder(Protocol):
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """A vector for each of the labels 1 to `count`; zeros for one that no pixel has."""
+        """A vector for each of the labels 1 to `count`; zeros for one that no pixel has.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            labels: of its pixels, 0 the background.
+            count: the largest label that is asked for.
+        """
         ...
 
     def embed_text(self, text: str) -> Float[np.ndarray, "D"]:

@@ -4,6 +4,12 @@ import numpy as np
 
 
 def whose_turn(seed: int, step: int, count: int) -> int:
-    """All views in a random order, and then in another; the same for the same seed and step."""
+    """All views in a random order, and then in another; the same for the same seed and step.
+
+    Args:
+        seed: of the orders.
+        step: 0 and up.
+        count: how many views.
+    """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng((seed, epoch)).permutation(count)[place])

@@ -37,10 +37,7 @@ def psnr(
     image, reference = _same_shape(image, reference)
     squared = (image - reference) ** 2
     if mask is not None:
-        mask = np.asarray(mask)
-        if mask.shape != image.shape[:2]:
-            raise ValueError(f"mask: got shape {mask.shape}, want {image.shape[:2]} to match image")
-        squared = squared[mask]
+        squared = squared[_checked(mask, image)]
     if squared.size == 0:
         return float("nan")
     mean = float(np.mean(squared))
@@ -81,9 +78,7 @@ def ssim(
     )
     if mask is None:
         return float(mean)
-    mask = np.asarray(mask)
-    if mask.shape != image.shape[:2]:
-        raise ValueError(f"mask: got shape {mask.shape}, want {image.shape[:2]} to match image")
+    mask = _checked(mask, image)
     return float(np.mean(similarity[mask])) if mask.any() else float("nan")
 
 
@@ -93,7 +88,13 @@ def with_matched_colors(
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width 3"]:
     """The image under the affine map of its colours that brings it nearest to the target, by least squares:
-    what is left is no difference in exposure or white balance."""
+    what is left is no difference in exposure or white balance.
+
+    Args:
+        image: colours 0 to 1.
+        target: what it is brought near to.
+        mask: pixels by which the map is found; all unless given. It is applied to all.
+    """
     counted = np.ones(image.shape[:2], bool) if mask is None else mask
     colors = np.concatenate([image[counted], np.ones((int(counted.sum()), 1))], axis=1)
     map_ = np.linalg.lstsq(colors, target[counted], rcond=None)[0]
@@ -127,12 +128,7 @@ def ms_ssim(
         ValueError: the shapes do not agree, or the picture is too small for five scales.
     """
     image, reference = _same_shape(image, reference)
-    weights = None
-    if mask is not None:
-        mask = np.asarray(mask)
-        if mask.shape != image.shape[:2]:
-            raise ValueError(f"mask: got shape {mask.shape}, want {image.shape[:2]} to match image")
-        weights = mask.astype(np.float64)
+    weights = None if mask is None else _checked(mask, image).astype(np.float64)
     if min(image.shape[:2]) < MS_SSIM_LEAST_SIDE:
         raise ValueError(
             f"image: got {image.shape[:2]} pixels, want at least {MS_SSIM_LEAST_SIDE} on each side for the "
@@ -208,9 +204,7 @@ def depth_error(
     depth, reference = _same_shape(depth, reference)
     valid = np.isfinite(depth) & np.isfinite(reference) & (depth > 0) & (reference > 0)
     if mask is not None:
-        if np.shape(mask) != depth.shape:
-            raise ValueError(f"mask: got shape {np.shape(mask)}, want {depth.shape} to match depth")
-        valid &= mask
+        valid &= _checked(mask, depth, "depth")
     if not valid.any():
         return DepthError(float("nan"), float("nan"), 0)
     gap = np.abs(depth[valid] - reference[valid])
@@ -222,3 +216,10 @@ def _same_shape(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, n
     if np.shape(image) != np.shape(reference):
         raise ValueError(f"reference: got shape {np.shape(reference)}, want {np.shape(image)} like the other")
     return np.asarray(image, np.float64), np.asarray(reference, np.float64)
+
+
+def _checked(mask: np.ndarray, picture: np.ndarray, name: str = "image") -> np.ndarray:
+    """A mask that has the picture's height and width, or a ValueError that says how they differ."""
+    if np.shape(mask) != picture.shape[:2]:
+        raise ValueError(f"mask: got shape {np.shape(mask)}, want {picture.shape[:2]} to match {name}")
+    return np.asarray(mask)

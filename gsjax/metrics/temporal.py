@@ -45,6 +45,11 @@ def between_neighbors(
 
     Pairs without a number (under an empty mask) are left out; NaN if none has one.
 
+    Args:
+        compare: a score of two pictures under a mask.
+        video: [T, H, W, 3], at least two frames.
+        masks: [T, H, W], True where to compare; everywhere unless given.
+
     Raises:
         ValueError: shapes do not agree, there are fewer than two frames, or `compare` says so.
     """
@@ -58,6 +63,10 @@ def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None 
     """Mean SSIM of neighbouring frames (papers/003, section 4); 1 if nothing moves. What T-LPIPS asks a
     network, 1 - t-SSIM asks windows of 11 pixels.
 
+    Args:
+        video: [T, H, W, 3], at least two frames.
+        masks: [T, H, W], True where to compare; everywhere unless given.
+
     Raises:
         ValueError: as `between_neighbors`, or a side is below 11 pixels.
     """
@@ -68,6 +77,11 @@ def t_lpips(
     weights: LpipsWeights, video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None
 ) -> float:
     """Mean LPIPS of neighbouring frames (papers/001, section 4.1); 0 if nothing moves.
+
+    Args:
+        weights: of LPIPS.
+        video: [T, H, W, 3], at least two frames.
+        masks: [T, H, W], True where to compare; everywhere unless given.
 
     Raises:
         ValueError: as `between_neighbors`, or the frames are too small for the network.
@@ -151,6 +165,12 @@ def along_flow(
     compares: warped LPIPS and warped SSIM (papers/003, section 4), which discount motion that is explained.
 
     Elsewhere both pictures show frame t, so that a window or network that reaches there finds no difference.
+
+    Args:
+        compare: a score of two pictures under a mask.
+        video: [T, H, W, 3], at least two frames.
+        flows: how things moved in it.
+        masks: [T, H, W], True where to compare; everywhere unless given.
 
     Raises:
         ValueError: the shapes do not agree, there are fewer than two frames, or `compare` says so.

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int, Integer
 from scipy.spatial import cKDTree
 
 from gsjax.geometry.cameras import pixels_of
+from gsjax.metrics.segmentation import IGNORED_LABEL
 
-UNKNOWN_LABEL = -1
 _ORTHONORMALITY = 1e-3
 
 
@@ -69,7 +69,7 @@ def true_labels(
             f"true_labels: got {len(masks)} masks, {len(depths)} depths, {len(viewmats)} viewmats and "
             f"{len(Ks)} Ks, want one of each a camera"
         )
-    labels = np.full(len(points), UNKNOWN_LABEL, np.int32)
+    labels = np.full(len(points), IGNORED_LABEL, np.int32)
     best = np.full(len(points), np.inf)
     for mask, depth, viewmat, K in zip(masks, depths, viewmats, Ks, strict=True):
         if np.shape(mask) != np.shape(depth):

@@ -95,7 +95,13 @@ def exploration(
     gaussians: Gaussians, key: PRNGKeyArray, amount: Float[Array, ""] | float
 ) -> Float[Array, "n 3"]:
     """Noise for the means (eq. 7), S eta times `amount`, of those that are almost transparent: so they find a
-    place where they are needed, and what is opaque keeps its own."""
+    place where they are needed, and what is opaque keeps its own.
+
+    Args:
+        gaussians: of all slots.
+        key: for eta.
+        amount: the learning rate of the means, times how strong the noise is to be.
+    """
     spread = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype)
     rotations = quats_to_matrices(gaussians.quats)
     local = jnp.einsum("nji,nj->ni", rotations, spread) * gaussians.scales**2

@@ -45,6 +45,10 @@ class LevenbergMarquardt(optx.LevenbergMarquardt):
     """
 
     def terminate(self, fn, y, args, options, state, tags):
+        """As optimistix's, and also where the move that was rejected last is below the tolerances.
+
+        Arguments as for `optimistix.AbstractLeastSquaresSolver.terminate`.
+        """
         done, result = super().terminate(fn, y, args, options, state, tags)
 
         def still(at, to):
@@ -224,7 +228,12 @@ def least_squares_step(
 
 
 def reject_overflow(residual: PyTree, overflow: Bool[Array, "..."]) -> PyTree:
-    """Infinity in every value where any camera overflowed its plan, so that a solver rejects the step."""
+    """Infinity in every value where any camera overflowed its plan, so that a solver rejects the step.
+
+    Args:
+        residual: arrays of any shape.
+        overflow: of the cameras, [..., C].
+    """
     overflow = jnp.asarray(overflow).any()
     return jax.tree.map(lambda a: jnp.where(overflow, jnp.inf, a), residual)
 

@@ -20,10 +20,14 @@ from jaxtyping import Array, Bool, PyTree
 
 
 class Init(Protocol):
+    """What makes the state of a step, from the parameters."""
+
     def __call__(self, params: PyTree) -> PyTree: ...
 
 
 class Update(Protocol):
+    """What advances parameters and state by one batch, and says how it went."""
+
     def __call__(
         self, params: PyTree, state: PyTree, batch: PyTree, *, step: Any, key: Any
     ) -> tuple[PyTree, PyTree, dict[str, Any]]: ...

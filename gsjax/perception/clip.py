@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Num
 
+from gsjax.perception import weights
 from gsjax.perception.pictures import square_crop, to_bytes
-from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
-
-_FILES = ("preprocessor_config.json|processor_config.json", "tokenizer.json|vocab.json")
 
 
 @dataclass(frozen=True)
@@ -61,6 +59,11 @@ class ClipEncoder:
         """The vector of a square crop around each of the labels 1 to `count`; zeros for one without pixels.
 
         What surrounds an object stays in its crop: CLIP was trained on pictures, not on cut-outs.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            labels: of its pixels, 0 the background.
+            count: the largest label that is asked for.
         """
         vectors = np.zeros((count, self.model.config.projection_dim), np.float32)
         there = [label for label in range(1, count + 1) if (labels == label).any()]
@@ -78,12 +81,12 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    folder = weights_folder(path, "CLIP's weights", _FILES, "openai/clip-vit-large-patch14")
-    torch, transformers = foundation_modules("CLIP")
-    model = transformers.CLIPModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
-    # The processor that needs no torchvision.
-    processor = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
-    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **LOCAL_FILES)
+    files = (weights.PROCESSOR, "tokenizer.json|vocab.json")
+    folder = weights.model_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")
+    torch, transformers = weights.foundation_modules("CLIP")
+    model = transformers.CLIPModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    processor = weights.image_processor(transformers, folder)
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **weights.LOCAL_FILES)
     return ClipEncoder(model, processor, tokenizer, torch, device)
 
 

@@ -78,7 +78,13 @@ class ClosedVocabulary:
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """A unit vector for each of the labels 1 to `count`; zeros for one that no pixel has."""
+        """A unit vector for each of the labels 1 to `count`; zeros for one that no pixel has.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1.
+            labels: of its pixels, 0 the background.
+            count: the largest label that is asked for.
+        """
         areas = np.bincount(labels[labels >= 0].ravel(), minlength=count + 1)[1 : count + 1]
         colors = color_words(image)
         rows = []

@@ -49,7 +49,13 @@ class ClassCodebook:
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """The vector of the name of each label, 1 to `count`; zeros for one without a name or a pixel."""
+        """The vector of the name of each label, 1 to `count`; zeros for one without a name or a pixel.
+
+        Args:
+            image: RGB, uint8 or floats 0 to 1. It is not looked at: labels alone say which names.
+            labels: of its pixels, 0 the background.
+            count: the largest label that is asked for.
+        """
         there = set(np.unique(labels).tolist())
         vectors = np.zeros((count, self._dimension), np.float32)
         for label in range(1, count + 1):

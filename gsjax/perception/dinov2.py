@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num
 
-from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
+from gsjax.perception import weights
+from gsjax.perception.pictures import in_patches
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,7 @@ class Dinov2Encoder:
         """Features of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen, nothing is cropped."""
         height, width = images.shape[1:3]
         patch = self.model.config.patch_size
-        scale = self.resolution / min(height, width)
-        rows, columns = (max(1, round(size * scale / patch)) for size in (height, width))
-        size = {"height": rows * patch, "width": columns * patch}
-        pixels = self.processor(
-            [to_bytes(image) for image in images], size=size, do_center_crop=False, return_tensors="pt"
-        )["pixel_values"]
+        pixels, rows, columns = in_patches(images, self.processor, patch, self.resolution)
         with self.torch.inference_mode():
             tokens = self.model(pixel_values=pixels.to(self.device)).last_hidden_state
             # Before the patches stand the class token and, in some models, registers.
@@ -54,15 +49,17 @@ class Dinov2Encoder:
 def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 518) -> Dinov2Encoder:
     """DINOv2, with or without registers, from a folder of weights in the layout of Hugging Face.
 
+    Args:
+        path: the folder.
+        device: of torch, "cpu" or "cuda".
+        resolution: pixels of the shorter side that the model is to see.
+
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = ("preprocessor_config.json|processor_config.json",)
-    folder = weights_folder(path, "DINOv2's weights", files, "facebook/dinov2-base")
-    torch, transformers = foundation_modules("DINOv2")
-    model = transformers.AutoModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
-    # The processor that needs no torchvision.
-    processor = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
-    return Dinov2Encoder(model, processor, torch, device, resolution)
+    folder = weights.model_folder(path, "DINOv2's weights", (weights.PROCESSOR,), "facebook/dinov2-base")
+    torch, transformers = weights.foundation_modules("DINOv2")
+    model = transformers.AutoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
+    return Dinov2Encoder(model, weights.image_processor(transformers, folder), torch, device, resolution)

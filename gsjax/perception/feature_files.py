@@ -53,6 +53,7 @@ class PictureFeatures:
 
     @property
     def dimension(self) -> int:
+        """C, numbers of a feature."""
         numbers = self.codebook if self.map is None else self.map
         assert numbers is not None
         return numbers.shape[-1]

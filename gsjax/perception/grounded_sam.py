@@ -6,24 +6,14 @@ Needs the extra `foundation`; torch and transformers are imported when models ar
 
 import os
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
+from gsjax.perception import weights
+from gsjax.perception.masks import Found, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.segmenters import name_by_size
-from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
-
-_PROCESSOR = "preprocessor_config.json|processor_config.json"
-
-
-class Found(NamedTuple):
-    """What the two models found, before it becomes labels."""
-
-    boxes: Float[np.ndarray, "n 4"]  # x0, y0, x1, y1 in pixels
-    scores: Float[np.ndarray, "n"]  # of the boxes, 0 to 1
-    masks: Bool[np.ndarray, "n H W"]
 
 
 @dataclass(frozen=True)
@@ -108,57 +98,38 @@ class GroundedSam:
         return masks[0][:, 0].numpy()
 
 
-def labels_of_masks(
-    masks: Bool[np.ndarray, "n H W"],
-    scores: Float[np.ndarray, "n"],
-    max_fraction: float = 1.0,
-    max_overlap: float = 1.0,
-) -> Int[np.ndarray, "H W"]:
-    """One label image from masks that may overlap: 0 background, 1 + the row of the mask elsewhere.
-
-    A mask with more than `max_fraction` of the picture is left out, and so is one that overlaps a mask of a
-    higher score by more than `max_overlap` (intersection over union). Where masks overlap the smaller is on
-    top: a thing lies on its tray.
-    """
-    kept: list[int] = []
-    for row in np.argsort(-scores, kind="stable"):
-        mask = masks[row]
-        overlaps = [(mask & masks[k]).sum() / max((mask | masks[k]).sum(), 1) for k in kept]
-        if 0 < mask.mean() <= max_fraction and max(overlaps, default=0.0) <= max_overlap:
-            kept.append(int(row))
-    labels = np.zeros(masks.shape[1:], np.int32)
-    for row in sorted(kept, key=lambda k: -int(masks[k].sum())):
-        labels[masks[row]] = row + 1
-    return labels
-
-
 def load_grounded_sam(
     detector: str | os.PathLike, segmenter: str | os.PathLike, device: str = "cpu", prompt: str = "object"
 ) -> GroundedSam:
     """Grounding DINO and SAM from two folders of weights in the layout of Hugging Face.
+
+    Args:
+        detector: the folder of Grounding DINO.
+        segmenter: the folder of SAM.
+        device: of torch, "cpu" or "cuda".
+        prompt: what to look for.
 
     Raises:
         FileNotFoundError: a folder or a file of it is missing.
         ValueError: a folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = (_PROCESSOR, "tokenizer.json|vocab.txt")
-    boxes = weights_folder(detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny")
-    masks = weights_folder(segmenter, "SAM's weights", (_PROCESSOR,), "facebook/sam-vit-base")
-    torch, transformers = foundation_modules("Grounded SAM")
-    # Processors that need no torchvision.
-    pictures = [
-        transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
-        for folder in (boxes, masks)
-    ]
-    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **LOCAL_FILES)
-    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **LOCAL_WEIGHTS)
-    sam = transformers.SamModel.from_pretrained(masks, **LOCAL_WEIGHTS)
+    files = (weights.PROCESSOR, "tokenizer.json|vocab.txt")
+    boxes = weights.model_folder(
+        detector, "Grounding DINO's weights", files, "IDEA-Research/grounding-dino-tiny"
+    )
+    masks = weights.model_folder(segmenter, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
+    torch, transformers = weights.foundation_modules("Grounded SAM")
+    tokenizer = transformers.AutoTokenizer.from_pretrained(boxes, **weights.LOCAL_FILES)
+    dino = transformers.GroundingDinoForObjectDetection.from_pretrained(boxes, **weights.LOCAL_WEIGHTS)
+    sam = transformers.SamModel.from_pretrained(masks, **weights.LOCAL_WEIGHTS)
     return GroundedSam(
         detector=dino.eval().to(device),
-        detector_processor=transformers.GroundingDinoProcessor(pictures[0], tokenizer),
+        detector_processor=transformers.GroundingDinoProcessor(
+            weights.image_processor(transformers, boxes), tokenizer
+        ),
         segmenter=sam.eval().to(device),
-        segmenter_processor=transformers.SamProcessor(pictures[1]),
+        segmenter_processor=transformers.SamProcessor(weights.image_processor(transformers, masks)),
         torch=torch,
         device=device,
         prompt=prompt,

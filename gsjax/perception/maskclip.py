@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from gsjax.perception.clip import ClipEncoder, load_clip
-from gsjax.perception.pictures import to_bytes
+from gsjax.perception.pictures import in_patches
 
 
 @dataclass(frozen=True)
@@ -33,19 +33,14 @@ class MaskClipEncoder:
 
     @property
     def min_score(self) -> float:
+        """A query whose best cosine is less means nothing that is seen; as of `ClipEncoder`."""
         return self.clip.min_score
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:
         """A vector a patch of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen."""
-        height, width = images.shape[1:3]
         vision, torch = self.clip.model.vision_model, self.clip.torch
         patch = self.clip.model.config.vision_config.patch_size
-        scale = self.resolution / min(height, width)
-        rows, columns = (max(1, round(size * scale / patch)) for size in (height, width))
-        size = {"height": rows * patch, "width": columns * patch}
-        pixels = self.clip.processor(
-            [to_bytes(image) for image in images], size=size, do_center_crop=False, return_tensors="pt"
-        )["pixel_values"]
+        pixels, rows, columns = in_patches(images, self.clip.processor, patch, self.resolution)
         with torch.inference_mode():
             seen = vision(
                 pixel_values=pixels.to(self.clip.device),
@@ -71,9 +66,8 @@ class MaskClipEncoder:
 def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int = 448) -> MaskClipEncoder:
     """CLIP from a folder of weights in the layout of Hugging Face, for patches.
 
-    Raises:
-        FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+    Args:
+        path, device: as for `gsjax.perception.clip.load_clip`, with its errors.
+        resolution: pixels of the shorter side that the model is to see.
     """
     return MaskClipEncoder(load_clip(path, device), resolution)

@@ -53,10 +53,10 @@ def match_points(
     photograph of 270x480.
 
     Args:
-        pictures: RGB, without lens distortion.
+        pictures: RGB, [H,W,3] each, without lens distortion.
         viewmats: world to camera, OpenCV axes.
         Ks: intrinsics in pixels, centres at +0.5.
-        masks: which pixels count; all unless given.
+        masks: which pixels count, [H,W] each; all unless given.
     """
     counted = masks or [None] * len(pictures)
     small = [_shrunk(*each) for each in zip(pictures, Ks, counted, strict=True)]
@@ -89,7 +89,14 @@ def filled_up(
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
     """`count` points, and their colours: some of those that were matched where these are more, else all of
     them and others between them, pixels drawn at random, as far away as the points that the photograph shows
-    near them."""
+    near them.
+
+    Args:
+        matched: the points between which others lie.
+        pictures, viewmats, Ks: of the photographs, [H,W,3] each, as for `match_points`.
+        count: how many points are wanted.
+        seed: of what is drawn at random.
+    """
     rng = np.random.default_rng(seed)
     if len(matched.points) > count:
         some = np.sort(rng.permutation(len(matched.points))[:count])

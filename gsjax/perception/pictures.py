@@ -1,5 +1,7 @@
 """Small things that all who look at pictures need."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8
 
@@ -23,6 +25,11 @@ def square_crop(
     """The smallest square around a mask, `margin` of its side wider on all sides; what sticks out of the
     picture repeats its border.
 
+    Args:
+        image: which the mask is of.
+        mask: True on what is cut out.
+        margin: share of the square's side.
+
     Raises:
         ValueError: the mask is empty.
     """
@@ -38,3 +45,26 @@ def square_crop(
         for begin, size in zip(start, mask.shape, strict=True)
     ]
     return image[np.ix_(*take)]
+
+
+def in_patches(
+    images: Num[np.ndarray, "C H W 3"], processor: Any, patch: int, resolution: int
+) -> tuple[Any, int, int]:
+    """Pictures as a transformer that cuts them into patches takes them, whole: nothing is cropped.
+
+    Args:
+        images: RGB, uint8 or floats 0 to 1.
+        processor: of transformers, which resizes and normalises.
+        patch: pixels a side.
+        resolution: pixels of the shorter side, rounded to whole patches.
+
+    Returns:
+        The torch tensor of pixels [C,3,rows * patch,columns * patch], and how many rows and columns of
+        patches each picture has.
+    """
+    scale = resolution / min(images.shape[1:3])
+    rows, columns = (max(1, round(side * scale / patch)) for side in images.shape[1:3])
+    size = {"height": rows * patch, "width": columns * patch}
+    pictures = [to_bytes(image) for image in images]
+    seen = processor(pictures, size=size, do_center_crop=False, return_tensors="pt")
+    return seen["pixel_values"], rows, columns

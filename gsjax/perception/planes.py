@@ -37,7 +37,13 @@ class Plane:
         valid: Bool[np.ndarray, "H W"],
         tolerance: Float[np.ndarray, "H W"],
     ) -> float:
-        """The part of the valid points that lies clearly (three tolerances) beyond the plane."""
+        """The part of the valid points that lies clearly (three tolerances) beyond the plane.
+
+        Args:
+            points: of all pixels, in the camera's frame, metres.
+            valid: where there is depth.
+            tolerance: how far from a plane its own pixels may lie, metres.
+        """
         return float(np.mean((points @ self.normal - self.offset < -3 * tolerance)[valid]))
 
     def fraction_rising(
@@ -47,7 +53,13 @@ class Plane:
         tolerance: Float[np.ndarray, "H W"],
     ) -> float:
         """The part of the pixels' rim at which the picture goes up from the plane: high on the ground that
-        things stand on or in, low on the top of a thing."""
+        things stand on or in, low on the top of a thing.
+
+        Args:
+            points: of all pixels, in the camera's frame, metres.
+            valid: where there is depth.
+            tolerance: above which a pixel rises, metres.
+        """
         rim = ndimage.binary_dilation(self.pixels, iterations=3) & ~self.pixels & valid
         rising = points @ self.normal - self.offset > tolerance
         return float(np.mean(rising[rim])) if rim.any() else 0.0

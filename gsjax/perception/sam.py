@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8
 from PIL import Image
 
-from gsjax.perception.grounded_sam import Found, labels_of_masks
+from gsjax.perception import weights
+from gsjax.perception.masks import Found, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.segmenters import name_by_size
-from gsjax.perception.weights import LOCAL_FILES, LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 
 @dataclass(frozen=True)
@@ -138,12 +137,10 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = ("preprocessor_config.json|processor_config.json",)
-    folder = weights_folder(path, "SAM's weights", files, "facebook/sam-vit-base")
-    torch, transformers = foundation_modules("SAM")
-    model = transformers.SamModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval()
-    # The processor that needs no torchvision.
-    pictures = transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
+    folder = weights.model_folder(path, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
+    torch, transformers = weights.foundation_modules("SAM")
+    model = transformers.SamModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval()
+    pictures = weights.image_processor(transformers, folder)
     pipeline = transformers.pipeline("mask-generation", model=model, image_processor=pictures, device=device)
     return SamSegmenter(pipeline, transformers.SamProcessor(pictures), torch)
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Num
 
+from gsjax.perception import weights
 from gsjax.perception.pictures import to_bytes
-from gsjax.perception.weights import LOCAL_WEIGHTS, foundation_modules, weights_folder
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,9 @@ def load_sam2(path: str | os.PathLike, device: str = "cpu") -> Sam2Propagator:
         ValueError: the folder leads to weights that are a pickle.
         ImportError: torch or transformers is not installed.
     """
-    files = ("preprocessor_config.json|processor_config.json",)
-    folder = weights_folder(path, "SAM2's weights", files, "facebook/sam2.1-hiera-tiny")
-    torch, transformers = foundation_modules("SAM2")
-    model = transformers.Sam2VideoModel.from_pretrained(folder, **LOCAL_WEIGHTS).eval().to(device)
+    folder = weights.model_folder(path, "SAM2's weights", (weights.PROCESSOR,), "facebook/sam2.1-hiera-tiny")
+    torch, transformers = weights.foundation_modules("SAM2")
+    model = transformers.Sam2VideoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
     # SAM2's own processor needs torchvision. ViT's does the same to a picture: resize, rescale, normalise.
     processor = transformers.ViTImageProcessorPil.from_pretrained(folder, local_files_only=True)
     return Sam2Propagator(model, processor, transformers.Sam2VideoInferenceSession, torch, device)

@@ -16,6 +16,7 @@ from skimage.color import rgb2lab
 from skimage.segmentation import felzenszwalb
 
 from gsjax.geometry.cameras import unproject
+from gsjax.perception.masks import name_by_size
 from gsjax.perception.pictures import unit_floats
 from gsjax.perception.planes import find_levels, find_planes, surface_normals
 
@@ -205,18 +206,6 @@ class PieceSegmenter:
         if depth is not None and K is not None and np.any(np.nan_to_num(depth) > 0):
             regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
         return name_by_size(regions, self.min_pixels)
-
-
-def name_by_size(
-    labels: Int[np.ndarray, "H W"], min_pixels: int = 1, background: int = 0
-) -> Int[np.ndarray, "H W"]:
-    """Labels renamed 1, 2, ... from the largest to the smallest; those under `min_pixels` become 0."""
-    names, inverse, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    kept = np.flatnonzero((names != background) & (counts >= min_pixels))
-    renamed = np.zeros(len(names), np.int32)
-    # A stable order, so that components of equal size keep the order in which the picture has them.
-    renamed[kept[np.argsort(-counts[kept], kind="stable")]] = np.arange(1, len(kept) + 1)
-    return renamed[inverse].reshape(labels.shape)
 
 
 def _camera_points(depth: np.ndarray, K: np.ndarray) -> Float[np.ndarray, "H W 3"]:

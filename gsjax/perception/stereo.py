@@ -47,7 +47,7 @@ def stereo_depth(
     """Depth along the left eye's axis, in the unit of the poses; 0 where no match is sure.
 
     Args:
-        left, right: RGB, uint8 or floats 0 to 1.
+        left, right: RGB, [H,W,3] both, uint8 or floats 0 to 1.
         viewmats: world to camera of both, OpenCV axes. Eyes that do not look the same way, or stand one above
             the other, are turned until they do.
         Ks: intrinsics of both in pixels, pixel centres at +0.5.

@@ -8,6 +8,7 @@ import os
 import shlex
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 _CONFIG = "config.json"
 _WHOLE, _INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -20,9 +21,11 @@ LOCAL_FILES = {"local_files_only": True, "trust_remote_code": False}
 """How transformers is to load; left alone it would ask whether to run code that lies in the folder."""
 LOCAL_WEIGHTS = LOCAL_FILES | {"use_safetensors": True}
 """How it is to load a model."""
+PROCESSOR = "preprocessor_config.json|processor_config.json"
+"""The file that says how pictures are resized and normalised, under either of its names."""
 
 
-def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
+def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
     """The folder of a model in the layout of Hugging Face, checked.
 
     Args:
@@ -56,6 +59,11 @@ def weights_folder(path: str | os.PathLike, model: str, others: tuple[str, ...],
         raise FileNotFoundError(f"{folder}: expected {model}; it lacks {lacking}, found {names}. {advice}")
     _check_no_pickles(folder)
     return folder
+
+
+def image_processor(transformers: ModuleType, folder: Path) -> Any:
+    """What resizes and normalises pictures for the model in a folder: the one that needs no torchvision."""
+    return transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
 
 
 def _check_no_pickles(folder: Path) -> None:

@@ -74,7 +74,13 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
 def needed_capacity(
     projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
 ) -> Int[Array, ""]:
-    """What `bin_gaussians` needs: exactly, if the capacity holds twice the rows; else twice the rows."""
+    """What `bin_gaussians` needs: exactly, if the capacity holds twice the rows; else twice the rows.
+
+    Args:
+        projected: what the camera sees.
+        tile_mask: tiles that are drawn; all unless given.
+        plan: whose capacity says how many rows fit.
+    """
     first_row, num_rows = _rows(projected, tile_mask, plan)
     rows = _total(num_rows)
     num_rows = jnp.where(rows <= plan.capacity // 2, num_rows, 0)

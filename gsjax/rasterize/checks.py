@@ -40,7 +40,8 @@ def check_inputs(
 ) -> tuple[tuple, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
 
-    Half precision is computed in float32; colours and features (not SH coefficients) are stored as they are.
+    Arguments as for `gsjax.rasterization`, under a plan that is resolved. Half precision is computed in
+    float32; colours and features (not SH coefficients) are stored as they are.
 
     Raises:
         ValueError: names the argument, the shape it got and the shape it wants.

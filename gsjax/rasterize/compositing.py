@@ -68,7 +68,13 @@ class TileState(NamedTuple):
 
 
 def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
-    """The state of pixels that nothing covers yet."""
+    """The state of pixels that nothing covers yet.
+
+    Args:
+        num_pixels: P.
+        channels: of what is composited.
+        dtype: of values and light.
+    """
     return TileState(jnp.zeros((channels, num_pixels), dtype), jnp.ones(num_pixels, dtype))
 
 
@@ -90,7 +96,13 @@ def splat_alphas(
 def dimmed(
     light: Float[Array, "*pixels"], alphas: Float[Array, "list *pixels"], limits: Limits
 ) -> Float[Array, "*pixels"]:
-    """The light of a TileState behind a list."""
+    """The light of a TileState behind a list.
+
+    Args:
+        light: before the list, as in a TileState.
+        alphas: of the list, front to back.
+        limits: say where a pixel ends.
+    """
     for alpha in alphas:
         after = light * (1 - alpha)
         light = jnp.where(after > limits.min_transmittance, after, -jnp.abs(light))
@@ -104,6 +116,11 @@ def splat_weights(
 
     Every row multiplies its own T_i together, in list order and so to the same bits as `dimmed`: for a short
     list that is cheaper than to store them all.
+
+    Args:
+        alphas: from `splat_alphas`.
+        light: before the list, as in a TileState.
+        limits: say where a pixel ends.
     """
     length = alphas.shape[0]
     row = np.arange(length)[:, None]
@@ -115,7 +132,10 @@ def splat_weights(
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def weights_of_many(alphas, light, limits: Limits):
-    """(`splat_weights` of a longer list, chunk by chunk; the light behind it)."""
+    """`splat_weights` [list, pixels] of a longer list, chunk by chunk, and the light [pixels] behind it.
+
+    Arguments as for `splat_weights`. The derivative is written by hand: one Gaussian after the other.
+    """
     weights = []
     for i in range(0, alphas.shape[0], CHUNK):
         piece = alphas[i : i + CHUNK]
@@ -184,7 +204,14 @@ def composite_tile(
 
 
 def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits) -> TileState:
-    """`composite_tile` of one chunk."""
+    """`composite_tile` of one chunk.
+
+    Args:
+        columns: the chunk.
+        pixels: [P, 2], relative to what the columns' means are.
+        state: so far.
+        limits: of alphas and transmittance.
+    """
     alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
     if not isinstance(columns.values, tuple):
         weights, light = weights_of_many(alphas, state.light, limits)
@@ -223,7 +250,14 @@ class Batches(NamedTuple):
 
 
 def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: Plan) -> Batches:
-    """All tiles by falling `length`, an estimate of how far each is read, of speed alone."""
+    """All tiles by falling `length`, an estimate of how far each is read, of speed alone.
+
+    Args:
+        lists: of all tiles.
+        length: entries.
+        channels: of what is composited; more make batches smaller.
+        plan: has the size of a batch.
+    """
     order = argsort_keys(jnp.iinfo(jnp.int32).max - length.astype(jnp.uint32), plan.sort)
     size = min(plan.batch_size(channels), order.shape[0])
     order = jnp.pad(order, (0, -order.shape[0] % size), constant_values=-1).reshape(-1, size)
@@ -257,7 +291,13 @@ def read_chunk(columns: Columns, lists: Lists, batch: Batches, first: Int[Array,
 def still_read(
     batch: Batches, first: Int[Array, ""], light: Float[Array, "batch pixels"]
 ) -> Bool[Array, "batch"]:
-    """Tiles with entries from `first` on, and a pixel that is not opaque."""
+    """Tiles with entries from `first` on, and a pixel that is not opaque.
+
+    Args:
+        batch: the tiles.
+        first: how many entries of each list are read.
+        light: that the pixels of each have left.
+    """
     return (first < batch.counts) & jnp.any(light > 0, axis=1)
 
 
@@ -289,3 +329,14 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
     # Where each tile stands in the batches; what fills up the last batch, -1, is the largest of keys.
     place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[: lists.counts.shape[0]]
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
+
+
+def untile(
+    tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, ...], plan: Plan
+) -> Float[Array, "*shape height width channels"]:
+    """The images of what was composited tile by tile, `shape` of them, each of the plan's size."""
+    channels, edge, y = tiles.shape[1], plan.tile_size, len(shape)
+    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
+    image = image.transpose(*range(y + 1), y + 3, y + 1, y + 4, y + 2)
+    image = image.reshape(*shape, plan.tiles_y * edge, plan.tiles_x * edge, channels)
+    return image[..., : plan.height, : plan.width, :]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.rasterize.binning import bin_gaussians
-from gsjax.rasterize.compositing import Lists, Splats
+from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
@@ -58,8 +58,8 @@ def freeze_views(
 ) -> tuple[FrozenView, Plan]:
     """The views [C, ...] of C cameras, and the plan that they are painted with. On the host.
 
-    Arguments and options as for `gsjax.rasterization`; gradients stop here. Gaussians that cannot be drawn
-    are in no list.
+    Arguments as for `gsjax.rasterization`, its options too; gradients stop here. Gaussians that cannot be
+    drawn are in no list.
 
     Raises:
         ValueError: as `gsjax.plan`.
@@ -76,8 +76,14 @@ def freeze_views(
 
 
 def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
-    """One view with so many `rows` and `ids`, at least as many as it has: by the first of the N Gaussians,
-    which no tile lists for it. On the host."""
+    """One view with longer `rows` and `ids`, so that views can be stacked: by the first of the N Gaussians,
+    which no tile lists for it. On the host.
+
+    Args:
+        view: of one camera.
+        seen: length that `rows` and what goes with it are to have.
+        pairs: length that `ids` is to have.
+    """
 
     def more(a: np.ndarray, length: int) -> np.ndarray:
         return np.concatenate([a, np.zeros((length - len(a), *a.shape[1:]), a.dtype)])
@@ -88,7 +94,13 @@ def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
 
 
 def rows_within(megabytes: float, numbers: int, plan: Plan) -> int:
-    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least."""
+    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least.
+
+    Args:
+        megabytes: what the pixels of a strip may take.
+        numbers: floats a pixel, of 4 bytes.
+        plan: of the view.
+    """
     a_row = 4 * numbers * plan.tile_size * plan.width
     return int(max(1, min(plan.tiles_y, megabytes * 2**20 // a_row)))
 
@@ -125,15 +137,7 @@ def paint_shown(
     splats = Splats(view.means2d, view.conics, view.opacities, values)
     lists = Lists(view.ids, view.starts, view.counts)
     tiles, transmittance, _ = composite(splats, lists, None, plan)
-    return _untiled(tiles, plan), 1 - _untiled(transmittance[:, None], plan)[..., 0]
-
-
-def _untiled(
-    tiles: Float[Array, "tiles channels pixels"], plan: Plan
-) -> Float[Array, "height width channels"]:
-    edge = plan.tile_size
-    image = tiles.reshape(plan.tiles_y, plan.tiles_x, -1, edge, edge).transpose(0, 3, 1, 4, 2)
-    return image.reshape(plan.tiles_y * edge, plan.tiles_x * edge, -1)[: plan.height, : plan.width]
+    return untile(tiles, (), plan), 1 - untile(transmittance[:, None], (), plan)[..., 0]
 
 
 def _shown(view: FrozenView) -> FrozenView:

@@ -21,7 +21,7 @@ def columns_in_lanes(a: Array) -> list[Array]:
 
 
 def flat(a: Array, n: int) -> Array:
-    """What `in_lanes` was given."""
+    """The first `n` numbers of an array in lanes [rows, 256]: what `in_lanes` was given."""
     return a.reshape(-1)[:n]
 
 

@@ -121,22 +121,27 @@ class Plan:
 
     @property
     def tiles_x(self) -> int:
+        """How many tiles lie side by side; the last one may reach out of the image."""
         return -(-self.width // self.tile_size)
 
     @property
     def tiles_y(self) -> int:
+        """How many tiles lie one above the other; the last one may reach out of the image."""
         return -(-self.height // self.tile_size)
 
     @property
     def num_tiles(self) -> int:
+        """How many tiles one image has."""
         return self.tiles_x * self.tiles_y
 
     @property
     def limits(self) -> Limits:
+        """The three thresholds that compositing knows."""
         return Limits(self.alpha_min, self.alpha_max, self.min_transmittance)
 
     @property
     def tile_pixels(self) -> int:
+        """How many pixels one tile has."""
         return self.tile_size * self.tile_size
 
     def batch_size(self, channels: int) -> int:
@@ -188,6 +193,11 @@ OPTION_NAMES = tuple(f.name for f in dataclasses.fields(Plan) if f.name not in _
 
 def resolve(plan: Plan | None, width: int, height: int, options: dict[str, Any]) -> Plan:
     """The plan a call runs under; without one, a plan of the given options whose capacity is still 0.
+
+    Args:
+        plan: the caller's, or None.
+        width, height: of the image, pixels.
+        options: by name; those that are UNSET are the plan's, or else the default.
 
     Raises:
         ValueError: an explicit option contradicts the plan, or that is none.

@@ -126,8 +126,14 @@ def project_gaussians(
 
     A row that is not finite, has |q|^2 < 1e-12, no area on the image or z outside (near, far), or does not
     reach into the frame, is not visible and its gradients are exactly zero: visibility is found first, on
-    values alone; then the same arithmetic runs on inputs in which such rows were replaced. `usable` marks
-    rows whose colours can be drawn.
+    values alone; then the same arithmetic runs on inputs in which such rows were replaced.
+
+    Args:
+        means, quats, scales, opacities: the Gaussians, as for `gsjax.rasterization`.
+        usable: rows whose colours can be drawn.
+        viewmat, K: of the camera; world to camera, pixels.
+        plan: image size and options.
+        means2d_offset: added to the projected means, pixels.
     """
     n = means.shape[0]
     # The gradients of x/z's bounds hold 1 / focal^2. A focal length of 0 fails too.

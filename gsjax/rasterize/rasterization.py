@@ -16,7 +16,7 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh, num_sh_bases
 from gsjax.rasterize.binning import bin_gaussians, needed_capacity
 from gsjax.rasterize.checks import check_inputs, is_concrete
-from gsjax.rasterize.compositing import Lists, Splats
+from gsjax.rasterize.compositing import Lists, Splats, untile
 from gsjax.rasterize.gradients import composite
 from gsjax.rasterize.lanes import LANES
 from gsjax.rasterize.plan import OPTION_NAMES, UNSET, Plan, resolve
@@ -194,7 +194,16 @@ def _options(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def planned_for(views, bare: Plan, headroom: float) -> Plan:
-    """`bare` with a capacity that holds what these checked inputs need, times `headroom`."""
+    """`bare` with a capacity that holds what these checked inputs need, times `headroom`.
+
+    Args:
+        views: as `check_inputs` returns them.
+        bare: has the options.
+        headroom: 1 or more.
+
+    Raises:
+        ValueError: values are traced, or `headroom` is below 1.
+    """
     values = jax.lax.stop_gradient(views)
     if not is_concrete(values):
         raise ValueError(
@@ -282,8 +291,8 @@ def _rasterize(views: _Views, plan: Plan, batch: tuple[int, ...]):
 
     mask, reads = jax.tree.map(merge, (views.tile_mask, views.reads))
     tiles, transmittance, counts = _draw(jax.tree.map(merge, projected), merge(values), mask, reads, plan)
-    image = _untile(tiles, shape, plan)
-    alphas = 1 - _untile(transmittance[:, None], shape, plan)
+    image = untile(tiles, shape, plan)
+    alphas = 1 - untile(transmittance[:, None], shape, plan)
     return _finish(image, alphas, views, projected, counts, plan, batch)
 
 
@@ -316,16 +325,6 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
     tiles, transmittance, reads = composite(splats, lists, reads, plan)
     reads = reads.reshape(num_views, plan.num_tiles)
     return tiles, transmittance, _Counts(reads, binned.pairs, binned.overflow, binned.needed)
-
-
-def _untile(tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, int], plan: Plan):
-    """[B, C, H, W, channels] of what was composited tile by tile."""
-    channels = tiles.shape[1]
-    edge = plan.tile_size
-    image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
-    image = image.transpose(0, 1, 2, 5, 3, 6, 4)
-    image = image.reshape(*shape, plan.tiles_y * edge, plan.tiles_x * edge, channels)
-    return image[:, :, : plan.height, : plan.width]
 
 
 def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts, plan: Plan, batch):

@@ -20,6 +20,15 @@ _VISIBLE = 1e-3  # behind less transmittance than this a flip changes a pixel by
 
 
 class Reference(NamedTuple):
+    """The images of one camera, and which of their pixels may be off.
+
+    Attributes:
+        colors: as `render_mode` says; depth comes last.
+        alphas: 0 to 1.
+        features: None where none were given.
+        doubtful: pixels that hang on a comparison which rounding may turn the other way.
+    """
+
     colors: Float[Array, "height width d"]
     alphas: Float[Array, "height width 1"]
     features: Float[Array, "height width f"] | None

@@ -213,6 +213,11 @@ def interpolated(
     One vertex after another, and positions along the last axis, XLA:CPU fuses gather, product and sum, a
     sixth of the time of a gather that is written out; but not on the way back, for which the derivative has
     the other form.
+
+    Args:
+        table: F features an entry.
+        weights: of C vertices for each of N points.
+        indices: of these vertices, rows of the table.
     """
     columns, found = table.T, jnp.zeros((), table.dtype)
     for weight, rows in zip(

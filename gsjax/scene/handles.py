@@ -83,7 +83,14 @@ def skin_means(
     centers: Float[Array, "P 3"],
     pose: HandlePose,
 ) -> Float[Array, "N 3"]:
-    """Where linear blend skinning takes points: two products of matrices, nothing of size N x P x 3."""
+    """Where linear blend skinning takes points: two products of matrices, nothing of size N x P x 3.
+
+    Args:
+        means: canonical, metres.
+        weights: rows that sum to 1.
+        centers: of the handles, canonical, metres.
+        pose: where these are.
+    """
     rotations, offsets = rigid_motions(centers, pose)
     blended = jnp.einsum("np,pij->nij", weights, rotations)
     return jnp.einsum("nij,nj->ni", blended, means) + weights @ offsets

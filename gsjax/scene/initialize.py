@@ -147,6 +147,11 @@ def gaussians_from_points(
 
 
 def check_depth(depth: np.ndarray) -> None:
+    """Refuses what is no depth picture [H, W] of floats.
+
+    Raises:
+        ValueError: it has another shape, or holds integers, whose unit is unknown.
+    """
     if depth.ndim != 2:
         raise ValueError(f"depth: got shape {depth.shape}, want [H, W]")
     if not np.issubdtype(depth.dtype, np.floating):
@@ -154,6 +159,7 @@ def check_depth(depth: np.ndarray) -> None:
 
 
 def valid_depth(depth: np.ndarray) -> np.ndarray:
+    """Where depth, of any shape, is positive and finite."""
     return np.isfinite(depth) & (depth > 0)
 
 

@@ -37,6 +37,8 @@ def lift_labels(
     Args:
         mask: integer labels, 0 the background.
         expected_labels: labels that must be in the mask; one that no pixel has gives a warning.
+        viewmat: world to camera.
+        K: intrinsics, pixels.
 
     Raises:
         ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.

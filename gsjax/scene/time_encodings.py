@@ -76,7 +76,15 @@ def init_hexplane(
     key: PRNGKeyArray, resolution: int, time_resolution: int, levels: int, channels: int
 ) -> HexPlane:
     """Planes of space from 0.1 to 0.5, those of time 1 (K-Planes, Fridovich-Keil et al. 2023): at first
-    nothing depends on the time."""
+    nothing depends on the time.
+
+    Args:
+        key: for the planes of space.
+        resolution: vertices a side of the coarsest planes; each level has twice as many.
+        time_resolution: vertices along the time, on all levels.
+        levels: how many.
+        channels: numbers a vertex.
+    """
     space, time = [], []
     for level, one in enumerate(jax.random.split(key, levels)):
         side = resolution * 2**level
@@ -159,7 +167,15 @@ class Voxels(eqx.Module):
 
 
 def init_voxels(key: PRNGKeyArray, resolution: int, channels: int, frequencies: int, outputs: int) -> Voxels:
-    """Small random voxels."""
+    """Small random voxels.
+
+    Args:
+        key: for all of them.
+        resolution: voxels a side.
+        channels: numbers a voxel.
+        frequencies: of sines of the time.
+        outputs: numbers of a meaning.
+    """
     entries = int(np.ceil(np.log2((resolution + 1) ** 3)))
     config = FeatureGridConfig(
         levels=1,

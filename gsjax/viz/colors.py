@@ -103,7 +103,13 @@ def colorize_features(features: Float[np.ndarray, "h w d"], pca: PcaColors) -> U
 def highlight(
     image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """One thing in its own colours with an outline of `color`, the rest grey and dim."""
+    """One thing in its own colours with an outline of `color`, the rest grey and dim.
+
+    Args:
+        image: uint8, or floats 0 to 1.
+        mask: of the thing.
+        color: of its outline, 0 to 255.
+    """
     image = to_uint8(image)
     dim = np.broadcast_to(image.mean(axis=-1, keepdims=True) * 0.6, image.shape).astype(np.uint8)
     picture = np.where(mask[..., None], image, dim)
@@ -212,7 +218,13 @@ def in_rows(
 def overlay_labels(
     image: Num[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"], strength: float = 0.65
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Labels as colours over a grey copy of the image, so that the shapes below still show."""
+    """Labels as colours over a grey copy of the image, so that the shapes below still show.
+
+    Args:
+        image: uint8, or floats 0 to 1.
+        labels: of pixels; 0 and below stay grey.
+        strength: share of the label's colour, 0 to 1.
+    """
     grey = to_uint8(image).mean(axis=-1, keepdims=True) * 0.75
     inside: Bool[np.ndarray, "h w 1"] = (labels > 0)[..., None]
     mixed = np.where(inside, strength * colorize_labels(labels) + (1 - strength) * grey, grey)

@@ -28,6 +28,7 @@ def update_time(
     Args:
         update_s: seconds of each update; NaN where there was none.
         target_hz: the rate drawn as a dashed line.
+        title: above the plot.
     """
     figure, axes = _new(title, "frame", "ms")
     ms = np.asarray(update_s, float) * 1e3
@@ -61,6 +62,7 @@ def error_over_frames(
         errors_mm: name to error of each frame; NaN where there is no truth.
         labels: name to label, which gives the line its colour; counted from 1 unless told.
         limit_mm: a goal, drawn dashed.
+        title: above the plot.
     """
     figure, axes = _new(title, "frame", "mm")
     for i, (name, error) in enumerate(errors_mm.items()):
@@ -135,7 +137,13 @@ def psnr_over_frames(
     held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,
     title: str = "PSNR",
 ) -> Figure:
-    """PSNR in dB over frames, one line a camera: solid where it was tracked, dashed where only judged."""
+    """PSNR in dB over frames, one line a camera: solid where it was tracked, dashed where only judged.
+
+    Args:
+        tracked: camera to PSNR of each frame.
+        held_out: the same of cameras that the method did not see.
+        title: above the plot.
+    """
     figure, axes = _new(title, "frame", "dB")
     lines = [(n, v, "-", "tracked") for n, v in tracked.items()]
     lines += [(n, v, (0, (4, 2)), "held out") for n, v in (held_out or {}).items()]
@@ -154,7 +162,12 @@ def trajectories(
 ) -> Figure:
     """Where the centroids went, in metres: a ring at the start, a dot at the end, the true path thin below.
 
-    `view` "top" looks along the world's z axis; "3d" shows all three.
+    Args:
+        centroids: name to position in each frame; NaN where there is none.
+        labels: name to label, which gives the line its colour; counted from 1 unless told.
+        truth: name to true position in each frame.
+        view: "top" looks along the world's z axis; "3d" shows all three.
+        title: above the plot.
     """
     figure, axes = _new(title, "x (m)", "y (m)", projection="3d" if view == "3d" else None)
     take = 3 if view == "3d" else 2

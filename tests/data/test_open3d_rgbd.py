@@ -3,6 +3,7 @@ import pytest
 
 from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_open3d
 from tests.data import dots
+from tests.data.looks import depths_from_another_frame
 
 WIDTH, HEIGHT, NUMBERS = 96, 72, (0, 3, 6, 12)
 INTRINSICS = (100.0, 90.0, 50.0, 35.0)
@@ -163,11 +164,5 @@ def test_the_living_room(shared_data):
     """Points of one frame lie on the depth of another, by the poses of the numbers in their names."""
     sequence = open_sequence(shared_data / "icl_living_room", ReadOptions(K=(525, 525, 320, 240)))
     assert sequence.frame_ids[:3] == (0, 3, 6)
-    depth, K = sequence.depth(0, 0), sequence.Ks[0, 0]
-    v, u = np.nonzero(depth)
-    local = np.linalg.inv(K) @ np.stack([u + 0.5, v + 0.5, np.ones(len(u))]) * depth[v, u]
-    moved = sequence.viewmats[10, 0] @ np.linalg.inv(sequence.viewmats[0, 0])
-    there = moved[:3, :3] @ local + moved[:3, 3:]
-    x, y = np.floor((K @ there)[:2] / there[2]).astype(int)
-    inside = (x >= 0) & (x < 640) & (y >= 0) & (y < 480)
-    assert np.median(np.abs(sequence.depth(10, 0)[y[inside], x[inside]] - there[2][inside])) < 0.01
+    measured, expected = depths_from_another_frame(sequence, 0, 10)
+    assert np.median(np.abs(measured - expected)) < 0.01

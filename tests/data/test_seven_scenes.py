@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError, DataWarning, open_sequence, read_seven_scenes
+from tests.data.looks import depths_from_another_frame
 
 WALL_M, BOX_M = 2.0, 1.0
 COLOR_FOCAL, DEPTH_FOCAL, BASELINE_M = 525.0, 585.0, 0.025
@@ -172,16 +173,8 @@ def test_the_kitchen(shared_data):
 def test_depth_of_the_kitchen_lies_on_that_of_another_frame(shared_data):
     """Points of one frame, seen from where the camera stood a second later, lie on the depth there."""
     sequence = read_seven_scenes(shared_data / "seven_scenes_kitchen")
-    depth, K = sequence.depth(0, 0), sequence.Ks[0, 0]
-    v, u = np.nonzero(depth)
-    local = np.linalg.inv(K) @ np.stack([u + 0.5, v + 0.5, np.ones(len(u))]) * depth[v, u]
-    moved = sequence.viewmats[10, 0] @ np.linalg.inv(sequence.viewmats[0, 0])
-    there = moved[:3, :3] @ local + moved[:3, 3:]
-    x, y = np.floor((K @ there)[:2] / there[2]).astype(int)
-    inside = (x >= 0) & (x < 640) & (y >= 0) & (y < 480)
-    measured = sequence.depth(10, 0)[y[inside], x[inside]]
-    gap = np.abs(measured - there[2][inside])[measured > 0]
-    assert np.median(gap) < 0.015
+    measured, expected = depths_from_another_frame(sequence, 0, 10)
+    assert np.median(np.abs(measured - expected)[measured > 0]) < 0.015
 
 
 def test_colour_of_the_kitchen_is_registered(shared_data):

@@ -11,11 +11,12 @@ import pytest
 from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
 from gsjax.perception.clip import load_clip
 from gsjax.perception.dinov2 import load_dinov2
-from gsjax.perception.grounded_sam import labels_of_masks, load_grounded_sam
+from gsjax.perception.grounded_sam import load_grounded_sam
 from gsjax.perception.maskclip import load_maskclip
+from gsjax.perception.masks import labels_of_masks
 from gsjax.perception.sam import load_sam
 from gsjax.perception.sam2 import load_sam2
-from gsjax.perception.weights import weights_folder
+from gsjax.perception.weights import model_folder
 
 there = all(importlib.util.find_spec(name) for name in ("torch", "transformers"))
 needs_foundation = pytest.mark.skipif(
@@ -330,10 +331,10 @@ def test_weights_that_are_a_pickle_are_refused_and_how_to_convert_them_is_said(l
 def test_files_that_lead_to_a_pickle_are_refused(tmp_path, name, holds, says):
     save_placeholders(tmp_path, "model.safetensors.index.json")
     (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": {"a": "a.safetensors"}}')
-    assert weights_folder(tmp_path, "CLIP's weights", (), "a/b") == tmp_path
+    assert model_folder(tmp_path, "CLIP's weights", (), "a/b") == tmp_path
     (tmp_path / name).write_text(holds)
     with pytest.raises(ValueError, match=rf"{name}: {says}"):
-        weights_folder(tmp_path, "CLIP's weights", (), "a/b")
+        model_folder(tmp_path, "CLIP's weights", (), "a/b")
 
 
 @pytest.mark.parametrize("load", LOADERS)

@@ -5,12 +5,12 @@ import pytest
 
 from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.metrics.segmentation import iou_of_masks
+from gsjax.perception.masks import name_by_size
 from gsjax.perception.segmenters import (
     PieceSegmenter,
     PlaneOrRegionSegmenter,
     PlaneSegmenter,
     RegionSegmenter,
-    name_by_size,
 )
 
 WIDTH, HEIGHT = 160, 120

@@ -4,95 +4,28 @@ Poison in every input: test_poison.py and `python -m benchmarks.fuzz`. Figures: 
 """
 
 import dataclasses
-import hashlib
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.scenes import ARRAYS, relative_error
+from benchmarks.scenes import relative_error
 from gsjax.io.ply import read_ply, write_ply
-from gsjax.rasterize.plan import Plan, rung
+from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import plan, rasterization
-from gsjax.rasterize.reference import rasterization_reference
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
-
-GAUSSIANS = ARRAYS[:5]
-FAINT = 1e-17
-TRAINED = (*GAUSSIANS, "viewmats", "Ks", "backgrounds")
-
-
-@partial(jax.jit, static_argnames="plan")
-def drawn(scene, weights, plan):
-    """Image with expected depth, its gradient against `weights`, and meta."""
-
-    def objective(scene):
-        image, alphas, meta = rasterization(**scene, width=plan.width, height=plan.height, plan=plan)
-        image = jnp.concatenate([image, alphas], axis=-1)[0]
-        return jnp.vdot(image, weights[..., : image.shape[-1]]), (image, meta)
-
-    gradient, (image, meta) = jax.grad(objective, has_aux=True)(scene)
-    return image, gradient, meta
-
-
-@partial(jax.jit, static_argnames="plan")
-def reference(scene, weights, plan):
-    """The same by the float64 reference, and the pixels that hang on a rounding."""
-
-    def objective(scene):
-        result = rasterization_reference(
-            *(scene[name] for name in GAUSSIANS),
-            scene["viewmats"][0],
-            scene["Ks"][0],
-            plan.width,
-            plan.height,
-            background=scene["backgrounds"][0],
-            render_mode=plan.render_mode,
-        )
-        image = jnp.concatenate([result.colors, result.alphas], axis=-1)
-        return jnp.vdot(image, weights), (image, result.doubtful)
-
-    gradient, (image, doubtful) = jax.grad(objective, has_aux=True)(scene)
-    return image, gradient, doubtful
-
-
-def scene_before(width=33, height=17, num=12, focal=30.0, depth=2.0, seed=0):
-    """A camera at the origin that looks along z, and Gaussians of a few pixels before it; float32."""
-    rng = np.random.default_rng(seed)
-    depths = depth * (1 + 0.5 * (rng.permutation(num) + 0.5) / num)
-    pixels = rng.uniform([0, 0], [width, height], (num, 2)) - [width / 2, height / 2]
-    scene = {
-        "means": np.concatenate([pixels * depths[:, None] / focal, depths[:, None]], axis=1),
-        "quats": rng.normal(size=(num, 4)),
-        "scales": rng.uniform(0.5, 3.0, (num, 3)) * depth / focal,
-        "opacities": rng.uniform(0.2, 0.9, num),
-        "colors": rng.uniform(size=(num, 3)),
-        "viewmats": np.eye(4)[None],
-        "Ks": np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]]),
-        "backgrounds": np.full((1, 3), 0.3),
-    }
-    return {k: np.float32(v) for k, v in scene.items()}
-
-
-def plan_for(width=33, height=17, num=12):
-    return Plan(width, height, rung(num * ((width + 7) // 8) * ((height + 7) // 8) * 2), render_mode="RGB+ED")
-
-
-def cotangent(width=33, height=17):
-    return np.float32(np.random.default_rng(1).normal(size=(height, width, 5)))
-
-
-def gradient_error(gradient, slope, names=TRAINED):
-    # Where the true gradient is 1e-20 (the rotation of a point), no digit of float32's means anything.
-    meaningful = [
-        k for k in names if np.abs(slope[k]).max() > FAINT or not np.abs(gradient[k]).max() <= FAINT
-    ]
-    return max(relative_error(gradient[k], slope[k]) for k in meaningful)
+from tests.rasterize.front import (
+    GAUSSIANS,
+    TRAINED,
+    cotangent,
+    drawn,
+    gradient_error,
+    plan_for,
+    reference,
+    scene_before,
+)
 
 
 def errors(scene, weights=None, plan=None, certain=None):
@@ -287,29 +220,6 @@ def test_logits_of_100_and_opacities_of_0_and_1_through_gaussians():
         assert not np.any(gradient.means[1::2] if gaussians is both[0] else gradient.means[0::2])
 
 
-def far_away(distance: float):
-    """(pixel error, image error) of float32 with camera and scene `distance` metres from the origin."""
-    scene = {k: np.float64(v) for k, v in scene_before().items()}
-    offset = distance * np.array([0.6, 0.48, 0.64])
-    scene["means"] = scene["means"] + offset
-    scene["viewmats"][0, :3, 3] -= offset
-    with jax.enable_x64(True):
-        want, _, exact = jax.tree.map(np.asarray, drawn(scene, np.float64(cotangent()), plan_for()))
-    rounded = {k: np.float32(v) for k, v in scene.items()}
-    got, gradient, meta = drawn(rounded, cotangent(), plan_for())
-    assert all(np.isfinite(gradient[key]).all() for key in TRAINED)
-    assert np.isfinite(got).all()
-    # The colours: an expected depth jumps from nothing to metres where a footprint ends.
-    return float(np.abs(meta.means2d - exact.means2d).max()), relative_error(got[..., :3], want[..., :3])
-
-
-# float32 holds a coordinate to 6e-8 of itself: at 1e4 m to half a millimetre, which here is 0.003 pixels.
-@pytest.mark.parametrize(("distance", "pixels"), [(1.0, 1e-4), (1e2, 1e-3), (1e4, 0.1), (1e6, 10.0)])
-def test_the_error_in_pixels_grows_with_the_distance_from_the_origin(distance, pixels):
-    error, _ = far_away(distance)
-    assert pixels / 1e3 < error < pixels
-
-
 def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
     num = 70_000  # by 32,400 tiles: 2.27e9
     arrays = {
@@ -355,72 +265,3 @@ def test_889536_zero_quaternions_in_one_file(tmp_path):
     for key in GAUSSIANS:
         np.testing.assert_allclose(gradient[key][:12], clean[key], rtol=1e-4, atol=1e-4)
         assert not np.any(gradient[key][12:])
-
-
-def digest() -> str:
-    """Of an image and all gradients, to the bit."""
-    image, gradient, _ = drawn(scene_before(), cotangent(), plan_for())
-    arrays = [image, *(gradient[key] for key in TRAINED)]
-    return hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in arrays)).hexdigest()
-
-
-def test_five_runs_and_two_processes_are_equal_bit_for_bit():
-    command = "import runpy, sys; print(runpy.run_path(sys.argv[1])['digest']())"
-    root = Path(__file__).resolve().parents[2]
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", command, __file__], cwd=root, stdout=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
-    assert len({digest() for _ in range(5)}) == 1
-    outputs = [process.communicate()[0].strip() for process in started]
-    assert outputs[0] == outputs[1]
-    assert len(outputs[0]) == 64
-
-
-def test_a_permutation_of_the_gaussians_changes_no_bit():
-    scene, order = scene_before(), np.random.default_rng(3).permutation(12)
-    want, slope, _ = drawn(scene, cotangent(), plan_for())
-    shuffled = {k: v[order] if k in GAUSSIANS else v for k, v in scene.items()}
-    got, gradient, _ = drawn(shuffled, cotangent(), plan_for())
-    np.testing.assert_array_equal(got, want)
-    for key in GAUSSIANS:
-        np.testing.assert_array_equal(gradient[key], slope[key][order])
-
-
-def half_precision(dtype, scene, this):
-    """(image, colours' gradient, other gradients) off float32, of the largest value, with `dtype` colours."""
-    weights = cotangent(this.width, this.height)
-    halved = scene | {"colors": jnp.asarray(scene["colors"], dtype)}
-    want, slope, _ = drawn(scene, weights, this)
-    got, gradient, _ = drawn(halved, weights, this)
-    assert gradient["colors"].dtype == dtype
-    others = max(relative_error(gradient[k], slope[k]) for k in TRAINED if k != "colors")
-    return relative_error(got, want), relative_error(gradient["colors"], slope["colors"]), others
-
-
-# Half the spacing of values: 2^-9 of a bfloat16, 2^-12 of a float16.
-@pytest.mark.parametrize(
-    ("dtype", "spacing"), [(jnp.bfloat16, 2**-9), pytest.param(jnp.float16, 2**-12, marks=pytest.mark.slow)]
-)
-def test_colours_in_half_precision_cost_their_own_rounding_and_no_more(dtype, spacing):
-    scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")
-    image, painted, others = half_precision(dtype, scene, this)
-    assert spacing / 100 < image <= spacing
-    assert painted <= 1.2 * spacing  # their gradient is rounded once more
-    assert others <= 4 * spacing
-
-
-@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
-def test_half_precision_is_composited_in_float32(dtype):
-    scene, this = scene_before(64, 48, num=300), dataclasses.replace(plan_for(64, 48, 300), render_mode="RGB")
-    halved = scene | {"colors": jnp.asarray(scene["colors"], dtype)}
-    rounded = scene | {"colors": halved["colors"].astype(jnp.float32)}
-    got, gradient, _ = drawn(halved, cotangent(64, 48), this)
-    want, slope, _ = drawn(rounded, cotangent(64, 48), this)
-    assert got.dtype == jnp.float32
-    np.testing.assert_allclose(got, want, atol=1e-5)  # half precision would be 1e-3 off
-    for key in set(TRAINED) - {"colors"}:
-        assert relative_error(gradient[key], slope[key]) < 1e-5
-    np.testing.assert_array_equal(gradient["colors"], slope["colors"].astype(dtype))

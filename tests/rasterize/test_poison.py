@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks import fuzz
+from benchmarks.fuzz import check
+from benchmarks.poisons import INPUTS, INTEGERS, MODES, PER_GAUSSIAN, PLACES, POISONS, Case, scene_of
 from benchmarks.scenes import ARRAYS
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
 PLAN = Plan(33, 17, 4096, render_mode="RGB+ED", sh_degree=1, rasterize_mode="antialiased")
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "colors", "features")
 TINY = np.finfo(np.float32).smallest_subnormal
 
 
@@ -198,18 +198,18 @@ def _reference(scene):
 
 @st.composite
 def poisons(draw, modes):
-    mode, name = draw(st.sampled_from(modes)), draw(st.sampled_from(fuzz.INPUTS))
-    shape = fuzz.scene_of(mode, 0)[name].shape
-    shape = shape if name in fuzz.PER_GAUSSIAN else shape[1:]
+    mode, name = draw(st.sampled_from(modes)), draw(st.sampled_from(INPUTS))
+    shape = scene_of(mode, 0)[name].shape
+    shape = shape if name in PER_GAUSSIAN else shape[1:]
     row, column = draw(st.integers(0, shape[0] - 1)), draw(st.integers(-1, math.prod(shape[1:]) - 1))
-    table = fuzz.INTEGERS if name == "reads" else fuzz.POISONS | (fuzz.PLACES if name == "means" else {})
+    table = INTEGERS if name == "reads" else POISONS | (PLACES if name == "means" else {})
     poison = draw(st.sampled_from(list(table)))
-    column = -1 if len(shape) == 1 or poison in fuzz.PLACES else column
-    return fuzz.Case(mode, draw(st.integers(0, 3)), name, row, column, poison)
+    column = -1 if len(shape) == 1 or poison in PLACES else column
+    return Case(mode, draw(st.integers(0, 3)), name, row, column, poison)
 
 
 def assert_sound(case):
-    _, failure = fuzz.check(case)
+    _, failure = check(case)
     assert not failure, f"python -m benchmarks.fuzz --case '{case}'  # {failure}"
 
 
@@ -222,6 +222,6 @@ def test_poison_anywhere_is_culled_and_counted_or_drawn_as_the_reference_draws_i
 
 @pytest.mark.slow
 @settings(max_examples=1500)
-@given(poisons(list(fuzz.MODES)))
+@given(poisons(list(MODES)))
 def test_poison_anywhere_in_every_mode(case):
     assert_sound(case)

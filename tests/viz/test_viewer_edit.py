@@ -10,7 +10,7 @@ from gsjax.scene.gaussians import gaussians_from_activated, take
 from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable, moved, open_viewer, words
 from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
 from gsjax.viz.viewer.splats import Palette
-from tests.viz.test_viewer import Api
+from tests.viz.scenes import Api
 from tests.viz.test_viewer_page import (
     Saved,
     browser,

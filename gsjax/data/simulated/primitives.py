@@ -59,7 +59,13 @@ class Primitive:
 def intersect(
     primitive: Primitive, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, "n"]:
-    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity."""
+    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity.
+
+    Args:
+        primitive: what is to be met.
+        origin: of all rays, metres.
+        directions: of any length, of which s is a multiple.
+    """
     match primitive.shape:
         case "box":
             near, far = _slabs(primitive.size, origin, directions, axes=(0, 1, 2))
@@ -106,22 +112,24 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
 
 def at_rest(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
     """Where points of the primitive, in its frame, are while it is not deformed."""
-    match primitive.shape:
-        case "bent box":
-            return BentBox(*primitive.size).undo(points)
-        case "sheet":
-            return Sheet(primitive.size).undo(points)
-    return points
+    soft = _soft(primitive)
+    return points if soft is None else soft.undo(points)
 
 
 def deformed(primitive: Primitive, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
     """Where points of the primitive at rest are in its frame: the inverse of `at_rest`."""
+    soft = _soft(primitive)
+    return rest if soft is None else soft.deform(rest)
+
+
+def _soft(primitive: Primitive) -> BentBox | Sheet | None:
+    """What maps a primitive that deforms; None for one that does not."""
     match primitive.shape:
         case "bent box":
-            return BentBox(*primitive.size).deform(rest)
+            return BentBox(*primitive.size)
         case "sheet":
-            return Sheet(primitive.size).deform(rest)
-    return rest
+            return Sheet(primitive.size)
+    return None
 
 
 def _box_normals(half, points):

@@ -91,7 +91,13 @@ class Hits:
 
 
 def trace(scene: Scene, t: int, c: int, subpixel: tuple[float, float] = (0.5, 0.5)) -> Hits:
-    """What camera c sees in frame t, at the same place within every pixel (0.5: its centre)."""
+    """What camera c sees in frame t, at the same place within every pixel (0.5: its centre).
+
+    Args:
+        scene: what there is.
+        t, c: frame and camera.
+        subpixel: that place, (x, y), 0 to 1.
+    """
     K, viewmat = scene.Ks[t, c], scene.viewmats[t, c]
     x, y = np.meshgrid(np.arange(scene.width) + subpixel[0], np.arange(scene.height) + subpixel[1])
     pixels = np.stack([x, y, np.ones_like(x)])
@@ -123,7 +129,12 @@ def render_labels(scene: Scene, hits: Hits) -> Int[np.ndarray, "height width"]:
 
 
 def render_color(scene: Scene, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
-    """RGB: Lambert's law, shadows, four samples a pixel."""
+    """RGB: Lambert's law, shadows, four samples a pixel.
+
+    Args:
+        scene: what there is.
+        t, c: frame and camera.
+    """
     total = np.zeros((3, scene.height, scene.width))
     side, up = _light_disc(scene.light)
     for subpixel, (a, b) in zip(_SUBPIXELS, _LIGHT_POINTS, strict=True):
@@ -137,6 +148,12 @@ def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.nd
     """Pixels (x, y) that what is seen in frame t moves until frame u, whether or not it is seen there.
 
     NaN where nothing was met and where the point is behind the camera in frame u.
+
+    Args:
+        scene: what there is.
+        t, u: the frames.
+        c: the camera.
+        hits: what its rays met in frame t.
     """
     index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
     before, after = scene.solids(t), scene.solids(u)

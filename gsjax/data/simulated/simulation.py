@@ -5,7 +5,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.data.sequence import Sequence, Truth
+from gsjax.data.objects import Truth
+from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.raycaster import (
     Scene,
     render_color,

@@ -108,7 +108,13 @@ def field_loss(config: FieldConfig) -> Callable:
 
 
 def strip_rows(config: FieldConfig, hidden: int, batch: FieldBatch) -> int:
-    """Rows of tiles in a strip whose pixels' numbers take no more memory than they may."""
+    """Rows of tiles in a strip whose pixels' numbers take no more memory than they may.
+
+    Args:
+        config: with the megabytes that a strip may take.
+        hidden: channels of what is rendered.
+        batch: of one view.
+    """
     numbers = hidden + config.channels
     numbers += 0 if batch.codebook is None else len(batch.codebook)
     numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # what it says, and what the field does

@@ -39,6 +39,7 @@ class FeatureField(eqx.Module):
 
     @property
     def channels(self) -> int:
+        """How many numbers the field has for each Gaussian."""
         return self.lift.shape[1]
 
     @property
@@ -111,7 +112,13 @@ def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
 
 
 def carried(field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None) -> Carried:
-    """What to render of a field: of all Gaussians, or of some."""
+    """What to render of a field: of all Gaussians, or of some.
+
+    Args:
+        field: of all Gaussians.
+        located: where they lie in its grid; None for a table.
+        rows: of which Gaussians; of all unless given.
+    """
     if not isinstance(field.encoding, FeatureGrid):
         return Carried(field.encoding if rows is None else field.encoding[rows], None)
     assert located is not None

@@ -35,7 +35,7 @@ def learned_inverse(
     Args:
         lift: W.
         features: F'_low as they occur, of pixels or of Gaussians.
-        key: of first values, and of what each step looks at.
+        key: one key, of shape [], of first values, and of what each step looks at.
         iterations: steps.
         batch: features that a step looks at.
     """

@@ -40,7 +40,13 @@ class Threshold(NamedTuple):
 def gaussian_cosines(
     field: FeatureField, located: Located | None, queries: Float[Array, "q d"]
 ) -> Float[Array, "n q"]:
-    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where one of them has no length."""
+    """cos(W f_i, q) of each Gaussian and query, exactly; 0 where one of them has no length.
+
+    Args:
+        field: of all Gaussians.
+        located: where they lie in its grid; None for a table.
+        queries: vectors in the teacher's channels.
+    """
     parts = carried(field, located)
     rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
     return _cosines(rendered, parts.lifted(field.lift), queries)
@@ -53,14 +59,27 @@ def pixel_cosines(
     plan: Plan,
     queries: Float[Array, "q d"],
 ) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
-    """cos(W F', q) of each pixel and query, and the alphas of the view."""
+    """cos(W F', q) of each pixel and query, and the alphas of the view.
+
+    Args:
+        field, located: as for `gaussian_cosines`.
+        view, plan: from `gsjax.rasterize.frozen.freeze_views`.
+        queries: vectors in the teacher's channels.
+    """
     return painted_cosines(field, carried(field, located, view.rows), view, plan, queries)
 
 
 def painted_cosines(
     field: FeatureField, parts: Carried, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
 ) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
-    """`pixel_cosines` where it is known what the view's Gaussians carry: of several strips of it, say."""
+    """`pixel_cosines` where it is known what the view's Gaussians carry: of several strips of it, say.
+
+    Args:
+        field: of all Gaussians.
+        parts: from `carried`, with the rows of the view.
+        view, plan: of the view, or of a strip of it.
+        queries: vectors in the teacher's channels.
+    """
     image, alphas = paint_shown(view, parts.values, plan)
     rendered = parts.joined(image.reshape(alphas.size, -1), alphas.ravel())
     cosines = _cosines(rendered, parts.lifted(field.lift), queries)
@@ -88,7 +107,13 @@ def back_projected_cosines(
     queries: Float[Array, "q d"],
     inverse: Float[Array, "channels d"],
 ) -> Float[Array, "n q"]:
-    """cos(f_i, W' q) with an inverse W' of the convolution, in the field's own channels (the paper's)."""
+    """cos(f_i, W' q) with an inverse W' of the convolution, in the field's own channels (the paper's).
+
+    Args:
+        field, located: as for `gaussian_cosines`.
+        queries: vectors in the teacher's channels.
+        inverse: W', from `learned_inverse`, say.
+    """
     parts = carried(field, located)
     rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
     features = parts.channels_of(rendered)
@@ -133,7 +158,13 @@ def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> 
 def pixel_mask(
     scores: Float[Array, "height width"], alphas: Float[Array, "height width"], threshold: float
 ) -> Bool[Array, "height width"]:
-    """Where a view's own scores are above the threshold, and the scene sends more than half of the light."""
+    """Where a view's own scores are above the threshold, and the scene sends more than half of the light.
+
+    Args:
+        scores: of pixels.
+        alphas: of the same.
+        threshold: of scores.
+    """
     return (scores > threshold) & (alphas > _OPAQUE)
 
 

@@ -129,7 +129,13 @@ def finished(problem: FieldProblem, state: FieldState) -> FeatureField:
 def frozen_views(
     gaussians: Gaussians, cameras: Sequence[Camera], rasterize_mode: str = "classic"
 ) -> list[tuple[FrozenView, Plan]]:
-    """The scene in each camera. Those of one size share their plan and the lengths of their lists."""
+    """The scene in each camera. Those of one size share their plan and the lengths of their lists.
+
+    Args:
+        gaussians: the scene.
+        cameras: of the views.
+        rasterize_mode: "classic" or "antialiased", as the scene was fitted.
+    """
     sizes = sorted({(camera.width, camera.height, camera.near) for camera in cameras})
     found: dict[int, tuple[FrozenView, Plan]] = {}
     for width, height, near in sizes:

@@ -38,7 +38,14 @@ def majority_labels(
     views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
 ) -> Int[np.ndarray, "n"]:
     """The label with most votes of all views, of each of `num` Gaussians; -1 for one that sends no light to a
-    pixel with a label."""
+    pixel with a label.
+
+    Args:
+        views: frozen, with their plans.
+        ids: label of each pixel of each view, [H,W]; -1 for none.
+        count: how many labels there are.
+        num: how many Gaussians.
+    """
     votes = np.zeros((num, count))
     for (view, plan), one in zip(views, ids, strict=True):
         np.add.at(votes, np.asarray(view.rows), np.asarray(label_votes(view, plan, jnp.asarray(one), count)))

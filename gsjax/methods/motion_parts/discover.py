@@ -33,11 +33,23 @@ class Views(Protocol):
     """Synchronised cameras over time; `gsjax.data.Sequence` is one."""
 
     @property
-    def num_frames(self) -> int: ...
+    def num_frames(self) -> int:
+        """T."""
+        ...
+
     @property
-    def num_cameras(self) -> int: ...
-    def image(self, t: int, c: int) -> np.ndarray: ...
-    def frame(self, t: int) -> Frame: ...
+    def num_cameras(self) -> int:
+        """C."""
+        ...
+
+    def image(self, t: int, c: int) -> np.ndarray:
+        """RGB of camera `c` in frame `t`, [H,W,3] uint8."""
+        ...
+
+    def frame(self, t: int) -> Frame:
+        """All cameras of frame `t` as arrays."""
+        ...
+
 
 
 class Start(NamedTuple):
@@ -150,7 +162,17 @@ def find_masks(
     config: PartsConfig,
     segmenter: Segmenter,
 ) -> Int[np.ndarray, "C H W"]:
-    """Masks of what changed, by the same numbers in all views; see `masks`."""
+    """Masks of what changed, by the same numbers in all views; see `masks`.
+
+    Args:
+        views: the recording.
+        gaussians, plan: the canonical scene, and what it is drawn with.
+        frame: the anchor's.
+        anchor: which frame that is.
+        moved: pixels that changed.
+        config: how.
+        segmenter: finds masks in one picture.
+    """
     drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(views.num_cameras)]
     depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
     pictures = [views.image(anchor.frame, c) for c in range(views.num_cameras)]
@@ -188,7 +210,13 @@ def find_masks(
 def centers_of(
     means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], slots: int
 ) -> Float[np.ndarray, "P 3"]:
-    """The centroid of each part's Gaussians, metres; that of all for a part that has none."""
+    """The centroid of each part's Gaussians, metres; that of all for a part that has none.
+
+    Args:
+        means: of the Gaussians, metres.
+        labels: the part of each.
+        slots: how many parts there may be.
+    """
     centers = np.tile(means.mean(0), (slots, 1))
     for part in np.unique(labels):
         centers[part] = means[labels == part].mean(0)
@@ -198,7 +226,13 @@ def centers_of(
 def radii_of(
     means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], centers: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, "P"]:
-    """How far each part reaches from its handle, root mean square, metres; 1 for a part without Gaussians."""
+    """How far each part reaches from its handle, root mean square, metres; 1 for a part without Gaussians.
+
+    Args:
+        means: of the Gaussians, metres.
+        labels: the part of each.
+        centers: of all parts, metres.
+    """
     squared = np.sum((means - centers[labels]) ** 2, axis=1)
     sums, counts = (np.bincount(labels, w, len(centers)) for w in (squared, np.ones_like(squared)))
     radii = np.sqrt(sums / np.maximum(counts, 1))

@@ -163,7 +163,13 @@ def isolate(
     begin: float | None = None,
     end: float | None = None,
 ) -> Trajectory:
-    """Of all motions only those of `parts` go on; the other parts `freeze`. To see nothing else: `ghost`."""
+    """Of all motions only those of `parts` go on; the other parts `freeze`. To see nothing else: `ghost`.
+
+    Args:
+        trajectory: of all parts.
+        parts: that go on.
+        at, begin, end: of the others, as for `freeze`, seconds.
+    """
     return freeze(trajectory, others(trajectory, parts), at, begin, end)
 
 

@@ -81,7 +81,13 @@ def did_you_mean(found: Any, known: Collection[str]) -> str:
 
 
 def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = float) -> Checked:
-    """A number, `of` which is from `low` to `high`; also one that YAML takes for text, such as 1e-3."""
+    """A number, `of` which is from `low` to `high`; also one that YAML takes for text, such as 1e-3.
+
+    Args:
+        wanted: what is expected, for messages.
+        low, high: the range.
+        of: what of the number has to be in it; the number itself unless given.
+    """
 
     def check(value: Any) -> float:
         try:
@@ -135,7 +141,11 @@ def instance(kind: type, wanted: str) -> Checked:
 
 
 def part_list(value: Any) -> tuple[str | int, ...]:
-    """Names and numbers of parts; one alone needs no list."""
+    """Names and numbers of parts; one alone needs no list.
+
+    Raises:
+        ValueError: it is neither, or there is none.
+    """
     listed = [value] if isinstance(value, (str, int)) else value
     sound = isinstance(listed, (list, tuple)) and len(listed) > 0
     if not sound or any(isinstance(part, bool) or not isinstance(part, (str, int)) for part in listed):

@@ -70,7 +70,13 @@ def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.nda
 
 
 def touching(parts: Parts, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
-    """The parts to which a share of a part's neighbours belongs, and the background."""
+    """The parts to which a share of a part's neighbours belongs, and the background.
+
+    Args:
+        parts: with the neighbours of each Gaussian.
+        labels: the part of each movable Gaussian.
+        part: whose neighbours are counted.
+    """
     neighbors = np.asarray(parts.canonical.neighbors)[labels == part].ravel()
     all_ = np.concatenate([labels, np.full(parts.canonical.fixed.num, BACKGROUND)])
     names, counts = np.unique(all_[neighbors], return_counts=True)
@@ -129,6 +135,11 @@ def outcome(start: Start, parts: Parts, times: Float[np.ndarray, "T"]) -> tuple[
     """The scene with its parts, all Gaussians in the order in which they were given, and where parts were.
 
     Handles that nothing follows are left out, and the others stand in the middle of what follows them.
+
+    Args:
+        start: where all began.
+        parts: that were followed.
+        times: of the frames, seconds.
     """
     weights = np.asarray(parts.weights)
     labels = weights.argmax(-1)

@@ -114,7 +114,13 @@ class Parts(NamedTuple):
 
 
 def first_parts(start: Start, frames: int, config: PartsConfig) -> Parts:
-    """Before anything is followed: all at rest."""
+    """Before anything is followed: all at rest.
+
+    Args:
+        start: where all begins.
+        frames: how many there will be.
+        config: how parts are followed.
+    """
     slots, count = len(start.canonical.alive), start.canonical.movable.num
     params = StreamParams(at_rest(slots), start.field)
     quats = np.zeros((frames, slots, 4), np.float32)
@@ -271,7 +277,16 @@ def _predicted(parts: Parts, t: int, way: int, before: HandlePose) -> HandlePose
 def seen_at(
     frame: Frame, canonical: Canonical, weights: Array, pose: HandlePose, tile: int = TILE, *, blend: Blend
 ) -> Seen:
-    """Pixels count where what moves is, and where it was in the canonical scene."""
+    """Pixels count where what moves is, and where it was in the canonical scene.
+
+    Args:
+        frame: what cameras saw.
+        canonical: the scene.
+        weights: of its movable Gaussians, [M,P].
+        pose: where handles are.
+        tile: pixels a side of what counts together.
+        blend: of rotations.
+    """
     moves = weights[:, BACKGROUND] < 0.5
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend).means
     # What stands still is put behind all cameras' backs, where it touches nothing.

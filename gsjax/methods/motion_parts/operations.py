@@ -109,7 +109,13 @@ class TimeEdit(Edit):
         return self.begin or 0.0, last if self.end is None else self.end
 
     def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
-        """The trajectory after it."""
+        """The trajectory after it.
+
+        Args:
+            trajectory: of all parts.
+            parts: whose time is changed.
+            begin, end: between which it is, seconds.
+        """
         raise NotImplementedError
 
 
@@ -193,7 +199,13 @@ class LookEdit(Edit):
         return edits.during(film[0].trajectory.times, self.begin, self.end, self.ease)
 
     def changed(self, layer: Layer, parts: list[int], share: Float[Array, "T"]) -> Trajectory:
-        """The layer's trajectory after it."""
+        """The layer's trajectory after it.
+
+        Args:
+            layer: the scene and its trajectory.
+            parts: that are changed.
+            share: of the change in each frame, 0 to 1.
+        """
         raise NotImplementedError
 
 

@@ -37,6 +37,7 @@ def pose_residual(
         batch: with a plan whose derivative is "forward", for the Jacobian is made by columns, 6 P of them.
             Its weights are taken as they are, and the past tells nothing of a pose.
         step: share of the iterations that is done, which `tear_weight` falls over.
+        key: not used; it is part of the residual's form.
         block, softness: of `block_residual`.
     """
     free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]

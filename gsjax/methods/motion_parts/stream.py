@@ -98,7 +98,15 @@ def posed(
     blend: Blend = "quaternion",
     nudges: Float[Array, "M 3"] | None = None,
 ) -> Gaussians:
-    """The whole scene with its handles at a pose, the movable Gaussians first, and these perhaps nudged."""
+    """The whole scene with its handles at a pose, the movable Gaussians first, and these perhaps nudged.
+
+    Args:
+        canonical: the scene at rest.
+        weights: of its movable Gaussians; rows sum to 1.
+        pose: where handles are.
+        blend: of rotations.
+        nudges: added to the movable means, metres; none unless given.
+    """
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend)
     if nudges is not None:
         moved = eqx.tree_at(lambda g: g.means, moved, moved.means + nudges)
@@ -107,7 +115,13 @@ def posed(
 
 def picture_loss(drawn: Rendered, seen: Seen, config: StreamConfig) -> Float[Array, ""]:
     """lambda L1 + (1 - lambda)(1 - SSIM) on the pixels that count; and where cameras measured depth, its
-    difference, which beyond a limit is that of another thing."""
+    difference, which beyond a limit is that of another thing.
+
+    Args:
+        drawn: the scene.
+        seen: the frame, and which of its pixels count.
+        config: with lambda, the depth's weight and its limit.
+    """
     counts = seen.counts.astype(drawn.colors.dtype)
     image = jnp.where(seen.counts[..., None], drawn.colors, seen.frame.images)
     share = jnp.maximum(counts.mean(), 1e-3)  # a step as long where little moves
@@ -126,7 +140,14 @@ def tearing(
 ) -> Float[Array, ""]:
     """How much of the scene is torn: the share of neighbours whose motions take the same place apart, each
     counted by r^2 / (r^2 + scale^2) of the gap r. A hinge tears nothing along its axis, and what is torn for
-    good costs no more the farther it goes; but a piece that no picture holds goes with its neighbours."""
+    good costs no more the farther it goes; but a piece that no picture holds goes with its neighbours.
+
+    Args:
+        canonical: the scene at rest, with neighbours.
+        weights: of its movable Gaussians.
+        pose: where handles are.
+        scale: metres.
+    """
     squared = jnp.sum(gaps_between(canonical, weights, pose) ** 2, axis=-1)
     return jnp.mean(squared / (squared + scale**2))
 
@@ -134,7 +155,13 @@ def tearing(
 def gaps_between(
     canonical: Canonical, weights: Float[Array, "M P"], pose: HandlePose
 ) -> Float[Array, "M k 3"]:
-    """By how much the motions of neighbours take the same place apart, metres."""
+    """By how much the motions of neighbours take the same place apart, metres.
+
+    Args:
+        canonical: the scene at rest, with neighbours.
+        weights: of its movable Gaussians.
+        pose: where handles are.
+    """
     rotations, offsets = rigid_motions(canonical.centers, pose)
     rigid = jnp.concatenate([rotations, offsets[..., None]], axis=-1).reshape(-1, 12)
     still = jnp.eye(3, 4, dtype=rigid.dtype).ravel()
@@ -207,7 +234,14 @@ def moved_on(
     pose: HandlePose, moves: HandlePose, canonical: Canonical, shift: Array, turn: Array
 ) -> HandlePose:
     """The pose after moves of Adam, of which one of length 1 shifts a part by `shift`, and turns it so far
-    that its border goes by `turn`, metres. The background's handle stays, and so do slots that hold none."""
+    that its border goes by `turn`, metres. The background's handle stays, and so do slots that hold none.
+
+    Args:
+        pose: before.
+        moves: of Adam, of length 1 about.
+        canonical: with the parts that there are, and how far each reaches.
+        shift, turn: metres, [] for all parts or [P,1].
+    """
     free = (canonical.alive & (jnp.arange(len(canonical.alive)) != BACKGROUND))[:, None]
     shift, turn = (jnp.where(free, far, 0.0) for far in (shift, turn))
     quats = pose.quats + turn / (2 * canonical.radii[:, None]) * moves.quats  # half the angle

@@ -92,6 +92,11 @@ def gaussians_at(scene: PartScene, now: Moment, blend: Blend = "quaternion") -> 
 
     A Gaussian between parts goes where its weights' mean has it, as in skinning, and is as large and as
     visible as that. What is 1 times as large and wholly shown is as it was, to the bit.
+
+    Args:
+        scene: the parts.
+        now: the moment, where they are, how large and how visible.
+        blend: of rotations.
     """
     gaussians, weights = scene.gaussians, scene.weights
     # From the change on, so that weights which sum to 1 but for rounding change nothing by it.

@@ -37,12 +37,24 @@ def motions_of(
     translations: Float[np.ndarray, "T P 3"],
     centers: Float[np.ndarray, "P 3"],
 ) -> Motions:
-    """The motions of handles that turn about their own places."""
+    """The motions of handles that turn about their own places.
+
+    Args:
+        rotations: of P handles in T frames.
+        translations: of the same, metres.
+        centers: about which they turn, metres.
+    """
     return Motions(rotations, centers + translations - np.einsum("tpij,pj->tpi", rotations, centers))
 
 
 def gap(motions: Motions, a: int, b: int, points: Float[np.ndarray, "n 3"]) -> float:
-    """How far two parts' motions take the same points apart, root mean square over frames, metres."""
+    """How far two parts' motions take the same points apart, root mean square over frames, metres.
+
+    Args:
+        motions: of all parts.
+        a, b: the two.
+        points: canonical, metres.
+    """
     turn = motions.rotations[:, a] - motions.rotations[:, b]
     shift = motions.offsets[:, a] - motions.offsets[:, b]
     apart = np.einsum("tij,nj->tni", turn, points) + shift[:, None]
@@ -51,7 +63,13 @@ def gap(motions: Motions, a: int, b: int, points: Float[np.ndarray, "n 3"]) -> f
 
 def extent(motions: Motions, part: int, points: Float[np.ndarray, "n 3"]) -> float:
     """How far a part has moved from where it was in the canonical scene, at most over frames, metres; 0
-    without frames."""
+    without frames.
+
+    Args:
+        motions: of all parts.
+        part: which.
+        points: its own, canonical, metres.
+    """
     turn = motions.rotations[:, part] - np.eye(3)
     moved = np.einsum("tij,nj->tni", turn, points) + motions.offsets[:, part][:, None]
     return float(np.sqrt(np.sum(moved**2, axis=-1).mean(-1).max(initial=0.0)))

@@ -31,7 +31,14 @@ Field = FeatureGrid | SimplexTable | Float[Array, "M P"]
 def new_field(
     key: PRNGKeyArray, config: PartsConfig, means: Float[Array, "M 3"], parts: int
 ) -> tuple[Field, Located | None]:
-    """What `config.weights` says, and where the Gaussians lie in it; a grid is over the box of these."""
+    """What `config.weights` says, and where the Gaussians lie in it; a grid is over the box of these.
+
+    Args:
+        key: of a grid's first values.
+        config: with the kind of weights.
+        means: of the movable Gaussians, metres.
+        parts: how many columns weights have.
+    """
     if config.weights != "grid":
         empty = jnp.zeros((len(means), parts))
         return (SimplexTable(empty) if config.weights == "simplex" else empty), None
@@ -57,7 +64,15 @@ def saying(
     iterations: int = 100,
 ) -> tuple[Field, Float[np.ndarray, "iterations"]]:
     """The field that says these weights: a table at once, a grid as far as it can after so many steps, of
-    which the losses come back too."""
+    which the losses come back too.
+
+    Args:
+        field: of the kind that is wanted.
+        located: where Gaussians lie in a grid.
+        weights: what it is to say; rows sum to 1.
+        alive: parts that there are.
+        iterations: steps of a grid.
+    """
     if isinstance(field, SimplexTable):
         return SimplexTable(weights), np.zeros(0)
     if not isinstance(field, FeatureGrid):

@@ -51,7 +51,12 @@ class Spot(NamedTuple):
 
 
 def spot(x: Float[Array, "p"], y: Float[Array, "p"], width: int, height: int) -> Spot:
-    """The spot of a place (x, y), pixels; outside of the image, the nearest on its border."""
+    """The spot of a place (x, y), pixels; outside of the image, the nearest on its border.
+
+    Args:
+        x, y: pixels, centres at +0.5.
+        width, height: of the image, pixels.
+    """
     x = jnp.clip(x - 0.5, 0.0, width - 1.001)
     y = jnp.clip(y - 0.5, 0.0, height - 1.001)
     column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
@@ -242,6 +247,13 @@ def disagreement(
     """How badly a group's points agree with the images after its twist: 0 perfect, 1 not at all.
 
     Colour and depth count the same; what falls outside the picture counts half.
+
+    Args:
+        twist: translation in metres, rotation vector.
+        points: of the group.
+        center: about which it turns, metres.
+        sight: what cameras saw.
+        config: limits of colour and depth.
     """
     residuals = _residuals(carry(points, twist, center), sight, config)
     kinds = list(zip(_squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=True))

@@ -76,6 +76,12 @@ def as_facing(firsts: Firsts, twist: Float[Array, "6"], center: Float[Array, "3"
     """Those of one group after a twist about its centre, of which cameras look for what faces them.
 
     What hides a group where it is believed to be need not hide it elsewhere.
+
+    Args:
+        firsts: of the group.
+        twist: translation in metres, rotation vector.
+        center: about which it turns, metres.
+        sight: of the cameras.
     """
     moved = carry(Points(firsts.means, firsts.tones, firsts.real), twist, center)
     normals = rotated(jaxlie.SO3.exp(twist[3:]).as_matrix(), firsts.normals)

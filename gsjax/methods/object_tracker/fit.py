@@ -20,7 +20,13 @@ _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
 
 
 def fit_loss(gaussians, batch, *, step, key):
-    """L1 and D-SSIM on the images, and a truncated depth difference where depth is known."""
+    """L1 and D-SSIM on the images, and a truncated depth difference where depth is known.
+
+    Args:
+        gaussians: what trains.
+        batch: (frame, plan).
+        step, key: not used; they are part of a loss's form.
+    """
     frame, plan = batch
     rendered = render(gaussians, frame.cameras, plan)
     loss = photometric_loss(rendered.colors, frame.images)
@@ -39,6 +45,12 @@ def fit_scene(
     scene: TrackedScene, frame: Frame, iterations: int, headroom: float = 1.5
 ) -> tuple[TrackedScene, dict]:
     """The scene after `iterations` steps of Adam on the first frame; re-plans where splats outgrow the plan.
+
+    Args:
+        scene: as it starts.
+        frame: the first.
+        iterations: of Adam.
+        headroom: of the plan, 1 or more.
 
     Returns:
         The scene, and the info of the last step.

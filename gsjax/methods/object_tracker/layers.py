@@ -114,7 +114,13 @@ def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
     and all that lies behind once less than a tenth is left. A Gaussian that would leave less than 1 % is not
     drawn, so none may take that much alone: `alpha_max`. So where one alone is all that shows of an opaque
     thing, depth leans by up to 9 % of the way to what moves behind it. Small tiles fit small Gaussians, and a
-    few of them end sooner than many (tuned on a CPU)."""
+    few of them end sooner than many (tuned on a CPU).
+
+    Args:
+        moving: the Gaussians that move.
+        cameras: all that look at them.
+        headroom: 1 or more.
+    """
     limits = {"alpha_min": 0.03, "alpha_max": 0.9, "min_transmittance": 0.01}
     tiles = {"tile_size": 4, "tiles_per_batch": 384}
     return plan_render(moving, cameras, headroom=headroom, sh_degree=None, **limits, **tiles)
@@ -127,6 +133,13 @@ def show_moving(
 
     Labels are drawn as their binary digits, which are few channels: where one label has more than half of a
     pixel's weight, so has each of its digits.
+
+    Args:
+        scene: what is tracked.
+        pose: where it is.
+        backdrop: what does not move, drawn once.
+        plan: from `plan_moving`.
+        coarseness: that of the backdrop; Gaussians are `thinned` by as much.
     """
     moving, cameras = thinned(moving_of(scene, pose), coarseness), backdrop.cameras
     powers = np.left_shift(1, np.arange(max(1, scene.num_objects.bit_length())))
@@ -158,7 +171,15 @@ def show_moving(
 def seen_from(
     means: Float[Array, "m 3"], groups: Int[Array, "m"], shown: Shown, cameras: Camera, gap: float
 ) -> Float[Array, "c m"]:
-    """1 for each Gaussian of a group that a camera sees: its label is on top there and its depth agrees."""
+    """1 for each Gaussian of a group that a camera sees: its label is on top there and its depth agrees.
+
+    Args:
+        means: of the Gaussians, metres.
+        groups: 1 and up.
+        shown: what each camera has on top.
+        cameras: C of them.
+        gap: by how much depths may differ, metres.
+    """
     width, height = cameras.width, cameras.height
 
     def one(viewmat, K, labels, depths):

@@ -33,14 +33,27 @@ class Motion(eqx.Module):
 def group_means(
     values: Float[Array, "m *d"], groups: Int[Array, "m"], num_groups: int
 ) -> Float[Array, "k *d"]:
-    """Mean of `values` over each group 1..K."""
+    """Mean of `values` over each group 1..K.
+
+    Args:
+        values: of Gaussians.
+        groups: 1..K, of each.
+        num_groups: K, static.
+    """
     total = jax.ops.segment_sum(values, groups - 1, num_groups)
     count = jax.ops.segment_sum(jnp.ones(groups.shape, values.dtype), groups - 1, num_groups)
     return total / jnp.maximum(count, 1).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
-    """Each group turned about its centre and shifted, then each Gaussian shifted by its delta."""
+    """Each group turned about its centre and shifted, then each Gaussian shifted by its delta.
+
+    Args:
+        pose: before.
+        motion: a twist a group, a delta a Gaussian.
+        centers: of groups, metres.
+        groups: 1..K, of each Gaussian.
+    """
     rotation = jaxlie.SO3.exp(motion.twists[:, 3:])
     member = groups - 1
     center = centers[member]
@@ -68,6 +81,11 @@ def facing(scene: TrackedScene, pose: Pose, eyes: Float[Array, "c 3"]) -> Float[
 
     Without this, the front of a box that has turned away would be compared with its back. It fades from 1 to
     0 as the angle between normal and ray passes 90 degrees. A constant: no gradient.
+
+    Args:
+        scene: with outward normals.
+        pose: where the Gaussians are.
+        eyes: places of the cameras, metres.
     """
     normals = jnp.einsum("mij,mj->mi", quats_to_matrices(pose.quats), scene.normals)
     rays = eyes[:, None] - pose.means

@@ -41,6 +41,7 @@ class Sight(NamedTuple):
 
     @property
     def tones(self) -> Float[Array, "c height width 3"]:
+        """What is compared: the first three channels of the pixels."""
         return self.pixels[..., :3]
 
     @property
@@ -77,7 +78,13 @@ def of_groups(chosen: Bool[Array, "k"], a: Shaped[Array, "k *d"], b: Shaped[Arra
 
 
 def carry(points: Points, twist: Float[Array, "6"], center: Float[Array, "3"]) -> Points:
-    """One group's points after its twist (translation, rotation vector) about its centre."""
+    """One group's points after its twist (translation, rotation vector) about its centre.
+
+    Args:
+        points: of the group.
+        twist: translation in metres, rotation vector.
+        center: about which it turns, metres.
+    """
     turn = jaxlie.SO3.exp(twist[3:]).as_matrix()
     moved = rotated(turn, points.means - center[:, None]) + (center + twist[:3])[:, None]
     return points._replace(means=moved)
@@ -90,7 +97,10 @@ def rotated(matrix: Float[Array, "3 3"], vectors: Float[Array, "*n 3 p"]) -> Flo
 
 
 def sum_of_three(values: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
-    """Along an axis of length 3, written out: XLA:CPU works out a reduction's numbers one by one."""
+    """The sum of an array [..., 3, ...] along an axis of length 3, written out.
+
+    XLA:CPU works out a reduction's numbers one by one.
+    """
     x, y, z = (jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(3))
     return x + y + z
 
@@ -101,6 +111,11 @@ def first_members(
     """Up to `per_group` places of each group 1..K, in a fixed random order, and which of them are real.
 
     Other values than 1..K belong to nobody. One sort finds the members of all groups.
+
+    Args:
+        groups: of n Gaussians or pixels.
+        num_groups: K, static.
+        per_group: static.
     """
     count = groups.shape[0]
     visit = np.random.default_rng(0).permutation(count).astype(np.int32)
@@ -136,6 +151,8 @@ def pixels_of_groups(
         labels: the group of each pixel, 0 for none.
         depths: of the model at that pixel. What is measured further off
             than a group is thick is something else.
+        num_groups: K, static.
+        config: with how many pixels.
         coarseness: labels and depths are of every so-manieth pixel.
     """
     sight = sight._replace(pixels=sight.pixels[:, ::coarseness, ::coarseness])
@@ -192,6 +209,12 @@ def renewed(
 
 
 def carry_keyframe(keyframe: Keyframe, twists: Float[Array, "k 6"], centers: Float[Array, "k 3"]) -> Keyframe:
-    """The keyframe after each group's twist about its centre."""
+    """The keyframe after each group's twist about its centre.
+
+    Args:
+        keyframe: of all groups.
+        twists: translations in metres, rotation vectors.
+        centers: about which groups turn, metres.
+    """
     turned = jaxlie.SO3.exp(twists[:, 3:]) @ jaxlie.SO3(keyframe.turned)
     return Keyframe(jax.vmap(carry)(keyframe.points, twists, centers), turned.normalize().wxyz)

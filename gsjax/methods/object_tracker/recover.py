@@ -63,6 +63,7 @@ def recover(
     """Where one lost group shows most.
 
     Args:
+        key: of the random places.
         firsts: of the group.
         center: what it turns about.
         hunch: what this said in the last frame, from where the group is believed to be now.
@@ -149,6 +150,7 @@ def guesses(
     a quarter near the hunch.
 
     Args:
+        key: of the random places.
         shifts: what is tried near by.
         firsts: of the group. Those of about a strange pixel's colour are brought to it.
         center: what the group turns about.

@@ -39,6 +39,12 @@ def refine_loss(
 
     Pixels of the region count by their rendered alpha, taken as a constant: what no Gaussian covers says
     nothing, and uncovering it gains nothing.
+
+    Args:
+        motion: of groups and Gaussians, which trains.
+        batch: scene, frame, pose and plan.
+        step, key: not used; they are part of a loss's form.
+        config: limits and weights.
     """
     scene, frame = batch.scene, batch.frame
     groups = scene.labels[: scene.num_moving]
@@ -81,6 +87,8 @@ def refine_residual(
     Args:
         motions: of each group, K of them, about its centre.
         batch: with a plan whose derivative is "forward" where the Jacobian is made by columns.
+        step, key: not used; they are part of a residual's form.
+        config: limits and weights.
         block, softness: of `block_residual`.
     """
     twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)

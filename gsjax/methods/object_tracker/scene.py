@@ -38,6 +38,7 @@ class TrackedScene(eqx.Module):
 
     @property
     def num_objects(self) -> int:
+        """How many objects there are; the background is none."""
         return len(self.label_ids) - 1
 
 

@@ -54,7 +54,15 @@ def judge(
     sight: Sight,
     config: AlignConfig,
 ) -> Float[Array, "k"]:
-    """How badly each group agrees with the images after its twist."""
+    """How badly each group agrees with the images after its twist.
+
+    Args:
+        twists: translations in metres, rotation vectors.
+        points: of all groups.
+        centers: about which groups turn, metres.
+        sight: what cameras saw.
+        config: limits of colour and depth.
+    """
     over_groups = jax.vmap(disagreement, in_axes=(0, 0, 0, None, None))
     return over_groups(twists, points, centers, sight, config)
 
@@ -91,6 +99,15 @@ def look_everywhere(
     changing. Half the points choose among these; all of them have the last word. A turn that ends elsewhere
     and agrees nearly as well says that pictures do not tell the turn. The lead is a share of what agrees, for
     what is hidden agrees with no turn. Where little agrees, or no turn was tried, it is infinite.
+
+    Args:
+        known: where the group was found already, and how well that agrees.
+        starts: twists to begin from.
+        points: of the group.
+        center: about which it turns, metres.
+        sight: what cameras saw.
+        config: of the alignment.
+        shifts: tried from the starts, as twists.
     """
     wide, half = widened(config), jax.tree.map(lambda a: a[..., ::2], points)
 

@@ -47,23 +47,50 @@ class Shape(Protocol):
     """What is known of an object or of the background; `gsjax.data.PointModel` is one."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What it is."""
+        ...
+
     @property
-    def means(self) -> np.ndarray: ...
+    def means(self) -> np.ndarray:
+        """Centres in its own frame, metres, [N,3]."""
+        ...
+
     @property
-    def quats(self) -> np.ndarray: ...
+    def quats(self) -> np.ndarray:
+        """Orientations w x y z, [N,4]."""
+        ...
+
     @property
-    def scales(self) -> np.ndarray: ...
+    def scales(self) -> np.ndarray:
+        """Standard deviations, metres, [N,3]."""
+        ...
+
     @property
-    def opacities(self) -> np.ndarray: ...
+    def opacities(self) -> np.ndarray:
+        """0 to 1, [N]."""
+        ...
+
     @property
-    def colors(self) -> np.ndarray: ...
+    def colors(self) -> np.ndarray:
+        """RGB, 0 to 1, [N,3]."""
+        ...
+
     @property
-    def label(self) -> int: ...
+    def label(self) -> int:
+        """Mask value of the object; 0 is the static background."""
+        ...
+
     @property
-    def pose(self) -> np.ndarray | None: ...
+    def pose(self) -> np.ndarray | None:
+        """Shape to world [4,4] in the first frame; None where it must be fitted."""
+        ...
+
     @property
-    def plane(self) -> np.ndarray | None: ...
+    def plane(self) -> np.ndarray | None:
+        """(n, d) with n.x + d = 0 of the plane in the world that it rests on, or None."""
+        ...
+
 
 
 def scene_from_shapes(

@@ -32,7 +32,13 @@ class Model(eqx.Module):
 
 
 def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
-    """The model before the first step."""
+    """The model before the first step.
+
+    Args:
+        gaussians: where it starts.
+        config: what is learned.
+        views: how many photographs there are.
+    """
     dtype = gaussians.means.dtype
     return Model(
         gaussians,
@@ -46,7 +52,13 @@ def exposed(
     colors: Float[Array, "c h w 3"], exposures: Float[Array, "views 3 4"], view: Int[Array, ""]
 ) -> Float[Array, "c h w 3"]:
     """Colours as the camera of a photograph made them: E [c; 1]. On average over photographs E is [I | 0]:
-    what all share belongs to the scene."""
+    what all share belongs to the scene.
+
+    Args:
+        colors: as the scene sends them.
+        exposures: E of each photograph.
+        view: which photograph.
+    """
     map_ = (exposures - exposures.mean(0))[view]
     return colors + jnp.einsum("chwj,ij->chwi", colors, map_[:, :3]) + map_[:, 3]
 
@@ -55,7 +67,14 @@ def refined(
     viewmats: Float[Array, "c 4 4"], twists: Float[Array, "views 6"], view: Int[Array, ""], radius: float
 ) -> Float[Array, "c 4 4"]:
     """View matrices of cameras that were turned about their centres and shifted. On average over photographs
-    neither turned nor shifted, for else the scene could move along."""
+    neither turned nor shifted, for else the scene could move along.
+
+    Args:
+        viewmats: as they were given, world to camera.
+        twists: of each photograph.
+        view: which photograph.
+        radius: of the scene: what shifts are counted in.
+    """
     return twisted(viewmats, (twists - twists.mean(0))[view], radius)
 
 

@@ -37,6 +37,11 @@ def light_of(
     over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i, over that of all.
 
     The sums are the gradient of the composited sum of a feature that is 1 everywhere.
+
+    Args:
+        gaussians: the scene.
+        views: all photographs.
+        rasterize_mode: "classic" or "antialiased", as the scene is fitted.
     """
     most, plans = np.zeros(gaussians.num, np.float32), {}
     for view in views:

@@ -76,6 +76,9 @@ def start_points(
 
     Args:
         cloud: points and their colours: the data's own, or, where `config.source` says so, those of matches.
+        views: the photographs.
+        config: which source, and how many points.
+        seed: of what is drawn at random.
 
     Raises:
         ValueError: the source that is asked for is not there.
@@ -169,7 +172,15 @@ def _at_random(views, count, random):
 
 
 def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int) -> Gaussians:
-    """Spheres on the points (some of them, where there are more than slots), and empty slots behind them."""
+    """Spheres on the points (some of them, where there are more than slots), and empty slots behind them.
+
+    Args:
+        points: [M, 3].
+        colors: [M, 3], 0 to 1.
+        slots: how many Gaussians there may ever be.
+        config: their opacity and scale.
+        seed: of which points are taken.
+    """
     if len(points) > slots:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:slots])
         points, colors = points[chosen], colors[chosen]

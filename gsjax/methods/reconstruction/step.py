@@ -142,7 +142,16 @@ def grow(
     all_looked: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
     """Dead Gaussians move to where more are needed, and there may be `factor` times as many, up to `cap`.
-    Where all photographs looked since the last time, those that none has seen count as dead."""
+    Where all photographs looked since the last time, those that none has seen count as dead.
+
+    Args:
+        model: what is learned.
+        state: of the optimizer, with what it knows of pulls.
+        key: says who is copied.
+        cap: of Gaussians.
+        factor: 1 or more.
+        all_looked: whether all photographs did.
+    """
     gaussians, pull = _without_unseen(model.gaussians, state, all_looked), _pull_of(state)
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
     slots = jnp.clip(jnp.ceil(used * factor).astype(jnp.int32), used, cap)
@@ -154,7 +163,13 @@ def grow(
 
 
 def slots_wanted(model: Model, state: Any, config: FitConfig) -> Int[Array, ""]:
-    """How many slots `split` would fill if there were enough."""
+    """How many slots `split` would fill if there were enough.
+
+    Args:
+        model: what is learned.
+        state: of the optimizer, with what it knows of pulls.
+        config: with the threshold of pulls.
+    """
     asks = wanted(model.gaussians, _pull_of(state), config.split.pull)
     return is_alive(model.gaussians).sum() + asks.sum()
 
@@ -173,6 +188,11 @@ def split(
     forgotten.
 
     Args:
+        model: what is learned.
+        state: of the optimizer, with what it knows of pulls.
+        key: says where halves go.
+        config: thresholds.
+        radius: of the scene: what sizes are counted in.
         reset: lower opacities.
         pruning: prune what is too large.
         all_looked: all photographs looked since the last time, so those that none has seen are pruned too.

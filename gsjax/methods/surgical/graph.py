@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera, pixels_of, project
+from gsjax.geometry.sampling import farthest_points
 from gsjax.losses.graph import (
     Edges,
     Matching,
     edge_affinities,
     edge_weights,
-    farthest_points,
     node_loss,
     similar_edges,
     similarity_loss,

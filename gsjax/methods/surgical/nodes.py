@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from gsjax.losses.graph import farthest_points
+from gsjax.geometry.sampling import farthest_points
 from gsjax.scene.deformation import Nodes
 from gsjax.scene.gaussians import Gaussians, take
 

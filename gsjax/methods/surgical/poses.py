@@ -41,7 +41,13 @@ def refined_viewmats(
 
 
 def refined_looks(looks: Sequence[Look], twists: Float[Array, "looks 6"], radius: float) -> list[Look]:
-    """Looks from where they were found to be."""
+    """Looks from where they were found to be.
+
+    Args:
+        looks: as they were given.
+        twists: of each look.
+        radius: of the scene: what shifts are counted in.
+    """
     given, times = np.stack([look.viewmat for look in looks]), np.array([look.time for look in looks])
     found = refined_viewmats(given[:, None], times, twists, looks, radius)
     return [look._replace(viewmat=viewmat) for look, viewmat in zip(looks, found[:, 0], strict=True)]

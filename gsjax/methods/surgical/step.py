@@ -56,7 +56,13 @@ class DeformingScene(eqx.Module):
     def features_at(
         self, times: Float[Array, "T"], rows: Int[Array, "n"], moving: "Moving" = None
     ) -> Float[Array, "T n c"]:
-        """Features of some Gaussians at some times, as `at` has them."""
+        """Features of some Gaussians at some times, as `at` has them.
+
+        Args:
+            times: 0 to 1.
+            rows: of the Gaussians.
+            moving: which of them move, as for `at`.
+        """
         if moving is None or isinstance(moving, Nodes):
             return features_at(self.gaussians, self.field, times, rows, moving)
         found = features_at(self.gaussians, self.field, times, rows)
@@ -151,7 +157,13 @@ def feature_loss(
     drawn: Float[Array, "height width c"], codebook: Float[Array, "k c"], ids: Int[Array, "h w"]
 ) -> Float[Array, ""]:
     """|F_t - F_s|_1, a mean over channels and the teacher's pixels, to whose grid F_s is brought bilinearly
-    (papers/004, eq. 10)."""
+    (papers/004, eq. 10).
+
+    Args:
+        drawn: F_t, the scene's features.
+        codebook: what the teacher may say.
+        ids: which of it, of each of its pixels; -1 where it says nothing.
+    """
     known = (ids >= 0).astype(drawn.dtype)
     off = jnp.abs(on_grid(drawn, ids.shape) - codebook[jnp.maximum(ids, 0)])
     return weighted_mean(off.mean(axis=-1), known)

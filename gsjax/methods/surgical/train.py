@@ -218,7 +218,13 @@ def _gate_from(config: SurgicalConfig) -> int:
 
 
 def farthest_moved(scene: DeformingScene, batches: Sequence[Batch], share: float) -> Int[Array, "M"]:
-    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any look's time."""
+    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any look's time.
+
+    Args:
+        scene: canonical, and how it deforms.
+        batches: of all looks.
+        share: of the Gaussians, 0 to 1.
+    """
     at = jax.jit(lambda scene, time: jnp.linalg.norm(scene.at(time).means - scene.gaussians.means, axis=-1))
     farthest = np.max([np.asarray(at(scene, batch.time)) for batch in batches], axis=0)
     order = np.argsort(-farthest, kind="stable")

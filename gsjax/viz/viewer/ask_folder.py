@@ -174,7 +174,13 @@ class AskFolder:
 
 def heat_of(gaussians: Gaussians, found: Found, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
     """A colour for each Gaussian by its score, RGB 0 to 1: bright above the threshold; below it dark, over a
-    grey shade of what is there."""
+    grey shade of what is there.
+
+    Args:
+        gaussians: the scene.
+        found: their scores.
+        selected: which are above the threshold.
+    """
     low, high = float(found.scores.min()), float(found.scores.max())
     shares = (found.scores - low) / max(high - low, 1e-9)
     colors = heat(np.where(selected, 0.55 + 0.45 * shares, 0.4 * shares)[None])[0].astype(np.float32) / 255

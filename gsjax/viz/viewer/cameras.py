@@ -39,8 +39,14 @@ class Pose(NamedTuple):
 def browser_camera(
     wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"], fov: float, width: int, height: int
 ) -> Camera:
-    """One camera [1] for our rasterizer, from a browser's: orientation camera to world in OpenCV axes, and
-    vertical field of view in radians."""
+    """One camera [1] for our rasterizer, from a browser's.
+
+    Args:
+        wxyz: orientation, camera to world in OpenCV axes.
+        position: in the world.
+        fov: vertical field of view, radians.
+        width, height: of the picture, pixels.
+    """
     rotation = Rotation.from_quat(np.asarray(wxyz, float), scalar_first=True).as_matrix().T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ np.asarray(position, float)
@@ -61,7 +67,14 @@ def vertical_fov(K: Float[np.ndarray, "3 3"], height: int) -> float:
 
 
 def pose_of(shots: Shots, frame: int, shot: int, distance: float) -> Pose:
-    """The camera of a photograph, looking at what is so far away."""
+    """The camera of a photograph, looking at what is so far away.
+
+    Args:
+        shots: all photographs.
+        frame: when.
+        shot: which of that frame.
+        distance: to what it looks at, in the scene's unit.
+    """
     row = shots.at(frame)
     to_world = np.linalg.inv(shots.viewmats[row, shot])
     position, forward, up = to_world[:3, 3], to_world[:3, 2], -to_world[:3, 1]

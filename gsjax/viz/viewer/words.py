@@ -55,7 +55,13 @@ def length_of(scene: Viewable) -> str:
 
 
 def described(scene: Viewable, picked: Picked | None, frame: int) -> str:
-    """What is known of a picked Gaussian, as a table in Markdown."""
+    """What is known of a picked Gaussian, as a table in Markdown.
+
+    Args:
+        scene: what is shown.
+        picked: the Gaussian, or None where nothing was hit.
+        frame: which is shown.
+    """
     if picked is None:
         return NOTHING_THERE
     gaussians, row = scene.at(frame), picked.index

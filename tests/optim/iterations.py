@@ -1,0 +1,31 @@
+"""What tests of least squares share: the solvers, and many updates on one batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from gsjax.optim.least_squares import LevenbergMarquardt
+
+SOLVERS = {
+    "default": LevenbergMarquardt(1e-6, 1e-6),
+    "LM": optx.LevenbergMarquardt(1e-6, 1e-6),
+    "GN": optx.GaussNewton(1e-6, 1e-6),
+    "dogleg": optx.Dogleg(1e-6, 1e-6),
+}
+
+
+def scanned(step, params, batch, num):
+    """Infos of `num` updates on one batch, stacked, after the last parameters."""
+
+    def body(carry, i):
+        *carry, info = step.update(*carry, batch, step=i, key=None)
+        return tuple(carry), info
+
+    (params, _), infos = jax.lax.scan(body, (params, step.init(params)), jnp.arange(num))
+    return params, infos
+
+
+def falls(losses) -> bool:
+    """Never up, but for the rounding of two ways to compute one image."""
+    return bool((np.diff(losses) <= 1e-6 * losses[:-1]).all())

@@ -1,0 +1,147 @@
+"""Public docstrings are full: read from the source, in every layer but the command line.
+
+A docstring is full if it opens with a sentence, tells of each parameter (of one or two, the sentence may do),
+says what is raised, and gives the shapes of arrays that their annotations leave open.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "gsjax"
+LAYERS = (
+    *("geometry", "rasterize", "scene", "losses", "optim", "methods"),
+    *("perception", "metrics", "data", "io", "viz"),
+)
+FEW = 2  # so many parameters may be left to their names and annotations
+ERRORS = ("ValueError", "TypeError", "OSError", "DataError")
+OPEN_SHAPE = re.compile(r"^(np\.ndarray|(jax\.)?Array)$|\[(np\.ndarray|Array), ['\"]\.\.\.['\"]\]")
+
+Definition = ast.Module | ast.ClassDef | ast.FunctionDef
+
+
+def definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
+    """All that is public in a module, and the module itself; no method that a base class documents."""
+    yield "the module", tree
+    told: dict[str, set[str]] = {}  # by class, the methods that it or its bases document
+    for node in tree.body:
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef):
+            continue
+        if not node.name.startswith("_"):
+            yield node.name, node
+        if isinstance(node, ast.ClassDef):
+            methods = [member for member in node.body if isinstance(member, ast.FunctionDef)]
+            inherited = set().union(*(told.get(ast.unparse(base), set()) for base in node.bases))
+            told[node.name] = inherited | {m.name for m in methods if ast.get_docstring(m)}
+            public = [m for m in methods if not (m.name.startswith("_") or m.name in inherited)]
+            yield from ((f"{node.name}.{m.name}", m) for m in public if not node.name.startswith("_"))
+
+
+def faults(node: Definition) -> Iterator[str]:
+    """What the docstring of one definition lacks."""
+    text = ast.get_docstring(node)
+    if not text:
+        yield "has no docstring"
+        return
+    opening = text.split("\n\n")[0]
+    if not re.search(r"[.:;?]\)?$", opening):
+        yield f"opens with no sentence: {opening[:60]!r}"
+    if isinstance(node, ast.FunctionDef):
+        given = node.args
+        arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+        arguments = [a for a in arguments if a.arg not in ("self", "cls")]
+        silent = [a.arg for a in arguments if not (tells_of(text, a.arg) or is_of_its_class(a))]
+        if len(arguments) > FEW and silent and not re.search(r"[Aa]rguments (as for|of) `", text):
+            yield f"does not tell of {', '.join(silent)}"
+        open_ = [a.arg for a in arguments if a.annotation and OPEN_SHAPE.search(ast.unparse(a.annotation))]
+        if open_ and not re.search(r"\[[^\]]+\]|shape|Arguments as for", text):
+            yield f"gives no shape for {', '.join(open_)}"
+        raised = sorted(set(raises(node)) & set(ERRORS))
+        if raised and "Raises" not in text:
+            yield f"does not say that it raises {', '.join(raised)}"
+
+
+def tells_of(text: str, name: str) -> bool:
+    """Whether a docstring has a parameter's name, or each word of it, also in the plural or the singular."""
+    words = [word.removesuffix("s") for word in name.split("_") if word]
+    return all(re.search(rf"(?<![a-zA-Z]){re.escape(word)}", text, re.IGNORECASE) for word in words)
+
+
+def is_of_its_class(argument: ast.arg) -> bool:
+    """Whether an argument is called as its class is, `config: TrackerConfig`: the class tells of it."""
+    if argument.annotation is None:
+        return False
+    classes = re.findall(r"[A-Z]\w*", ast.unparse(argument.annotation).split("[")[0])
+    spelled = argument.arg.replace("_", "").removesuffix("s").lower()
+    return any(name.removesuffix("s").lower().endswith(spelled) for name in classes if len(spelled) > 3)
+
+
+def raises(function: ast.FunctionDef) -> Iterator[str]:
+    """Names of what the body raises by itself, functions within it left out."""
+    pending: list[ast.AST] = list(function.body)
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            continue
+        if isinstance(node, ast.Raise) and node.exc is not None:
+            raised = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
+            yield ast.unparse(raised).split(".")[-1]
+        pending.extend(ast.iter_child_nodes(node))
+
+
+def not_full(source: str) -> list[str]:
+    """One message, from the line on, for each fault in a module."""
+    tree = ast.parse(source)
+    if not tree.body:  # an empty __init__.py
+        return []
+    return [
+        f"{getattr(node, 'lineno', 1)}: {name} {fault}"
+        for name, node in definitions(tree)
+        for fault in faults(node)
+    ]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_public_docstrings_are_full(layer):
+    messages = [
+        f"gsjax/{file.relative_to(PACKAGE)}:{message}"
+        for file in sorted((PACKAGE / layer).rglob("*.py"))
+        for message in not_full(file.read_text(encoding="utf-8"))
+    ]
+    assert not messages, "\n" + "\n".join(messages)
+
+
+FULL = '''"""A module."""
+
+
+def f(a: Float[np.ndarray, "..."], b, some_points):
+    """Adds b to all points, and some.
+
+    Args:
+        a: [n, 3], metres.
+
+    Raises:
+        ValueError: never.
+    """
+    raise ValueError("a")
+'''
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("A module.", "A module", "1: the module opens with no sentence"),
+        ('"""A module."""', "", "the module has no docstring"),
+        ("Adds b to", "Adds to", "f does not tell of b"),
+        ("all points, and some", "all", "f does not tell of some_points"),
+        ("[n, 3], metres", "numbers", "f gives no shape for a"),
+        ("Raises:", "Finds:", "f does not say that it raises ValueError"),
+        ("def f(", "class F:\n    def g(self): ...\n\n\ndef f(", "F.g has no docstring"),
+    ],
+)
+def test_what_a_docstring_lacks_is_named(old, new, says):
+    assert not_full(FULL) == []
+    assert any(says in message for message in not_full(FULL.replace(old, new)))
