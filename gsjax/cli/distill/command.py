@@ -17,7 +17,7 @@ from gsjax.cli.distill.scene import FieldScene, SceneOptions, open_scene
 from gsjax.cli.distill.teacher import Asked, Masks, Second, Teaching
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed
+from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
 from gsjax.cli.recording import located
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
@@ -66,6 +66,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         asked = Asked(

@@ -29,6 +29,7 @@ from gsjax.cli.options import (
     Seeded,
     Selection,
     Timed,
+    checked,
     preset_options,
 )
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
@@ -82,6 +83,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
     """
+    options = checked(options)
     _check(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:

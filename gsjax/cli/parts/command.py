@@ -21,6 +21,7 @@ from gsjax.cli.options import (
     Resuming,
     Seeded,
     Selection,
+    checked,
 )
 from gsjax.cli.parts.loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts.results import finished, print_results, write_results
@@ -78,6 +79,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything found before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)

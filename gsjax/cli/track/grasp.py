@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.options import Seeded
+from gsjax.cli.options import Seeded, checked
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.folder import replaced_folder
 from gsjax.cli.track.outputs import frame_rate, write_png
@@ -64,6 +64,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
+    options = checked(options)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         saved, answer = ask(options, console, notes)
