@@ -34,6 +34,7 @@ from gsjax.cli.options import (
     preset_options,
 )
 from gsjax.cli.recording import located, open_recording
+from gsjax.cli.run.ending import exit_code
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.data import Photographs
@@ -172,7 +173,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _recording(options: Options, notes: Notes) -> Deep:

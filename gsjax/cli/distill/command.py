@@ -19,6 +19,7 @@ from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
 from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
 from gsjax.cli.recording import located
+from gsjax.cli.run.ending import exit_code
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.cli.run.records import digest
@@ -148,7 +149,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _told(row: Mapping[str, Any]) -> str:
