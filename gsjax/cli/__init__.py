@@ -33,7 +33,7 @@ COMMANDS = {
     "query": ("gsjax.cli.query.command", "find what a text means: objects of a run, or Gaussians by a field"),
     "ask": ("gsjax.cli.deform.ask", "answer a question on a scene that deforms, in plain English"),
     "grasp": ("gsjax.cli.track.grasp", "find the best grasp of the object that a text means, in every frame"),
-    "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect it into tables"),
+    "experiment": ("gsjax.cli.experiment.command", "sweep what a claim rests on, and collect it into tables"),
     "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
 }
 """Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
