@@ -35,7 +35,7 @@ GROUPS = {
     "Judge and measure": {
         "eval": ("gsjax.cli.fit.evaluate", "score a scene that was fitted, again or in more ways"),
         "compare": ("gsjax.cli.compare.command", "set runs side by side: scores, curves, pictures"),
-        "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect tables"),
+        "experiment": ("gsjax.cli.experiment.command", "sweep what a claim rests on, and collect tables"),
         "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step here"),
     },
 }
