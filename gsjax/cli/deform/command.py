@@ -30,9 +30,11 @@ from gsjax.cli.options import (
     Seeded,
     Selection,
     Timed,
+    checked,
     preset_options,
 )
 from gsjax.cli.recording import located, open_recording
+from gsjax.cli.run.ending import exit_code
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.data import Photographs
@@ -50,7 +52,8 @@ from gsjax.methods.surgical import (
 
 HELP = (
     " As in `gsjax deform DATASET --out RUN`. Masks say where tools are, which are left out unless --tools "
-    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane."
+    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane. "
+    "One camera is learned from (--cameras; the first unless given), one judges (--eval-cameras; the next)."
 )
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
@@ -101,7 +104,8 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
-    asked = _checked(options)
+    options = checked(options)
+    asked = _asked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
@@ -169,7 +173,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _recording(options: Options, notes: Notes) -> Deep:
@@ -179,10 +183,18 @@ def _recording(options: Options, notes: Notes) -> Deep:
     if is_of_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
-    first = options.cameras[0] if options.cameras else whole.camera_ids[0]
-    if first not in whole.camera_ids:
-        raise ValueError(f"--cameras: {whole.name} has no camera {first}; it has {list(whole.camera_ids)}")
-    sequence = whole.select(cameras=[first, *(c for c in whole.camera_ids if c != first)])
+    for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):
+        if camera and camera[0] not in whole.camera_ids:
+            known = list(whole.camera_ids)
+            raise ValueError(f"{flag}: {whole.name} has no camera {camera[0]}; it has {known}")
+    judge = options.eval_cameras
+    first = options.cameras or tuple(c for c in whole.camera_ids if c not in judge)[:1]
+    if not first or first == judge:
+        raise ValueError(
+            f"--eval-cameras: expected another camera than that to learn from, found {list(judge)} for both"
+        )
+    others = [camera for camera in whole.camera_ids if camera not in (*first, *judge)]
+    sequence = whole.select(cameras=[*first, *judge, *others])
     return with_depth(sequence, options.depth, options.deform.plane_depth, notes)
 
 
@@ -218,10 +230,12 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
-def _checked(options: Options) -> Asked | None:
+def _asked(options: Options) -> Asked | None:
     """Whose features are asked for, once all options fit; None: nobody's."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
+    if len(options.eval_cameras) > 1:
+        raise ValueError(f"--eval-cameras: expected one to judge by, found {list(options.eval_cameras)}")
     asked = Asked(options.features, options.masks, options.sam, options.weights, options.level)
     option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
     if option is not None and asked.features not in ("closed", "clip"):

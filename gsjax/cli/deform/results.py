@@ -12,6 +12,7 @@ from gsjax.cli.run.report import Media, Table, write_report
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
 
+_RECIPES = {"surst": "After SurstSplat", "clin": "After GaussianClin"}
 _COLUMNS = (  # key, head, unit and decimals, where frames have it
     ("frame", "frame", "", None),
     ("psnr_masked", "PSNR where it counts", "dB", 2),
@@ -69,7 +70,9 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     write_report(
         folder.report,
         title=f"{found['dataset']} deforms" + ("" if found["complete"] else " (partial run)"),
-        subtitle=f"{found['method']}; {frames['learned']} frames learned, {frames['held_out']} held out",
+        subtitle=(
+            f"{_RECIPES[found['preset']]}; {frames['learned']} frames learned, {frames['held_out']} held out"
+        ),
         summary=cards,
         strips=shown,
         plots=plots,

@@ -17,8 +17,9 @@ from gsjax.cli.distill.scene import FieldScene, SceneOptions, open_scene
 from gsjax.cli.distill.teacher import Asked, Masks, Second, Teaching
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed
+from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
 from gsjax.cli.recording import located
+from gsjax.cli.run.ending import exit_code
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.cli.run.records import digest
@@ -66,6 +67,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         asked = Asked(
@@ -147,7 +149,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _told(row: Mapping[str, Any]) -> str:

@@ -12,12 +12,12 @@ from gsjax.cli.distill.file import StoredField
 from gsjax.cli.distill.scene import FieldScene
 from gsjax.cli.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
 from gsjax.cli.distill.teacher import Teaching
-from gsjax.cli.fit.results import mean_scores
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, describe
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.report import Media, Table, write_report
-from gsjax.cli.track.outputs import write_png
+from gsjax.cli.run.scores import mean_scores
+from gsjax.io.pictures import write_png
 from gsjax.methods.feature_field import FeatureField, FieldConfig, carried
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import Located

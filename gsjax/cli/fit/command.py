@@ -29,10 +29,12 @@ from gsjax.cli.options import (
     Seeded,
     Selection,
     Timed,
+    checked,
     preset_options,
 )
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
 from gsjax.cli.recording import located
+from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
@@ -82,6 +84,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
     """
+    options = checked(options)
     _check(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
@@ -150,9 +153,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "fit",
             "dataset": photographs.name,
-            "complete": finished,
-            "report": True,
-            "stopped": None if stopped is None else reason(stopped),
+            **ended(stopped),
             "steps": state.step,
             "skipped": curve.skipped,
             "num_gaussians": gaussians.num,
@@ -179,11 +180,7 @@ def run(options: Options) -> int:
         if finished:
             folder.forget_resume()
     print_results(folder, found)
-    if isinstance(stopped, KeyboardInterrupt):
-        return 130
-    if stopped is not None:
-        raise stopped
-    return 0
+    return exit_code(stopped)
 
 
 def _check(options: Options) -> None:

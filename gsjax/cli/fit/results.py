@@ -1,7 +1,6 @@
 """What a fit came to: its curve, its scores, pictures of views that it never saw, and the report."""
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,12 @@ from gsjax.cli.fit.orbit import NAME as ORBIT
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import counted
 from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.run.pictures import PANELS
 from gsjax.cli.run.report import Media, Table, write_report
-from gsjax.cli.track.outputs import write_png
+from gsjax.cli.run.scores import mean_scores
 from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import atomic_write
+from gsjax.io.pictures import write_png
 from gsjax.methods.reconstruction import Fitted, Problem, View
 from gsjax.metrics.image import depth_error, psnr, ssim, with_matched_colors
 from gsjax.optim.densification import is_alive
@@ -46,8 +47,6 @@ _TIMES = {
     "video": "the video",
     "total": "in all, with reading and the start",
 }
-PANELS = ("photograph", "rendered", "difference")
-"""What a picture of a view shows, from left to right."""
 
 
 @dataclass
@@ -131,15 +130,6 @@ class Scores:
     def mean(self) -> dict[str, float | None]:
         """Over the views that have a number."""
         return mean_scores(self.rows, ("psnr", "ssim", "depth_mm", "psnr_matched"))
-
-
-def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
-    """Of each score, over the views that have a finite one; None where none has."""
-    known = {
-        name: [row[name] for row in rows if row.get(name) is not None and np.isfinite(row[name])]
-        for name in names
-    }
-    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
 def living(gaussians: Gaussians) -> tuple[Gaussians, int]:

@@ -21,11 +21,13 @@ from gsjax.cli.options import (
     Resuming,
     Seeded,
     Selection,
+    checked,
 )
 from gsjax.cli.parts.loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts.results import finished, print_results, write_results
 from gsjax.cli.parts.resume import Saver, load
 from gsjax.cli.recording import Recording, located, open_recording, parse_frames
+from gsjax.cli.run.ending import exit_code
 from gsjax.cli.run.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
@@ -78,6 +80,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything found before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
@@ -148,11 +151,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_results(folder, found)
-    if isinstance(following.stopped, KeyboardInterrupt):
-        return 130
-    if following.stopped is not None:
-        raise following.stopped
-    return 0
+    return exit_code(following.stopped)
 
 
 def _check(options: Options, recording: Recording) -> None:

@@ -13,13 +13,14 @@ from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, counted, reason
 from gsjax.cli.parts.loop import Following
 from gsjax.cli.parts.scoring import joints_of, part_rows, score_parts
+from gsjax.cli.parts.views import part_views
 from gsjax.cli.recording import Recording
+from gsjax.cli.run.ending import ended
 from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.run.pictures import Film
 from gsjax.cli.run.report import Media, format_number, write_report
-from gsjax.cli.track.outputs import Film
-from gsjax.cli.track.scoring import Scores, camera_metrics
-from gsjax.cli.track.summary import CAMERA_COLUMNS, Column, camera_rows, grid, table, time_table
-from gsjax.cli.track.views import part_views
+from gsjax.cli.run.scores import CAMERA_COLUMNS, Scores, camera_metrics, camera_rows
+from gsjax.cli.run.tables import Column, grid, table, time_table
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
@@ -103,8 +104,7 @@ def finished(
     return {
         "kind": "parts",
         "dataset": sequence.name,
-        "complete": following.stopped is None,
-        "stopped": None if following.stopped is None else reason(following.stopped),
+        **ended(following.stopped),
         "anchor": start.anchor.frame,
         "frames": {
             "followed": len(frames),

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from gsjax.cli.messages import Notes
 from gsjax.cli.recording import Recording
-from gsjax.cli.track.scoring import motion_metrics
+from gsjax.cli.run.scores import motion_metrics
 from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment

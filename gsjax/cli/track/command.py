@@ -30,13 +30,15 @@ from gsjax.cli.recording import (
     open_recording,
     warn_of_missing,
 )
+from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder, expect_dataset
+from gsjax.cli.run.pictures import Film
 from gsjax.cli.run.report import format_number
+from gsjax.cli.run.scores import Scores
 from gsjax.cli.track.loop import Tracking, begin, follow
-from gsjax.cli.track.outputs import Film, write_first_mask, write_plots, write_tracking
+from gsjax.cli.track.outputs import write_first_mask, write_plots, write_tracking
 from gsjax.cli.track.resume import Saver, load
 from gsjax.cli.track.scoring import (
-    Scores,
     budget_metrics,
     group_values,
     lost_over_frames,
@@ -131,11 +133,7 @@ def run(options: Options) -> int:
         if found["complete"]:
             folder.forget_resume()
     print_summary(folder, found)
-    if isinstance(tracking.stopped, KeyboardInterrupt):
-        return 130
-    if error := tracking.stopped or failed:
-        raise error
-    return 0
+    return exit_code(tracking.stopped or failed)
 
 
 def _start(
@@ -242,11 +240,11 @@ def _what_ran(
 ) -> dict[str, Any]:
     """The part of metrics.json that says what ran, and how fast."""
     ids, updates = recording.tracked.frame_ids, np.asarray(tracking.update_s[1:]) * 1e3
-    stopped = tracking.stopped
     return {
+        "kind": "track",
         "dataset": recording.tracked.name,
-        "complete": stopped is None and scores.num_frames == tracking.num_frames,
-        "stopped": None if stopped is None else reason(stopped),
+        **ended(tracking.stopped),
+        "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
         "frames": {
             "tracked": tracking.num_frames,
             "asked": recording.tracked.num_frames,

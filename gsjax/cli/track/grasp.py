@@ -16,16 +16,17 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.options import Seeded
+from gsjax.cli.options import Seeded, checked
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.folder import replaced_folder
-from gsjax.cli.track.outputs import frame_rate, write_png
+from gsjax.cli.run.pictures import frame_rate
 from gsjax.cli.track.query import Answer, ObjectQuery, ask, progress, show
 from gsjax.cli.track.saved import SavedRun
 from gsjax.cli.track.views import views
 from gsjax.geometry.cameras import project
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp
 from gsjax.optim.compiler import host_options
@@ -64,6 +65,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
+    options = checked(options)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         saved, answer = ask(options, console, notes)

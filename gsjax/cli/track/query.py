@@ -17,10 +17,12 @@ from rich.table import Table
 from gsjax.cli.messages import Notes
 from gsjax.cli.options import Common
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
-from gsjax.cli.track.outputs import frame_rate, write_png
+from gsjax.cli.run.pictures import frame_rate
+from gsjax.cli.run.views import View
 from gsjax.cli.track.saved import SavedRun, open_run
-from gsjax.cli.track.views import View, views
+from gsjax.cli.track.views import views
 from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.object_tracker import find_object
 from gsjax.methods.protocols import LanguageEncoder

@@ -1,0 +1,121 @@
+"""What an experiment's config.yaml may say, and what is said where it says something else."""
+
+import dataclasses
+import difflib
+import json
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+CONFIG = "config.yaml"
+FIGURES = (".png", ".svg", ".jpg", ".webp")
+_WORDS = {str: "text", int: "a whole number", list: "a list", dict: "key: value pairs"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table."""
+
+    key: str  # of what `run` returns, or seconds
+    label: str = ""  # the key unless given
+    unit: str = ""
+    direction: str = ""  # lower or higher: which is better
+    format: str = ""  # as Python's format() has it, such as .2f; three digits unless given
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What `figure(rows, path)` of the script draws."""
+
+    file: str = "figure.png"
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What config.yaml says; its keys are these names."""
+
+    claim: str  # one sentence
+    source: str  # where it is made: paper and section, or else
+    script: str  # path from the config's folder, with `run(options, seed, folder)`; several may share one
+    grid: dict = field(default_factory=dict)  # option: [values]; all combinations, the last option fastest
+    cases: list = field(default_factory=list)  # of option: value pairs; the grid is swept in each
+    seeds: list = field(default_factory=lambda: [0])
+    columns: list = field(default_factory=list)  # of Column; none for all figures
+    figure: dict = field(default_factory=dict)  # a Figure
+    version: int = 1  # raise it to have all cells measured again
+
+
+def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Figure]:
+    """Read a config.yaml and check all of it but the sweep; `read_experiment` checks that.
+
+    Args:
+        path: the file.
+        root: the folder of all experiments, within which the script has to be.
+
+    Raises:
+        ValueError: it is no YAML, or a key is not as it should be.
+    """
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        said = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
+        raise ValueError(f"{path}: expected YAML, found {said}") from error
+    config = _fields(Config, found, f"{path}", ": ")
+    for key in ("claim", "source", "script"):
+        expect(getattr(config, key).strip(), f"{path}: {key}", "text", "none")
+    script = path.parent / config.script
+    within = script.resolve().is_relative_to(root.resolve())
+    expect(within, f"{path}: script", f"a path within {root}", config.script)
+    expect(script.is_file(), f"{path}: script", "a file", f"none at {script}")
+    columns = tuple(_column(value, f"{path}: columns[{i}]") for i, value in enumerate(config.columns))
+    expect_unlike([column.key for column in columns], f"{path}: columns")
+    figure = _fields(Figure, config.figure, f"{path}: figure")
+    fits = Path(figure.file).name == figure.file and Path(figure.file).suffix in FIGURES
+    expect(fits, f"{path}: figure.file", f"a file name in {', '.join(FIGURES)}", figure.file)
+    return config, columns, figure
+
+
+def _column(value: Any, where: str) -> Column:
+    column = _fields(Column, value, where)
+    known = column.direction in ("", "lower", "higher")
+    expect(known, f"{where}.direction", "lower or higher", column.direction)
+    try:
+        format(1.0, column.format)
+    except ValueError:
+        expect(False, f"{where}.format", "one of Python's for a number, such as .2f", column.format)
+    return column
+
+
+def _fields(kind: type, value: Any, where: str, separator: str = ".") -> Any:
+    """The dataclass of a mapping: its keys are known, types are as annotated, and nothing is missing."""
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    expect(isinstance(value, dict), where, f"the keys {', '.join(fields)}", value)
+    for key in value:
+        meant = difflib.get_close_matches(str(key), fields, 1)
+        found = f"{key!r}" + (f"; did you mean {meant[0]!r}?" if meant else "")
+        expect(key in fields, where, f"the keys {', '.join(fields)}", found)
+    for key, f in fields.items():
+        required = f.default is MISSING and f.default_factory is MISSING
+        sound = isinstance(value.get(key), f.type) and not isinstance(value[key], bool)
+        if key in value or required:
+            expect(sound, f"{where}{separator}{key}", _WORDS[f.type], value.get(key))
+    return kind(**value)
+
+
+def expect(holds: Any, where: str, expected: str, found: Any) -> None:
+    """Raises a ValueError that says where what was expected and what was found, unless `holds`."""
+    if holds:
+        return
+    found = "nothing" if found is None else found
+    said = found if isinstance(found, str) else json.dumps(found, default=str)
+    raise ValueError(f"{where}: expected {expected}, found {said}")
+
+
+def expect_unlike(names: list[str], where: str) -> None:
+    """Raises a ValueError that names those that are there more than once."""
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    expect(not twice, where, "each once", f"{', '.join(twice)} more than once")

@@ -1,0 +1,72 @@
+"""What makes a row stale, and scripts that are shared."""
+
+from pathlib import Path
+
+import pytest
+
+from gsjax.cli.experiment.sweep import experiment_names, read_experiment
+from tests.cli.experiment.toys import SCRIPT, calls, results
+
+
+@pytest.mark.parametrize("change", ["script", "helper", "version"])
+def test_a_stale_cell_is_reported_and_runs_again(toy, gsjax, change):
+    folder = toy()
+    gsjax("run", "toy")
+    calls()
+    folder = toy(SCRIPT + "# another\n") if change == "script" else toy(version=1 + (change == "version"))
+    if change == "helper":
+        (folder / "helper.py").write_text("FACTOR = 2\n")
+    _, out, _ = gsjax("list")
+    assert "0 of 4" in out
+    assert "4 stale" in out
+    assert "Stale: 4 of 4 cells" in gsjax("table", "toy")[1]
+    gsjax("run", "toy", "--only", "size=320", "mode=fast")
+    assert calls() == ["320 fast 0"]
+    _, out, _ = gsjax("table", "toy")
+    assert "Stale: 3 of 4 cells" in out
+    assert len(set(r["script"] for r in results(folder)["rows"])) == 2
+    gsjax("run", "toy")
+    assert len(calls()) == 3
+    assert "stale" not in gsjax("list")[1]
+
+
+def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
+    drawn = "\f\ndef figure(rows, path):\n    path.write_text({!r})\n"
+    folder = toy(SCRIPT + drawn.format("one"), figure={"caption": "c"})
+    gsjax("run", "toy")
+    calls()
+    toy(SCRIPT + drawn.format("another"), figure={"caption": "c"})
+    assert "4 of 4" in gsjax("list")[1]
+    gsjax("run", "toy")
+    assert calls() == []
+    assert (folder / "figure.png").read_text() == "another"
+    toy(SCRIPT.replace("/ 10", "/ 5") + drawn.format("another"), figure={"caption": "c"})
+    assert "4 stale" in gsjax("list")[1]
+
+
+def test_two_experiments_share_a_script(toy, gsjax):
+    """Its helpers stand beside the script, not beside the config."""
+    folder = toy("from factor import FACTOR\n" + SCRIPT, script="../shared/sweep.py")
+    shared = folder.parent / "shared"
+    shared.mkdir()
+    (folder / "sweep.py").rename(shared / "sweep.py")
+    (shared / "factor.py").write_text("FACTOR = 1\n")
+    other = folder.parent / "other"
+    other.mkdir()
+    (other / "config.yaml").write_text((folder / "config.yaml").read_text())
+    assert [gsjax("run", name)[0] for name in ("toy", "other")] == [0, 0]
+    assert results(folder)["rows"][0]["result"] == results(other)["rows"][0]["result"]
+
+
+ROOT = Path(__file__).resolve().parents[3] / "experiments"
+
+
+@pytest.mark.parametrize("name", experiment_names(ROOT))
+def test_every_experiment_of_this_repository_can_be_loaded(name, tmp_path):
+    """Settings that scripts name may be gone or refused, which only a run would tell."""
+    try:
+        read_experiment(ROOT, name, tmp_path).load()
+    except ValueError as error:
+        if "No module named" not in str(error):
+            raise
+        pytest.skip(f"{error}")
