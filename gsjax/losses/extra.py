@@ -10,15 +10,16 @@ A method that takes `extra_losses` adds them up with its own, and the gradient o
 What one counts beside the others is a factor within it. Without any, a method's program is what it was.
 """
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import Rendered
 
 
+@runtime_checkable
 class ExtraLoss(Protocol):
     """A pure function, differentiable in what it reads: of a scene as it was drawn, and of what was seen."""
 
@@ -39,7 +40,7 @@ ExtraLosses = tuple[ExtraLoss, ...]
 """A tuple, for it is static under jit. A function made anew, as a lambda is, compiles anew: make it once."""
 
 
-def named_losses(losses: Sequence[ExtraLoss]) -> dict[str, ExtraLoss]:
+def named_losses(losses: Any) -> dict[str, ExtraLoss]:
     """Losses by the names of their functions, under which `info["extra"]` has their values.
 
     Raises:
@@ -60,9 +61,7 @@ def named_losses(losses: Sequence[ExtraLoss]) -> dict[str, ExtraLoss]:
     return named
 
 
-def extra_terms(
-    losses: Sequence[ExtraLoss], scene: Any, rendered: Rendered, frame: Frame
-) -> dict[str, Float[Array, ""]]:
+def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str, Float[Array, ""]]:
     """What each of them comes to, by name.
 
     Args:
@@ -74,9 +73,9 @@ def extra_terms(
     """
     terms = {name: loss(scene, rendered, frame) for name, loss in named_losses(losses).items()}
     for name, value in terms.items():
-        shape = getattr(value, "shape", None if not isinstance(value, int | float) else ())
-        if shape != ():
+        if value is None or jnp.shape(value) != ():
+            found = "None" if value is None else f"shape {jnp.shape(value)}"
             raise ValueError(
-                f"extra_losses: expected a scalar of {name}, found shape {shape}; take a sum or a mean"
+                f"extra_losses: expected a scalar of {name}, found {found}; take a sum or a mean"
             )
     return terms
