@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import OfRecording
 from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
@@ -49,6 +50,12 @@ def located(dataset: str) -> str:
     """The absolute path of a dataset, by which a run finds it again from elsewhere; of a built-in scene its
     name."""
     return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)
+
+
+def chosen_recording(options: OfRecording) -> Recording:
+    """The recording that a command is told of. Raises: as `open_recording`."""
+    cameras = (options.cameras, options.eval_cameras)
+    return open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
 
 
 def open_recording(

@@ -20,20 +20,9 @@ from gsjax.cli.deform.scores import judge
 from gsjax.cli.distill.choice import TeacherChoice, TeacherOptions
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import (
-    OF_NO_BEARING,
-    Common,
-    DatasetAndOut,
-    HeldOutFrames,
-    Resuming,
-    Seeded,
-    Selection,
-    Timed,
-    checked,
-    preset_options,
-)
+from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, preset_options
 from gsjax.cli.recording import located, open_recording
-from gsjax.cli.run.ending import exit_code
+from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.data import Photographs
@@ -61,7 +50,7 @@ _UNLIKE = 0.6  # an IoU
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Timed, Seeded, TeacherOptions, HeldOutFrames, Selection, DatasetAndOut):
+class Options(TeacherOptions, OfDataset):
     """What `gsjax deform` is told."""
 
     preset: Literal["surst", "clin"] = "surst"
@@ -153,10 +142,7 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        folder.write_metrics(found)
-        write_results(folder, found)
-        if found["complete"]:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
     return exit_code(learning.stopped)
 

@@ -96,15 +96,7 @@ def answer_deformation(
     Args:
         path: of the run.
         stored: what it learned.
-        question: what is asked.
-        changes: what is done with what is found.
-        folder: for it, in place of an earlier answer, which stays until this one is whole.
-        notes: told of what is odd.
-        console: shows how far it is.
-
-    Raises:
-        ValueError: the question cannot be understood, or means nothing of the scene.
-        FileExistsError: something is in the folder that is no answer.
+        question, changes, folder, notes, console: as for a field's `answer`, and so is what is raised.
     """
     t = _frame(stored, question.frame)
     shown = sorted({t, *_pictured(stored, question)})

@@ -20,7 +20,7 @@ from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
 from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
 from gsjax.cli.recording import located
-from gsjax.cli.run.ending import exit_code
+from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.cli.run.records import digest
@@ -133,10 +133,7 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        folder.write_metrics(found)
-        write_results(folder, found)
-        if found["complete"]:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
     return exit_code(learning.stopped)
 

@@ -14,6 +14,7 @@ from gsjax.cli.distill.scores import ClassScores, Frozen, angle_error, class_map
 from gsjax.cli.distill.teacher import Teaching
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, describe
+from gsjax.cli.run.ending import print_grid
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.report import Media, Table, write_report
 from gsjax.cli.run.scores import mean_scores
@@ -159,7 +160,7 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """The run in a few lines."""
-    console, grid, test = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0)), found["test"]
+    grid, test = Grid.grid(padding=(0, 3, 0, 0)), found["test"]
     words = []
     if test["miou_3d"] is not None:
         words.append(f"mIoU {test['miou_3d']:.3f} by 3D query, {test['miou_2d']:.3f} by 2D query")
@@ -181,9 +182,5 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     pace = f" ({seconds['steps'] / max(1, found['steps']):.2f} s each)" if seconds["steps"] else ""
     minutes = (seconds["steps"] + seconds["compile"]) / 60
     grid.add_row("[bold]steps[/]", f"{found['steps']:,} in {minutes:.1f} min{pace}")
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
-    console.print(f"[bold]ask it[/]  gsjax query {folder.path} TEXT", soft_wrap=True)
+    print_grid(folder, found, grid)
+    Console(highlight=False).print(f"[bold]ask it[/]  gsjax query {folder.path} TEXT", soft_wrap=True)

@@ -156,7 +156,7 @@ def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: in
     write_npz(path, {name: np.asarray(array) for name, array in arrays.items()})
 
 
-def write_results(folder: RunFolder, found: dict[str, Any], following: Following) -> None:
+def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Writes report.html."""
     rows = _in_words(found["parts"])
     colors = [label_color(row["part"]) for row in rows]
