@@ -70,6 +70,15 @@ def open_recording(
     """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
     made smaller by `scale`. `opened` opens it, whole; `open_sequence` unless given.
 
+    Args:
+        dataset: a folder, or a built-in scene.
+        cameras: ids of those to look through.
+        eval_cameras: ids of those held out.
+        frames: START:STOP[:STEP].
+        read: what the layout leaves open.
+        scale: of pictures.
+        opened: as above.
+
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
             much would be left of pictures.
@@ -117,7 +126,13 @@ def _scaled(sequence: Sequence, scale: float) -> Sequence:
 
 
 def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:
-    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height."""
+    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height.
+
+    Args:
+        scale: what was given.
+        what: is made smaller, in words.
+        before, after: its (width, height).
+    """
     if scale < 1 and min(after) < _LEAST_SIDE:
         raise ValueError(
             f"--scale {scale:g}: {what} of {before[0]}x{before[1]} would be {after[0]}x{after[1]}; expected "
@@ -254,7 +269,14 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
-    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian."""
+    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian.
+
+    Args:
+        recording: with its truth, where it has one.
+        mask: the first mask.
+        scene_ids: labels that the scene has.
+        notes: told of each.
+    """
     if mask.labels is None:
         return
     names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())

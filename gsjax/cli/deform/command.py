@@ -181,7 +181,14 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
 
 
 def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metric: bool = True) -> None:
-    """Writes deformation.npz, and scene.ply, the scene as it was at the first frame."""
+    """Writes deformation.npz, and scene.ply, the scene as it was at the first frame.
+
+    Args:
+        folder: of the run.
+        state: what was learned.
+        data: what it was learned from.
+        metric: whether depth, and so the scene, is in metres.
+    """
     seen = data.sequence
     stored = StoredDeformation(
         state.scene,

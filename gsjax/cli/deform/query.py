@@ -96,7 +96,11 @@ def answer_deformation(
     Args:
         path: of the run.
         stored: what it learned.
-        question, changes, folder, notes, console: as for a field's `answer`, and so is what is raised.
+        question, changes, folder, notes, console: as for a field's `answer`.
+
+    Raises:
+        ValueError: the question cannot be understood, or means nothing of the scene.
+        FileExistsError: something is in the folder that is no answer.
     """
     t = _frame(stored, question.frame)
     shown = sorted({t, *_pictured(stored, question)})
@@ -193,6 +197,12 @@ def _write_labels(
 
 def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
     """What a text, a point or a box is in the scene's channels.
+
+    Args:
+        stored: what a run learned.
+        question: what is asked.
+        t: the frame that is asked about.
+        there: the scene at that frame.
 
     Raises:
         ValueError: the text cannot be read, or nothing of the scene lies there.

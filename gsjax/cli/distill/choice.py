@@ -57,6 +57,7 @@ class TeacherChoice:
 
     @property
     def of_files(self) -> bool:
+        """Whether features are those of a folder of files."""
         return self.features not in ("auto", *KINDS)
 
     def located(self) -> dict[str, Any]:

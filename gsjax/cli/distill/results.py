@@ -47,7 +47,16 @@ def judge(
     notes: Notes,
 ) -> dict[str, Any]:
     """Compares held-out views, or those that taught where none is held out, with what the teacher says of
-    them, and draws some. What cannot be read is noted, and nothing is compared there."""
+    them, and draws some. What cannot be read is noted, and nothing is compared there.
+
+    Args:
+        folder: of the run, for pictures.
+        scene: what the field is of, and its photographs.
+        teaching: who says what of them.
+        stored: the field.
+        config: how it was learned.
+        notes: told of what cannot be read.
+    """
     held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
     field, located = stored.at(scene.gaussians.means)
@@ -111,7 +120,13 @@ def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[
 def draw_features(
     numbers: Float[Array, "n three"], frozen: Frozen, pca: PcaColors
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A view in the colours of its features; what shows little of the scene is near black."""
+    """A view in the colours of its features; what shows little of the scene is near black.
+
+    Args:
+        numbers: three of each Gaussian, as `feature_colors` has them.
+        frozen: the view.
+        pca: which colours they are.
+    """
     image, alphas = (np.asarray(a) for a in paint(frozen[0], numbers, frozen[1]))
     alphas = alphas[..., None]
     return colorize_features(np.where(alphas > 0.5, image / np.maximum(alphas, 0.5), np.nan), pca)

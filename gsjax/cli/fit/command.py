@@ -227,7 +227,14 @@ def write_cameras(folder: RunFolder, names: list[str], views: list[View], model:
 def without_needless(
     views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes
 ) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
-    """Those that some photograph needs, and the light that each sends."""
+    """Those that some photograph needs, and the light that each sends.
+
+    Args:
+        views: the photographs that were fitted.
+        config: how; its `prune` is the share of light below which one is not needed.
+        gaussians: the scene.
+        notes: told how many were left out.
+    """
     if not gaussians.num:
         return gaussians, np.zeros(0)
     light = light_of(gaussians, views, "antialiased" if config.antialiased else "classic")

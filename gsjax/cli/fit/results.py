@@ -84,7 +84,13 @@ class Curve:
             self._rate = 0.95 * self._rate + 0.05 * seconds if self._rate else seconds
 
     def add(self, fitted: Fitted, test_psnr: float | None, folder: RunFolder) -> None:
-        """A row, which stands in metrics.jsonl at once."""
+        """A row, which stands in metrics.jsonl at once.
+
+        Args:
+            fitted: the step.
+            test_psnr: of held-out photographs, dB, where they were looked at.
+            folder: of the run.
+        """
         row = {
             "step": fitted.state.step,
             "seconds": self.seconds + self.compile_seconds,

@@ -65,7 +65,19 @@ def finished(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes."""
+    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes.
+
+    Args:
+        folder: of the run.
+        recording: what was looked through, and who judges.
+        start: the canonical scene.
+        parts: as they were found.
+        following: how that went.
+        config: how they were found.
+        seconds: by stage, so far.
+        notes: told of what is odd.
+        console: shows how far it is.
+    """
     frames = np.flatnonzero(parts.done)
     stopped = following.stopped
     complete = stopped is None

@@ -39,7 +39,13 @@ def finish(
 
 
 def print_grid(folder: RunFolder, found: dict[str, Any], grid: Grid) -> None:
-    """The run in a few lines, on stdout: those of the grid, whether it was stopped, where the report is."""
+    """The run in a few lines, on stdout: those of the grid, whether it was stopped, where the report is.
+
+    Args:
+        folder: of the run.
+        found: what metrics.json holds.
+        grid: a row each, its head in bold.
+    """
     if not found["complete"]:
         grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
     console = Console(highlight=False)

@@ -77,7 +77,14 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
 def write_results(
     folder: RunFolder, found: dict[str, Any], plots: list[tuple[Path, str]], first_mask: Path | None
 ) -> None:
-    """Writes report.html."""
+    """Writes report.html.
+
+    Args:
+        folder: of the run.
+        found: what metrics.json holds.
+        plots: files with their captions.
+        first_mask: its picture, or None.
+    """
     caption = f"Where objects come from: the first mask of camera {found['mask']['camera']}"
     write_report(
         folder.report,
