@@ -16,6 +16,7 @@ from functools import cache, lru_cache
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import sleep
 from typing import Any
 from zipfile import ZipFile
 
@@ -30,7 +31,10 @@ from gsjax.optim.compiler import keep_freed_memory
 
 PROCESSES, SLURM = "processes", "slurm"
 CONNECT_S = 10
-_POLL_S = 1
+_POLL_S, _COLLECTED_S = 1, 60
+_KEYS = "gsjax-"
+# A terminal sends Ctrl-C to them too, but who ends them is this process. What a cell starts gets it as ever.
+_UNDISTURBED = "import signal; signal.signal(signal.SIGINT, lambda *_: None)"
 
 
 def run_on_cluster(
@@ -60,10 +64,9 @@ def run_on_cluster(
     killed_worker = _package("distributed").KilledWorker
     if scheduler == PROCESSES:
         workers = workers or usable_cores()
-    sharing = workers if scheduler == PROCESSES else None
-    where = (f"{experiment.root}", experiment.name, experiment.fingerprint, experiment.made_with)
     with _client(scheduler, workers) as client, _said_if_gone(scheduler):
-        under_way = {client.submit(run_there, *where, cell, sharing, debug): cell for cell in cells}
+        sharing = workers if scheduler == PROCESSES else None
+        under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
         suspects, alone = [], False
         while under_way:
             for future in _finished(client, list(under_way), say):
@@ -75,6 +78,13 @@ def run_on_cluster(
                         suspects.append((future, cell))
                         continue
                     record = _killed(experiment, cell, error.allowed_failures + 2)
+                except ImportError as error:
+                    if debug:  # a script's own
+                        raise
+                    raise ValueError(
+                        f"a worker cannot load what runs a cell: {error}; start workers where gsjax "
+                        f"{experiment.made_with} is installed, as here"
+                    ) from error
                 future.release()  # before its worker can die, for then Dask would compute it again
                 yield cell, record
             if not under_way and suspects:
@@ -95,8 +105,26 @@ def _said_if_gone(scheduler: str) -> Iterator[None]:
         ) from error
 
 
+def _submit(client: Any, experiment: Experiment, cell: Cell, sharing: int | None, debug: bool) -> Any:
+    """Ask for a cell; returns its future. What is asked again while a worker is still at it joins it."""
+    about = (f"{experiment.root}", experiment.name, experiment.fingerprint, experiment.made_with)
+    arguments = (*about, cell.options, cell.seed, sharing, debug)
+    key = f"{_KEYS}{import_module('dask.base').tokenize(arguments)}"
+    # By its name, and with plain arguments: a worker without this module fails to load it and says so. It
+    # would break over a message that holds what it cannot load.
+    module = __name__
+    return client.submit(lambda: import_module(module).run_there(*arguments), key=key)
+
+
 def run_there(
-    root: str, name: str, script: str, made_with: str, cell: Cell, sharing: int | None, debug: bool
+    root: str,
+    name: str,
+    script: str,
+    made_with: str,
+    options: dict[str, Any],
+    seed: int,
+    sharing: int | None,
+    debug: bool,
 ) -> bytes:
     """Run a cell; what a worker does.
 
@@ -105,7 +133,8 @@ def run_there(
         name: of the experiment.
         script: the fingerprint that it must have here too.
         made_with: the gsjax that must be here too.
-        cell: which one.
+        options: those of the cell.
+        seed: that of the cell.
         sharing: how many workers share this machine's cores; None leaves it to them.
         debug: let through what the cell raises.
 
@@ -118,6 +147,7 @@ def run_there(
             f"worker {worker.address}: expected one thread, for cells share what a script has loaded, found "
             f"{worker.state.nthreads}; start it with --nthreads 1"
         )
+    _wait_until_collected(worker)
     # JAX keeps memory that it has freed. A worker that Dask pauses for that would never go on.
     worker.memory_manager.memory_pause_fraction = False
     if sharing is not None:
@@ -129,8 +159,17 @@ def run_there(
         raise ValueError(f"worker {worker.address}: {error}") from error
     with TemporaryDirectory(dir=worker.local_directory, prefix="gsjax-") as temporary:
         left = Path(temporary) / "left"
-        run_cell(experiment, cell, script_run, left, debug)
+        run_cell(experiment, Cell(options, seed), script_run, left, debug)
         return Path(shutil.make_archive(f"{temporary}/sent", "zip", left)).read_bytes()
+
+
+def _wait_until_collected(worker: Any) -> None:
+    """Until what this worker computed before is on the disk of who asked: the next cell may end it. Whoever
+    asked may have gone, so not for ever."""
+    for _ in range(int(_COLLECTED_S / 0.01)):
+        if not any(str(key).startswith(_KEYS) for key in list(worker.data)):
+            return
+        sleep(0.01)
 
 
 @lru_cache(maxsize=1)
@@ -216,10 +255,10 @@ def _killed(experiment: Experiment, cell: Cell, workers: int) -> dict[str, Any]:
 @contextmanager
 def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
     """A client of the scheduler, which is started where it is not an address, and ended with its workers."""
-    distributed = _package("distributed")
+    distributed, config = _package("distributed"), _package("dask.config")
     with ExitStack() as stack:
         # Cells take long: none is to wait for a worker while another one is idle.
-        stack.enter_context(_package("dask.config").set({"distributed.scheduler.worker-saturation": 1.0}))
+        stack.enter_context(config.set({"distributed.scheduler.worker-saturation": 1.0}))
         place = scheduler
         if scheduler == PROCESSES:
             place = stack.enter_context(
@@ -229,6 +268,7 @@ def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
                     memory_limit=0,
                     dashboard_address=None,
                     silence_logs=logging.CRITICAL,
+                    preload=[*config.get("distributed.worker.preload"), _UNDISTURBED],
                 )
             )
         elif scheduler == SLURM:
