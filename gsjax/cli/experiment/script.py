@@ -43,6 +43,16 @@ def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Call
     return run, figure
 
 
+def forget_scripts(root: Path) -> None:
+    """Have this process load modules below `root` anew when they are imported next."""
+    root = root.resolve()
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is not None and Path(file).resolve().is_relative_to(root):
+            del sys.modules[name]
+    sys.path[:] = [path for path in sys.path if not Path(path).resolve().is_relative_to(root)]
+
+
 def fingerprint_of(path: Path, text: str, version: int) -> str:
     """Changes with a script, with what stands beside it and with the config's version.
 
