@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gsjax.cli import COMMANDS
-from gsjax.cli.experiment_sweep import experiment_names
+from gsjax.cli.experiment.sweep import experiment_names
 from gsjax.cli.messages import parse_options
 
 ROOT = Path(__file__).resolve().parents[2]
