@@ -2,4 +2,5 @@
 
 from gsjax.cli import entry
 
-entry()
+if __name__ == "__main__":  # and not where a process that it started looks for its functions
+    entry()

@@ -2,6 +2,7 @@
 
 import os
 import platform
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -51,10 +52,15 @@ def keep_to_cores(count: int | None) -> None:
     if not 1 <= count <= len(allowed):
         most = "1 core" if len(allowed) == 1 else f"1 to {len(allowed)} cores"
         raise ValueError(f"--cores: expected {most}, which is what this process may use, found {count}")
+    keep_to(allowed[-count:])
+
+
+def keep_to(cores: Iterable[int]) -> None:
+    """Have this process run on these cores, by their numbers; threads that there are already too."""
     tasks = Path("/proc/self/task")
     for thread in [int(task.name) for task in tasks.iterdir()] if tasks.is_dir() else [0]:
         with suppress(ProcessLookupError):  # it has ended meanwhile
-            os.sched_setaffinity(thread, allowed[-count:])
+            os.sched_setaffinity(thread, cores)
 
 
 def resident_mb() -> float:

@@ -106,6 +106,12 @@ def draw_labels(
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
     beside what each pixel most likely is.
 
+    Args:
+        folder: for them.
+        stored: what a run learned.
+        pictured: frames, counted from 0.
+        console: shows how far it is.
+
     Returns:
         By frame, which share of the picture each name has.
     """

@@ -5,7 +5,7 @@ import json
 from dataclasses import dataclass
 from itertools import chain, compress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 from rich.text import Text
 
+from gsjax.cli.experiment.cluster import PROCESSES, check_scheduler, run_on_cluster
 from gsjax.cli.experiment.collect import collect, stdout
 from gsjax.cli.experiment.local import run_here
 from gsjax.cli.experiment.sweep import Cell, Experiment, experiment_names, in_words, read_experiment
@@ -49,6 +50,13 @@ class Run(Table):
     """Only cells whose options have these values; several values of one key are alternatives."""
     fresh: bool = False
     """Run cells again that are done."""
+    executor: Literal["local", "dask"] = "local"
+    """Who runs the cells: this process, one after the other, or the workers of a Dask cluster."""
+    scheduler: Annotated[str, tyro.conf.arg(metavar="processes|slurm|tcp://HOST:PORT")] = "processes"
+    """For dask: processes on this machine; jobs of SLURM, as Dask's configuration of jobqueue.slurm has them;
+    or the address of a scheduler, whose workers run in checkouts like this one."""
+    workers: int | None = None
+    """For dask: how many processes or jobs to start. As many processes as there are cores, unless given."""
 
 
 Options = List | Run | Table
@@ -95,6 +103,7 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
     console = Console(stderr=True, highlight=False)
     chosen = choose(experiment, options.seeds, options.only)
     script_run, figure = experiment.load()
+    check_executor(options)
     experiment.committed()  # if it cannot be read, that is said now and not after hours
     if options.fresh:  # forgotten at once, so that after Ctrl-C the rest goes on without --fresh
         for cell in chosen:
@@ -112,10 +121,16 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
             def say(what: str) -> None:
                 progress.update(task, description=what)
 
-            for cell, record in run_here(experiment, left, script_run, say, options.debug):
-                failed += [cell] if record["error"] else []
-                console.print(_line(cell, record), soft_wrap=not console.is_terminal)
-                progress.update(task, advance=1, description="cells")
+            if options.executor == "dask" and left:
+                how = (options.scheduler, options.workers)
+                finished = run_on_cluster(experiment, left, *how, say, options.debug)
+            else:
+                finished = run_here(experiment, left, script_run, say, options.debug)
+            with contextlib.closing(finished):  # at once, also after Ctrl-C
+                for cell, record in finished:
+                    failed += [cell] if record["error"] else []
+                    console.print(_line(cell, record), soft_wrap=not console.is_terminal)
+                    progress.update(task, advance=1, description="cells")
         code = collect(experiment, figure, options.debug)
     except KeyboardInterrupt:
         kept = sum(experiment.is_done(experiment.own(cell)) for cell in chosen)
@@ -130,7 +145,16 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
     return code
 
 
-def _line(cell: Cell, record: dict) -> Text:
+def check_executor(options: Run) -> None:
+    """Raises a ValueError where who runs the cells cannot be as it is given."""
+    if options.executor == "dask":
+        check_scheduler(options.scheduler, options.workers)
+    elif options.workers is not None or options.scheduler != PROCESSES:
+        given = "--workers" if options.workers is not None else "--scheduler"
+        raise ValueError(f"{given}: expected with --executor dask, found --executor local")
+
+
+def _line(cell: Cell, record: dict[str, Any]) -> Text:
     """What became of a cell."""
     if record["error"]:
         return Text.assemble(("failed", "bold red"), f"  {cell}  {record['error']}")

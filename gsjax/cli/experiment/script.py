@@ -43,9 +43,21 @@ def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Call
     return run, figure
 
 
+def forget_scripts(root: Path) -> None:
+    """Have this process load modules below `root` anew when they are imported next."""
+    root = root.resolve()
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is not None and Path(file).resolve().is_relative_to(root):
+            del sys.modules[name]
+    sys.path[:] = [path for path in sys.path if not Path(path).resolve().is_relative_to(root)]
+
+
 def fingerprint_of(path: Path, text: str, version: int) -> str:
-    """Changes with a script, with what stands beside it and with the config's version; not with its function
-    `figure`, which changes no row.
+    """Changes with a script, with what stands beside it and with the config's version.
+
+    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax, which
+    change where a module moved. Rows say themselves which gsjax made them.
 
     Args:
         path: of the script.
@@ -53,20 +65,38 @@ def fingerprint_of(path: Path, text: str, version: int) -> str:
         version: the config's.
     """
     beside = sorted(other for other in path.parent.glob("*.py") if other.name != path.name)
-    texts = [_without_figure(text), *(other.read_text(encoding="utf-8") for other in beside)]
-    return hashlib.sha256("\n".join([str(version), *texts]).encode()).hexdigest()[:16]
+    helpers = [_without(other.read_text(encoding="utf-8"), _imports_gsjax) for other in beside]
+    script = _without(text, lambda node: _imports_gsjax(node) or _is_figure(node))
+    return hashlib.sha256("\n".join([str(version), script, *helpers]).encode()).hexdigest()[:16]
 
 
-def _without_figure(script: str) -> str:
-    """A script's text but for its top-level function `figure`: a plot drawn otherwise changes no row."""
+def _is_figure(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef) and node.name == "figure" and node.col_offset == 0
+
+
+def _imports_gsjax(node: ast.AST) -> bool:
+    """Whether it is an import of nothing but gsjax and its modules."""
+    if isinstance(node, ast.ImportFrom):
+        modules = [node.module or ""] if node.level == 0 else [""]
+    else:
+        modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [""]
+    return all(module.split(".")[0] == "gsjax" for module in modules)
+
+
+def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
+    """A module's text but for the lines of the statements that are left out, if they stand there alone."""
     try:
-        figures = [f for f in ast.parse(script).body if isinstance(f, ast.FunctionDef) and f.name == "figure"]
+        nodes = [node for node in ast.walk(ast.parse(text)) if left_out(node)]
     except SyntaxError:
-        return script  # loading it says so
-    lines = script.removesuffix("\n").split("\n")  # as Python counts them: others also split at form feeds
-    for f in reversed(figures):
-        del lines[f.lineno - 1 : f.end_lineno]
-    return "\n".join(lines)
+        return text  # loading it says so
+    lines = text.removesuffix("\n").split("\n")  # as Python counts them: others also split at form feeds
+    gone = set()
+    for node in nodes:
+        before = lines[node.lineno - 1].encode()[: node.col_offset]  # columns are counted in bytes
+        behind = lines[node.end_lineno - 1].encode()[node.end_col_offset :].strip()
+        if not before.strip() and behind[:1] in (b"", b"#"):
+            gone.update(range(node.lineno - 1, node.end_lineno))
+    return "\n".join(line for n, line in enumerate(lines) if n not in gone)
 
 
 def made_with_of(root: Path) -> str:

@@ -7,12 +7,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 from rich.table import Table as Grid
 
 from gsjax.cli.fit.orbit import NAME as ORBIT
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import counted
+from gsjax.cli.run.ending import print_grid
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.pictures import PANELS
 from gsjax.cli.run.report import Media, Table, write_report
@@ -84,7 +84,13 @@ class Curve:
             self._rate = 0.95 * self._rate + 0.05 * seconds if self._rate else seconds
 
     def add(self, fitted: Fitted, test_psnr: float | None, folder: RunFolder) -> None:
-        """A row, which stands in metrics.jsonl at once."""
+        """A row, which stands in metrics.jsonl at once.
+
+        Args:
+            fitted: the step.
+            test_psnr: of held-out photographs, dB, where they were looked at.
+            folder: of the run.
+        """
         row = {
             "step": fitted.state.step,
             "seconds": self.seconds + self.compile_seconds,
@@ -244,10 +250,10 @@ def write_panel(path: Path, seen: Seen) -> None:
     write_png(path, side_by_side(*pair, captions=PANELS))
 
 
-def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> None:
+def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Writes the curve and report.html."""
     plot = folder.plot("curve")
-    save(fit_curve(curve.rows), plot)
+    save(fit_curve(found["curve"]), plot)
     test, cards = found["test"], {}
     if test and test["psnr"] is not None:
         cards["PSNR, held out"] = (f"{test['psnr']:.2f}", "dB")
@@ -296,7 +302,7 @@ def _tables_of_parts(parts: list[dict[str, Any]], looked: str) -> list[Table]:
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """The run in a few lines."""
-    console, grid = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0))
+    grid = Grid.grid(padding=(0, 3, 0, 0))
     photographs, seconds = found["photographs"], found["seconds"]
     test = found["test"]
     if test and test["psnr"] is not None:
@@ -309,8 +315,4 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     rate = found["steps"] / seconds["fit"] if seconds["fit"] else 0
     words = f"{found['steps']:,} steps in {_minutes(found):.1f} min ({rate:.1f} a second), "
     grid.add_row("[bold]fit[/]", f"{words}{seconds['compile']:.0f} s of it compiling")
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
+    print_grid(folder, found, grid)

@@ -48,6 +48,11 @@ def load(folder: Path, problem: Problem, start: FitState) -> tuple[FitState, Cur
     """The newest state that is whole, and the curve until then; the start where a run was stopped before it
     had saved any.
 
+    Args:
+        folder: RUN/resume.
+        problem: what is fitted to what.
+        start: the state before the first step.
+
     Raises:
         CheckpointError: there are only damaged ones.
     """

@@ -65,7 +65,19 @@ def finished(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes."""
+    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes.
+
+    Args:
+        folder: of the run.
+        recording: what was looked through, and who judges.
+        start: the canonical scene.
+        parts: as they were found.
+        following: how that went.
+        config: how they were found.
+        seconds: by stage, so far.
+        notes: told of what is odd.
+        console: shows how far it is.
+    """
     frames = np.flatnonzero(parts.done)
     stopped = following.stopped
     complete = stopped is None
@@ -156,7 +168,7 @@ def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: in
     write_npz(path, {name: np.asarray(array) for name, array in arrays.items()})
 
 
-def write_results(folder: RunFolder, found: dict[str, Any], following: Following) -> None:
+def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Writes report.html."""
     rows = _in_words(found["parts"])
     colors = [label_color(row["part"]) for row in rows]

@@ -126,6 +126,7 @@ def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, 
 
 
 def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
+    """The errors of one object for metrics.json; None each where it was not scored."""
     fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
     scored = {name: getattr(score, name, None) for name in fields}
     return scored | {"gaussians_scored": 0 if score is None else score.num_scored}

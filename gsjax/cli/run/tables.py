@@ -33,7 +33,14 @@ def grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
 
 
 def table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> list[Table]:
-    """The table with the columns in which something stands; none if there are no rows."""
+    """The table with the columns in which something stands; none if there are no rows.
+
+    Args:
+        title: of the table.
+        columns: all that there may be.
+        rows: values by the columns' keys.
+        note: below it.
+    """
     if not rows:
         return []
     shown = _shown(columns, rows)

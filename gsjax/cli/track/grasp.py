@@ -114,6 +114,12 @@ def _write(
 def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Console) -> Grasp:
     """The best grasp of each frame, stacked, on the host; none is feasible while the object is lost.
 
+    Args:
+        options: gripper, samples and where to approach from.
+        saved: the run.
+        answer: the object.
+        console: shows how far it is.
+
     Raises:
         ValueError: nothing says which side of the object's surface is outside.
     """
@@ -174,7 +180,15 @@ def draw_grasp(
     K: Float[np.ndarray, "3 3"],
     zoom: float = 1.0,
 ) -> np.ndarray:
-    """The picture with the closed gripper drawn in: fingers, palm and wrist; green where it is feasible."""
+    """The picture with the closed gripper drawn in: fingers, palm and wrist; green where it is feasible.
+
+    Args:
+        picture: [H,W,3], uint8.
+        grasp: one, in the world.
+        gripper: its measures.
+        viewmat, K: of the camera, the picture's size before it was enlarged.
+        zoom: by which it was enlarged.
+    """
     half, back = float(grasp.width) / 2, gripper.tip - gripper.finger_height
     wrist = back - gripper.palm_height
     corners = [(0, 0, wrist), (0, 0, back), (0, -half, gripper.tip), (0, -half, back), (0, half, back)]

@@ -177,7 +177,13 @@ class Log:
         self._memory_at = 0.0
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
-        """One update."""
+        """One update.
+
+        Args:
+            update: what the tracker says.
+            arrival: the frame, and when it came.
+            budget: seconds, beyond which an update is late.
+        """
         now = perf_counter()
         self.times.append(now)
         self.stamps.append(arrival.snapshot.stamp)
@@ -266,7 +272,14 @@ def _spread(seconds: list[float]) -> dict[str, float] | None:
 
 
 def follow(options: Options, source: Source, log: Log, console: Console) -> BaseException | None:
-    """Track until the stream ends; returns what ended it early, or None."""
+    """Track until the stream ends; returns what ended it early, or None.
+
+    Args:
+        options: budget, patience and how long.
+        source: where frames come from.
+        log: is told of every update.
+        console: shows how far it is.
+    """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
     newest = Newest(source.snapshots, patience=options.patience)
     arrived: list[Arrival] = []

@@ -17,7 +17,13 @@ from gsjax.viz.colors import overlay_labels
 
 
 def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
-    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped."""
+    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped.
+
+    Args:
+        folder: of the run.
+        tracking: the scene and its poses.
+        times: [T] of the frames, seconds.
+    """
     # Parts of one object are one label in the files.
     label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
     labels = label_of[np.asarray(tracking.scene.labels)].astype(np.int32)
@@ -62,7 +68,16 @@ def write_plots(
     names: dict[int, str],
     colors: np.ndarray,
 ) -> list[tuple[Path, str]]:
-    """Writes the plots; returns each one's path and what it shows."""
+    """Writes the plots; returns each one's path and what it shows.
+
+    Args:
+        folder: of the run.
+        tracking, recording: what was tracked, and what judges.
+        scores: of views.
+        motion: of objects, by mask value.
+        names: of objects, by mask value.
+        colors: [K+1], the label that gives each group its colour.
+    """
     written = []
 
     def keep(name: str, figure, caption: str) -> None:

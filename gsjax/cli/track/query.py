@@ -116,6 +116,11 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
 def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
     """Open the run and find the object; prints the scores of all.
 
+    Args:
+        options: the run and the text.
+        console: for the scores.
+        notes: told of what is odd.
+
     Raises:
         ValueError, OSError: as `ask_for_object`.
     """
@@ -146,7 +151,13 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
 
 
 def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
-    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged."""
+    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged.
+
+    Args:
+        view: of one camera.
+        mask: where the object is.
+        group: that of the object, for its colour.
+    """
     size = enlarged(mask.shape[1], mask.shape[0])
     image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
     # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
@@ -161,7 +172,13 @@ def enlarged(width: int, height: int) -> tuple[int, int]:
 
 
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
-    """The one view of each frame, with a progress bar."""
+    """The one view of each frame, with a progress bar.
+
+    Args:
+        frames: the views of each frame, one camera.
+        saved: the run.
+        console: for the bar.
+    """
     count = saved.tracking.num_frames
     for frame in track(frames, "rendering", total=count, console=console, transient=True):
         yield frame[0]

@@ -63,7 +63,16 @@ def metrics(
     values: np.ndarray | None,
 ) -> dict[str, Any]:
     """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
-    though some Gaussian may lie on it. docs/tracker.md says what each score means."""
+    though some Gaussian may lie on it. docs/tracker.md says what each score means.
+
+    Args:
+        tracking: the scene and its poses.
+        recording: what judges.
+        mask: the first one.
+        scores: of views.
+        motion: of objects, by mask value.
+        values: the mask value of each group, [K+1], or None.
+    """
     names = object_names(tracking, recording, mask, values)
     motion = {label: score for label, score in motion.items() if _members(tracking, values, label).any()}
     objects = {
@@ -146,18 +155,32 @@ def _frames_lost(tracking: Tracking, values: np.ndarray | None, label: int) -> i
 def lost_over_frames(
     tracking: Tracking, values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates"]:
-    """In which updates the tracker held the object, or a part of it, for lost."""
+    """In which updates the tracker held the object, or a part of it, for lost.
+
+    Args:
+        tracking: the scene and what the tracker said of it.
+        values: the mask value of each group, [K+1], or None.
+        label: the object's.
+    """
     return _of_object(tracking, tracking.lost, values, label).any(axis=1)
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
-    """After which updates the tracker did not know how the object, or a part of it, is turned."""
+    """After which updates the tracker did not know how the object, or a part of it, is turned.
+
+    Args:
+        tracking, values, label: as for `lost_over_frames`.
+    """
     return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
     """The frame from which on, to the end, the tracker did not know how the object is turned, lost or not;
-    None if it knew at the end."""
+    None if it knew at the end.
+
+    Args:
+        tracking, values, label: as for `lost_over_frames`.
+    """
     known = np.flatnonzero(~turn_unknown(tracking, values, label))
     first = known[-1] + 2 if len(known) else 1
     return int(first) if first < tracking.num_frames else None

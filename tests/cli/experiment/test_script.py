@@ -44,6 +44,40 @@ def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
     assert "4 stale" in gsjax("list")[1]
 
 
+GSJAX_IMPORTS = """
+from gsjax.cli.recording import open_recording
+from gsjax.scene import (  # several
+    Gaussians,
+    Tags,
+)
+import gsjax.losses, gsjax
+"""
+LATE = "\ndef late():\n    from gsjax.cli.{} import follow  # noqa\n    return follow\n"
+
+
+@pytest.mark.parametrize("where", ["sweep.py", "helper.py"])
+def test_where_a_module_of_gsjax_stands_changes_no_fingerprint(toy, where):
+    folder, text = toy(), SCRIPT + LATE.format("track.loop")
+
+    def fingerprint(text: str) -> str:
+        (folder / where).write_text(text)
+        return read_experiment(Path("experiments"), "toy", Path("runs")).fingerprint
+
+    plain = fingerprint(text)
+    assert fingerprint(GSJAX_IMPORTS.lstrip() + text) == plain
+    assert fingerprint(SCRIPT + LATE.format("track_loop")) == plain
+    for other in (
+        "import gsjax, os",  # not gsjax alone
+        "import gsjaxlike",
+        "from .gsjax import x",
+        "import gsjax; SIZE = 3",
+        "SIZE = 3; import gsjax",
+        '"""\nimport gsjax\n"""',
+        "# import gsjax",
+    ):
+        assert fingerprint(f"{other}\n{text}") != plain
+
+
 def test_two_experiments_share_a_script(toy, gsjax):
     """Its helpers stand beside the script, not beside the config."""
     folder = toy("from factor import FACTOR\n" + SCRIPT, script="../shared/sweep.py")

@@ -53,7 +53,7 @@ def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
+def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Print objects, cameras, the rate and where the report is, to stdout."""
     console = Console(highlight=False)
     console.print()
@@ -74,10 +74,17 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
 
 
-def write_run_report(
+def write_results(
     folder: RunFolder, found: dict[str, Any], plots: list[tuple[Path, str]], first_mask: Path | None
 ) -> None:
-    """Writes report.html."""
+    """Writes report.html.
+
+    Args:
+        folder: of the run.
+        found: what metrics.json holds.
+        plots: files with their captions.
+        first_mask: its picture, or None.
+    """
     caption = f"Where objects come from: the first mask of camera {found['mask']['camera']}"
     write_report(
         folder.report,
