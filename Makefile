@@ -8,7 +8,7 @@ RUN := runs/demo
 DEMO := "simulated:tabletop?width=240&height=180"
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all bench docs lint clean
+.PHONY: help demo test test-all bench gallery docs lint clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -30,6 +30,9 @@ test-all: $(VENV)/installed-test ## every test, the slow ones too
 
 bench: $(VENV)/installed-test ## the whole benchmark suite, on a machine that does nothing else
 	$(BIN)/gsjax bench
+
+gallery: $(VENV)/installed ## small runs and the experiments' figures into docs/gallery.md
+	$(BIN)/python docs/make_gallery.py
 
 docs: $(VENV)/installed-dev ## build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -2,8 +2,8 @@
 
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
-Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet: MINUTES on two
-cores. Figures of experiments are shown from where they are committed, and nothing is measured here.
+Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet: some 20 minutes
+on two busy cores. Figures of experiments are shown from where they are committed, and nothing is measured here.
 """
 
 import json
@@ -121,8 +121,8 @@ def page(shown: dict[str, str]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Made by `make gallery`: small runs on built-in scenes (simulated; MINUTES on two cores the first "
-        "time, then seconds), and the figures of [experiments](experiments.md) as they are committed. Small "
+        "Made by `make gallery`: small runs on built-in scenes (simulated; some 20 minutes on two busy cores "
+        "the first time, then seconds), and the figures of [experiments](experiments.md) as they are committed. Small "
         "runs look worse than long ones, and are no results.",
         "",
         "## Speed against accuracy",

@@ -1,0 +1,42 @@
+"""The gallery: what it runs is understood, and its page is the one that the script would write."""
+
+import importlib.util
+import shlex
+
+import numpy as np
+import pytest
+
+from tests.docs.blocks import ROOT, check_command
+
+
+@pytest.fixture(scope="module")
+def gallery():
+    spec = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs/make_gallery.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_what_it_runs_has_options_that_exist(gallery):
+    for command in gallery.COMMANDS.values():
+        check_command(["gsjax", *shlex.split(command)])
+
+
+def test_the_page_is_as_the_script_has_it_and_its_pictures_are_small(gallery):
+    shown = {name: f"gallery/{name}.jpg" for name in gallery.SAYS}
+    assert gallery.PAGE.read_text(encoding="utf-8") == gallery.page(shown)
+    sizes = {path.name: path.stat().st_size for path in gallery.PICTURES.iterdir()}
+    assert sizes.keys() == {"trades.png", *(f"{name}.jpg" for name in gallery.SAYS)}
+    assert max(sizes.values()) < 150_000
+
+
+def test_trades_are_those_of_the_committed_results(gallery, tmp_path):
+    for trade, found in zip(gallery.TRADES, gallery.points(), strict=True):
+        costs, gains, first = (np.array(column) for column in zip(*found, strict=True))
+        assert np.isfinite(costs).all(), trade
+        assert np.isfinite(gains).all(), trade
+        assert (costs > 0).all(), trade
+        assert first.any(), trade
+        assert not first.all(), trade
+    gallery.draw_trades(tmp_path / "trades.png")
+    assert (tmp_path / "trades.png").stat().st_size > 20_000
