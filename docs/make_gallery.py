@@ -3,10 +3,11 @@
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
 Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet: some 20 minutes
-on two busy cores. Figures of experiments are shown from where they are committed, and nothing is measured here.
+on two busy cores. Figures of experiments are shown from where they are committed; nothing is measured here.
 """
 
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -95,7 +96,7 @@ def _write(name: str, picture: np.ndarray) -> str:
 # -- the page ------------------------------------------------------------------------------------------------
 
 SECTIONS = {
-    "The tracker": ("tracker", ("tracker_trade", "tracker_ablation", "optimizers", "basin", "hard_cases")),
+    "The tracker": ("tracker", ("tracker_trade", "tracker_ablation", "optimizers", "basin")),
     "Parts": ("parts", ("parts_ablation", "parts_trade", "parts_failures", "parts_tracked", "bar_blends")),
     "Edits": ("edit", ("parts_edits",)),
     "Semantic fields": ("field", ("field_ablation", "field_trade")),
@@ -122,8 +123,8 @@ def page(shown: dict[str, str]) -> str:
         "# Gallery",
         "",
         "Made by `make gallery`: small runs on built-in scenes (simulated; some 20 minutes on two busy cores "
-        "the first time, then seconds), and the figures of [experiments](experiments.md) as they are committed. Small "
-        "runs look worse than long ones, and are no results.",
+        "the first time, then seconds), and the figures of [experiments](experiments.md) as they are "
+        "committed. Small runs look worse than long ones, and are no results.",
         "",
         "## Speed against accuracy",
         "",
@@ -136,7 +137,7 @@ def page(shown: dict[str, str]) -> str:
         lines += [f"## {title}", ""]
         if picture is not None:
             folder, says = SAYS[picture]
-            command = COMMANDS[folder].replace(f"{RUNS}/", "runs/gallery/")
+            command = shlex.join(COMMANDS[folder].replace(f"{RUNS}/", "runs/gallery/").split())
             lines += [f"![{says}]({shown[picture]})", "", f"*{says}* `gsjax {command}`", ""]
         for name in experiments:
             lines += [f"![{name}](../experiments/{name}/figure.png)", "", _caption(name), ""]
