@@ -38,7 +38,7 @@ def test_what_has_no_floor_or_two_is_named(requirement):
 
 
 def test_an_unknown_extra_is_named():
-    with pytest.raises(ValueError, match="expected one of the extras .*found 'nothing'"):
+    with pytest.raises(ValueError, match=r"expected one of the extras .*found 'nothing'"):
         floors.floors(PROJECT, ["nothing"])
 
 
