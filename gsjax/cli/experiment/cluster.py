@@ -64,6 +64,7 @@ def run_on_cluster(
     killed_worker = _package("distributed").KilledWorker
     if scheduler == PROCESSES:
         workers = workers or usable_cores()
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
     with _client(scheduler, workers) as client, _said_if_gone(scheduler):
         sharing = workers if scheduler == PROCESSES else None
         under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
