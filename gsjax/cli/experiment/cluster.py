@@ -300,7 +300,8 @@ def slurm_cluster() -> Any:
             f"{config.PATH}, found no {'cores' if cores is None else 'memory'}"
         )
     # What Dask calls cores are threads of its own, and would be as many cells at once.
-    return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores)
+    free_port = {"dashboard_address": ":0", **config.get("jobqueue.slurm.scheduler-options")}
+    return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores, scheduler_options=free_port)
 
 
 def check_scheduler(scheduler: str, workers: int | None) -> None:

@@ -17,8 +17,8 @@ import pytest
 from gsjax.cli.experiment.cluster import slurm_cluster
 from tests.cli.experiment.toys import SCRIPT, calls, cell_files, results
 
-distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-import dask
+pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+config = pytest.importorskip("dask").config
 
 LOGGED = """
 import os, time
@@ -62,9 +62,8 @@ def address(tmp_path_factory):
             time.sleep(0.05)
         yield json.loads(there.read_text())["address"], folder
     finally:
-        for program in started:
+        for program in reversed(started):  # workers first
             program.terminate()
-        for program in started:
             program.wait(20)
 
 
@@ -72,8 +71,9 @@ def address(tmp_path_factory):
 def beside(address, toy, monkeypatch):
     """Writes the toy where the workers are; returns how to run it there."""
     where, folder = address
-    for left in ("experiments", "runs", "log.txt", "calls.txt"):
+    for left in ("experiments", "runs"):
         shutil.rmtree(folder / left, ignore_errors=True)
+    for left in ("log.txt", "calls.txt"):
         (folder / left).unlink(missing_ok=True)
     monkeypatch.chdir(folder)
     (folder / "experiments" / "toy").mkdir(parents=True)
@@ -164,7 +164,7 @@ def test_a_cell_that_kills_every_worker_fails_and_the_others_are_done(toy, gsjax
     dies = "options['n'] == 0 and os.path.exists('stop') and os.kill(os.getpid(), 9)"
     folder = toy(LOGGED.format(dies), grid={"n": [0, 1, 2]})
     Path("stop").touch()
-    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+    with config.set({"distributed.scheduler.allowed-failures": 0}):
         code, _, err = gsjax("run", "toy", "--executor", "dask", "--workers", "1")
     assert code == 1
     assert "n=0 seed=0  KilledWorker: 2 workers died with this cell" in err
@@ -181,13 +181,8 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     toy(LOGGED.format("time.sleep(60 if options['n'] else 0)"), grid={"n": [0, 1, 2]})
     command = [sys.executable, "-m", "gsjax.cli", "experiment", "run", "toy", "--executor", "dask"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
-    going = subprocess.Popen(
-        [*command, "--workers", "1"],
-        env=environment,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    said = {"stderr": subprocess.PIPE, "text": True}
+    going = subprocess.Popen([*command, "--workers", "1"], env=environment, start_new_session=True, **said)
     while len(logged("begun")) < 2 and going.poll() is None:
         time.sleep(0.02)
     time.sleep(0.3)
@@ -202,16 +197,16 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
 def test_a_job_of_slurm_is_one_worker_with_all_its_cores():
     pytest.importorskip("dask_jobqueue")
     asked = {"cores": 12, "memory": "48GB", "queue": "long", "walltime": "08:00:00", "interface": "lo"}
-    with dask.config.set({"jobqueue.slurm": {**dask.config.get("jobqueue.slurm", {}), **asked}}):
-        with slurm_cluster() as cluster:
-            script = cluster.job_script()
+    settings = {"jobqueue.slurm": {**config.get("jobqueue.slurm", {}), **asked}}
+    with config.set(settings), slurm_cluster() as cluster:
+        script = cluster.job_script()
     for line in ("-p long", "--cpus-per-task=12", "--mem=45G", "-t 08:00:00", "-n 1"):
         assert f"#SBATCH {line}\n" in script
     assert "--nthreads 1 " in script
     assert "--nworkers" not in script
-    with dask.config.set({"jobqueue.slurm.memory": None, "jobqueue.slurm.cores": 12}):
-        with pytest.raises(ValueError, match="expected jobqueue.slurm.cores and .memory in Dask's settings"):
-            slurm_cluster()
+    settings = {"jobqueue.slurm.memory": None, "jobqueue.slurm.cores": 12}
+    with config.set(settings), pytest.raises(ValueError, match=r"Dask's settings, .*found no memory"):
+        slurm_cluster()
 
 
 @pytest.mark.parametrize(
