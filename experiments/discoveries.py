@@ -17,7 +17,7 @@ from gsjax.cli.parts.command import FIT as FIT  # for settings that differ from 
 from gsjax.cli.parts.command import Options
 from gsjax.cli.parts.command import run as run_parts
 from gsjax.cli.parts.saved import open_parts_run
-from gsjax.cli.track.views import part_views
+from gsjax.cli.parts.views import part_views
 from gsjax.data import Sequence
 from gsjax.methods.motion_parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores

@@ -10,9 +10,10 @@ import numpy as np
 from rich.console import Console
 
 from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
+from gsjax.cli.run.scores import Scores
 from gsjax.cli.track.loop import Tracking, begin, follow
-from gsjax.cli.track.scoring import Scores, group_values, metrics, score_motion
-from gsjax.cli.track.summary import MOVED_MM
+from gsjax.cli.track.results import MOVED_MM
+from gsjax.cli.track.scoring import group_values, metrics, score_motion
 from gsjax.cli.track.views import views
 from gsjax.methods.object_tracker import StartConfig, TrackedScene, TrackerConfig, start_scene
 from gsjax.scene.frame import Frame

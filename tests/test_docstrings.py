@@ -1,4 +1,4 @@
-"""Public docstrings are full: read from the source, in every layer but the command line.
+"""Public docstrings are full: read from the source, in every layer.
 
 A docstring is full if it opens with a sentence, tells of each parameter (of one or two, the sentence may do),
 says what is raised, and gives the shapes of arrays that their annotations leave open.
@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "gsjax"
 LAYERS = (
     *("geometry", "rasterize", "scene", "losses", "optim", "methods"),
-    *("perception", "metrics", "data", "io", "viz"),
+    *("perception", "metrics", "data", "io", "viz", "cli"),
 )
 FEW = 2  # so many parameters may be left to their names and annotations
 ERRORS = ("ValueError", "TypeError", "OSError", "DataError")

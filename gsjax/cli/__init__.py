@@ -9,33 +9,37 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from rich.console import Console
-from rich.table import Table
 
-COMMANDS = {
-    "track": ("gsjax.cli.track.command", "follow the objects of a recording, and report on it"),
-    "live": ("gsjax.cli.track.live", "follow objects while frames arrive, at a rate you name"),
-    "fit": ("gsjax.cli.fit.command", "fit a static scene to posed photographs, and report on it"),
-    "parts": (
-        "gsjax.cli.parts.command",
-        "find the parts of a moving scene from several cameras, and their joints",
-    ),
-    "deform": (
-        "gsjax.cli.deform.command",
-        "reconstruct what deforms, from an endoscope say, with its meaning",
-    ),
-    "edit": ("gsjax.cli.parts.edit", "change when, where and how parts of a run move, and film it"),
-    "distill": ("gsjax.cli.distill.command", "give the Gaussians of a scene a meaning, to be asked by query"),
-    "eval": ("gsjax.cli.fit.evaluate", "score a scene that was fitted, again or in more ways"),
-    "compare": ("gsjax.cli.compare.command", "set runs side by side: scores, curves, pictures, settings"),
-    "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for gsjax fit"),
-    "info": ("gsjax.cli.info.command", "say what is understood of a recording"),
-    "view": ("gsjax.cli.view.command", "look at a run or a PLY file in a browser"),
-    "query": ("gsjax.cli.query.command", "find what a text means: objects of a run, or Gaussians by a field"),
-    "ask": ("gsjax.cli.deform.ask", "answer a question on a scene that deforms, in plain English"),
-    "grasp": ("gsjax.cli.track.grasp", "find the best grasp of the object that a text means, in every frame"),
-    "experiment": ("gsjax.cli.experiment.command", "sweep what a claim rests on, and collect it into tables"),
-    "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step on this machine"),
+GROUPS = {
+    "Look at data": {
+        "info": ("gsjax.cli.info.command", "say what is understood of a recording or of photographs"),
+        "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for fit"),
+    },
+    "Reconstruct": {
+        "track": ("gsjax.cli.track.command", "follow the objects of a recording from RGB-D cameras"),
+        "live": ("gsjax.cli.track.live", "follow objects while frames arrive, at a rate you name"),
+        "fit": ("gsjax.cli.fit.command", "fit a static scene to posed photographs"),
+        "parts": ("gsjax.cli.parts.command", "find the parts of a moving scene, and their joints"),
+        "deform": ("gsjax.cli.deform.command", "reconstruct what deforms, from an endoscope say"),
+    },
+    "Give a meaning, and ask": {
+        "distill": ("gsjax.cli.distill.command", "give the Gaussians of a run or a PLY file a meaning"),
+        "query": ("gsjax.cli.query.command", "find what a text means: objects of a run, or Gaussians"),
+        "ask": ("gsjax.cli.deform.ask", "answer a question on a scene that deforms"),
+        "grasp": ("gsjax.cli.track.grasp", "find the best grasp of what a text means, in every frame"),
+    },
+    "See and change": {
+        "view": ("gsjax.cli.view.command", "look at a run or a PLY file in a browser"),
+        "edit": ("gsjax.cli.parts.edit", "change when, where and how parts move, and film it"),
+    },
+    "Judge and measure": {
+        "eval": ("gsjax.cli.fit.evaluate", "score a scene that was fitted, again or in more ways"),
+        "compare": ("gsjax.cli.compare.command", "set runs side by side: scores, curves, pictures"),
+        "experiment": ("gsjax.cli.experiment.command", "sweep what a claim rests on, and collect tables"),
+        "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step here"),
+    },
 }
+COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 """Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
 which returns the exit code, perhaps `HELP`, more to say of it, and perhaps `options_for(arguments)`: the
 options where defaults depend on what is given, and the arguments that are left to parse."""
@@ -82,14 +86,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+_SHARED = {
+    "--out RUN": "the folder of the run, with report.html and metrics.json",
+    "--frames 0:60:2": "which frames or photographs, as Python slices them",
+    "--cameras 0 1": "which cameras are looked through",
+    "--eval-cameras 2": "which are held out, and only judge",
+    "--scale 0.5": "pictures at half their width and height",
+    "--preset NAME": "whose settings; any of them is an option too: --fit.steps",
+    "--seed 1": "of all that is random",
+    "--minutes 5": "stop then, with what there is",
+    "--resume": "go on with a run that was stopped",
+    "--overwrite": "replace a run that is finished",
+}
+"""Options that mean the same wherever they stand."""
+
+
 def _print_help() -> None:
-    console = Console(highlight=False)
-    console.print("[bold]gsjax[/]: moving scenes from 3D Gaussians, in pure JAX\n")
-    table = Table.grid(padding=(0, 3, 0, 2))
-    for name, (_, does) in COMMANDS.items():
-        table.add_row(f"[bold cyan]gsjax {name}[/]", does)
-    console.print(table)
-    console.print(
-        "\nEach has its own options: [bold]gsjax track --help[/]. A first run, which needs no data:\n"
-    )
+    """One page of 80 columns."""
+    console = Console(highlight=False, soft_wrap=True)
+    console.print("[bold]gsjax[/]: moving scenes from 3D Gaussians, in pure JAX")
+    sections = {
+        title: {f"gsjax {name}": does for name, (_, does) in group.items()} for title, group in GROUPS.items()
+    }
+    for title, rows in (*sections.items(), ("Options, the same wherever they stand", _SHARED)):
+        console.print(f"\n[bold]{title}[/]")
+        for name, does in rows.items():
+            console.print(f"  [cyan]{name:<18}[/] {does}")
+    console.print("\nAll options of one: [bold]gsjax track --help[/]. A first run, which needs no data:\n")
     console.print("  gsjax track simulated:tabletop --out runs/demo --frames 0:30")
+    console.print("  gsjax view runs/demo")

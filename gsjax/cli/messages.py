@@ -35,31 +35,16 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         arguments: what stands behind the name.
         entry: its module, and what it does.
     """
-    import tyro
-
-    module, does = entry
-    debug = False
     try:
-        chosen = import_module(module)
-        options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
-        kind, arguments = options_for(arguments)
-        options = tyro.cli(
-            kind,
-            prog=f"gsjax {command}",
-            description=f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", ""),
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
-        debug = options.debug
-        _expect_values(options, arguments)
+        options = parse_options(command, arguments, entry)
         keep_to_cores(getattr(options, "cores", None))  # before JAX looks how many there are
         compiler = import_module("gsjax.optim.compiler")
         compiler.keep_freed_memory()
         if command not in _COMPILE_ANEW:
             compiler.keep_programs()
-        return chosen.run(options)
+        return import_module(entry[0]).run(options)
     except Exception as error:
-        if debug:
+        if "--debug" in arguments:
             raise
         if isinstance(error, USER_ERRORS):
             say_error(describe(error))
@@ -67,6 +52,35 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
         say_error(f"{told}. Please report it with what --debug shows")
         return 1
+
+
+def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) -> Any:
+    """The options of a command, without running it.
+
+    Args:
+        command: its name.
+        arguments: what stands behind the name.
+        entry: its module, and what it does.
+
+    Raises:
+        ValueError: a list was begun and left empty.
+        SystemExit: the arguments were not understood, or ask for help; what there is to say is printed.
+    """
+    import tyro
+
+    module, does = entry
+    chosen = import_module(module)
+    options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
+    kind, arguments = options_for(arguments)
+    options = tyro.cli(
+        kind,
+        prog=f"gsjax {command}",
+        description=f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", ""),
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    _expect_values(options, arguments)
+    return options
 
 
 def _expect_values(options: Any, arguments: list[str]) -> None:

@@ -111,6 +111,16 @@ class DatasetAndOut:
     """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class OfRecording(Common, Resuming, HeldOut, Selection, DatasetAndOut):
+    """What those have that make a run of a recording."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfDataset(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
+    """What those have that make a run of a dataset by learning, step by step."""
+
+
 def checked(options: Told) -> Told:
     """The options, with `--seed` in each configuration that has one.
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
+from gsjax.cli.options import OfRecording
 from gsjax.data import ReadOptions, Sequence, open_sequence
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.open import SIMULATED_PREFIX
@@ -51,6 +52,12 @@ def located(dataset: str) -> str:
     return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)
 
 
+def chosen_recording(options: OfRecording) -> Recording:
+    """The recording that a command is told of. Raises: as `open_recording`."""
+    cameras = (options.cameras, options.eval_cameras)
+    return open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
+
+
 def open_recording(
     dataset: str,
     cameras: Indices[int],
@@ -62,6 +69,15 @@ def open_recording(
 ) -> Recording:
     """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
     made smaller by `scale`. `opened` opens it, whole; `open_sequence` unless given.
+
+    Args:
+        dataset: a folder, or a built-in scene.
+        cameras: ids of those to look through.
+        eval_cameras: ids of those held out.
+        frames: START:STOP[:STEP].
+        read: what the layout leaves open.
+        scale: of pictures.
+        opened: as above.
 
     Raises:
         ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
@@ -110,7 +126,13 @@ def _scaled(sequence: Sequence, scale: float) -> Sequence:
 
 
 def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:
-    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height."""
+    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height.
+
+    Args:
+        scale: what was given.
+        what: is made smaller, in words.
+        before, after: its (width, height).
+    """
     if scale < 1 and min(after) < _LEAST_SIDE:
         raise ValueError(
             f"--scale {scale:g}: {what} of {before[0]}x{before[1]} would be {after[0]}x{after[1]}; expected "
@@ -247,7 +269,14 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
-    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian."""
+    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian.
+
+    Args:
+        recording: with its truth, where it has one.
+        mask: the first mask.
+        scene_ids: labels that the scene has.
+        notes: told of each.
+    """
     if mask.labels is None:
         return
     names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())

@@ -36,7 +36,7 @@ def test_version(say):
 def test_unknown_command(say):
     code, _, err = say("trakc")
     assert code == 2
-    assert "no command 'trakc'; there are: track, live, fit, parts, " in err
+    assert "no command 'trakc'; there are: info, poses, track, live, " in err
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))

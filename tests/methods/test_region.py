@@ -4,14 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.methods.object_tracker import first_pose, place
-from gsjax.methods.object_tracker.region import (
-    Needed,
-    TrackerPlan,
-    near_background,
-    near_scene,
-    shift_background,
-    spread,
-)
+from gsjax.methods.object_tracker.plan import Needed, TrackerPlan
+from gsjax.methods.object_tracker.region import near_background, near_scene, shift_background, spread
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render, render

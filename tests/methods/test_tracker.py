@@ -16,12 +16,13 @@ from gsjax.methods.object_tracker import (
     TrackedScene,
     TrackerConfig,
     first_pose,
+    plan_tracker,
     start_scene,
     track,
     tracking,
 )
 from gsjax.methods.object_tracker.grow import with_slots
-from gsjax.methods.object_tracker.tracker import TrackerBatch, object_tracker, plan_tracker
+from gsjax.methods.object_tracker.tracker import TrackerBatch, object_tracker
 from gsjax.optim.step import Step
 from gsjax.scene.gaussians import take
 

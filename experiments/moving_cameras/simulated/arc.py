@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.cli.track.summary import MOVED_MM
+from gsjax.cli.track.results import MOVED_MM
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
 from gsjax.methods.object_tracker import (

@@ -11,7 +11,7 @@ import numpy as np
 from gsjax.cli.machine import name as machine_name
 from gsjax.cli.run.records import Kind, Record
 from gsjax.cli.run.report import format_number
-from gsjax.cli.track.summary import MOVED_MM
+from gsjax.cli.track.results import MOVED_MM
 
 _NOT_COMPARED = (
     "out",

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from gsjax.cli.fit.results import PANELS
+from gsjax.cli.run.pictures import PANELS
 from gsjax.cli.run.records import Record
-from gsjax.cli.track.outputs import write_png
+from gsjax.io.pictures import write_png
 from gsjax.viz.colors import captioned
 
 _COLUMNS = 4  # of a strip

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
@@ -18,21 +17,12 @@ from gsjax.cli.deform.file import NAME, StoredDeformation, write_deformation
 from gsjax.cli.deform.poses import as_refined
 from gsjax.cli.deform.results import print_results, write_results
 from gsjax.cli.deform.scores import judge
-from gsjax.cli.distill.teacher import Asked, Masks
+from gsjax.cli.distill.choice import TeacherChoice, TeacherOptions
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import (
-    OF_NO_BEARING,
-    Common,
-    DatasetAndOut,
-    HeldOutFrames,
-    Resuming,
-    Seeded,
-    Selection,
-    Timed,
-    preset_options,
-)
+from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, preset_options
 from gsjax.cli.recording import located, open_recording
+from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.data import Photographs
@@ -50,7 +40,8 @@ from gsjax.methods.surgical import (
 
 HELP = (
     " As in `gsjax deform DATASET --out RUN`. Masks say where tools are, which are left out unless --tools "
-    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane."
+    "draw. Depth is the data's, else matched between two eyes; without either the scene begins on a plane. "
+    "One camera is learned from (--cameras; the first unless given), one judges (--eval-cameras; the next)."
 )
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
@@ -59,7 +50,7 @@ _UNLIKE = 0.6  # an IoU
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
+class Options(TeacherOptions, OfDataset):
     """What `gsjax deform` is told."""
 
     preset: Literal["surst", "clin"] = "surst"
@@ -72,20 +63,6 @@ class Options(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, Dataset
     depth: Depth = "auto"
     """Where depth is from: data (files), stereo (camera to learn from and the next one are matched) or plane
     (none: the scene begins on one, and its depth is of no unit). auto: the first of these that there is."""
-    features: str = "auto"
-    """What is to be learned beside colours: classes (a code for each class of the masks), closed (colour and
-    outline of each mask; no foundation model), clip or maskclip (with --weights), a folder of feature files
-    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the frames' pictures, or by frame number), or
-    none. auto: classes if masks have more than one among the pixels that count."""
-    masks: Masks = "auto"
-    """Whose masks closed and clip are asked about: the recording's own, or a segmenter's that needs no
-    weights. auto: files if there are."""
-    sam: Path | None = None
-    """Folder of SAM's weights: let it segment for these."""
-    weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
-    level: Literal["default", "small", "medium", "large"] = "default"
-    """Of LangSplat's files, which size of objects."""
     deform: SurgicalConfig = field(default_factory=lambda: PRESETS["surst"])
     """How it is learned."""
 
@@ -101,7 +78,8 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
-    asked = _checked(options)
+    options = checked(options)
+    asked = _teacher(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
@@ -164,12 +142,9 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        folder.write_metrics(found)
-        write_results(folder, found)
-        if found["complete"]:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _recording(options: Options, notes: Notes) -> Deep:
@@ -179,10 +154,18 @@ def _recording(options: Options, notes: Notes) -> Deep:
     if is_of_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
-    first = options.cameras[0] if options.cameras else whole.camera_ids[0]
-    if first not in whole.camera_ids:
-        raise ValueError(f"--cameras: {whole.name} has no camera {first}; it has {list(whole.camera_ids)}")
-    sequence = whole.select(cameras=[first, *(c for c in whole.camera_ids if c != first)])
+    for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):
+        if camera and camera[0] not in whole.camera_ids:
+            known = list(whole.camera_ids)
+            raise ValueError(f"{flag}: {whole.name} has no camera {camera[0]}; it has {known}")
+    judge = options.eval_cameras
+    first = options.cameras or tuple(c for c in whole.camera_ids if c not in judge)[:1]
+    if not first or first == judge:
+        raise ValueError(
+            f"--eval-cameras: expected another camera than that to learn from, found {list(judge)} for both"
+        )
+    others = [camera for camera in whole.camera_ids if camera not in (*first, *judge)]
+    sequence = whole.select(cameras=[*first, *judge, *others])
     return with_depth(sequence, options.depth, options.deform.plane_depth, notes)
 
 
@@ -198,7 +181,14 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
 
 
 def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metric: bool = True) -> None:
-    """Writes deformation.npz, and scene.ply, the scene as it was at the first frame."""
+    """Writes deformation.npz, and scene.ply, the scene as it was at the first frame.
+
+    Args:
+        folder: of the run.
+        state: what was learned.
+        data: what it was learned from.
+        metric: whether depth, and so the scene, is in metres.
+    """
     seen = data.sequence
     stored = StoredDeformation(
         state.scene,
@@ -218,11 +208,13 @@ def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metri
     write_ply(folder.scene, jax.device_get(stored.at(0.0)))
 
 
-def _checked(options: Options) -> Asked | None:
+def _teacher(options: Options) -> TeacherChoice | None:
     """Whose features are asked for, once all options fit; None: nobody's."""
     if len(options.cameras) > 1:
         raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
-    asked = Asked(options.features, options.masks, options.sam, options.weights, options.level)
+    if len(options.eval_cameras) > 1:
+        raise ValueError(f"--eval-cameras: expected one to judge by, found {list(options.eval_cameras)}")
+    asked = TeacherChoice(options.features, options.masks, options.sam, options.weights, options.level)
     option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
     if option is not None and asked.features not in ("closed", "clip"):
         raise ValueError(
@@ -231,7 +223,7 @@ def _checked(options: Options) -> Asked | None:
     if options.features != NOBODY:
         asked.check(also=(NOBODY,))
         return asked
-    if asked != Asked(NOBODY):
+    if asked != TeacherChoice(NOBODY):
         raise ValueError("--weights, --level: expected --features that have a use for them, found none")
     return None
 

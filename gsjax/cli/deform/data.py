@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.deform.teacher import ClassTeacher, EncodedTeacher, Meaning, Said, said_of, teaching_of
-from gsjax.cli.distill.teacher import Asked
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
@@ -103,7 +103,7 @@ def deform_data(
     sequence: Sequence,
     every: int,
     tools: Tools,
-    asked: Asked | None,
+    asked: TeacherChoice | None,
     channels: int,
     tool_values: tuple[int, ...],
     notes: Notes,

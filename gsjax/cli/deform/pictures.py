@@ -14,8 +14,9 @@ from rich.progress import track
 from gsjax.cli.deform.file import StoredDeformation
 from gsjax.cli.deform.prompts import Wanted
 from gsjax.cli.query.selected import Changes
-from gsjax.cli.track.outputs import frame_rate, write_png
+from gsjax.cli.run.pictures import frame_rate
 from gsjax.geometry.cameras import Camera
+from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.surgical.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
@@ -104,6 +105,12 @@ def draw_labels(
 ) -> dict[str, dict[str, float]]:
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
     beside what each pixel most likely is.
+
+    Args:
+        folder: for them.
+        stored: what a run learned.
+        pictured: frames, counted from 0.
+        console: shows how far it is.
 
     Returns:
         By frame, which share of the picture each name has.

@@ -96,11 +96,7 @@ def answer_deformation(
     Args:
         path: of the run.
         stored: what it learned.
-        question: what is asked.
-        changes: what is done with what is found.
-        folder: for it, in place of an earlier answer, which stays until this one is whole.
-        notes: told of what is odd.
-        console: shows how far it is.
+        question, changes, folder, notes, console: as for a field's `answer`.
 
     Raises:
         ValueError: the question cannot be understood, or means nothing of the scene.
@@ -201,6 +197,12 @@ def _write_labels(
 
 def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
     """What a text, a point or a box is in the scene's channels.
+
+    Args:
+        stored: what a run learned.
+        question: what is asked.
+        t: the frame that is asked about.
+        there: the scene at that frame.
 
     Raises:
         ValueError: the text cannot be read, or nothing of the scene lies there.

@@ -2,16 +2,17 @@
 
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table as Grid
 
 from gsjax.cli.deform.scores import OVER_TIME
 from gsjax.cli.machine import in_words
+from gsjax.cli.run.ending import print_grid
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.report import Media, Table, write_report
 from gsjax.viz.colors import label_color
 from gsjax.viz.plots import losses_over_steps, save
 
+_RECIPES = {"surst": "After SurstSplat", "clin": "After GaussianClin"}
 _COLUMNS = (  # key, head, unit and decimals, where frames have it
     ("frame", "frame", "", None),
     ("psnr_masked", "PSNR where it counts", "dB", 2),
@@ -69,7 +70,9 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     write_report(
         folder.report,
         title=f"{found['dataset']} deforms" + ("" if found["complete"] else " (partial run)"),
-        subtitle=f"{found['method']}; {frames['learned']} frames learned, {frames['held_out']} held out",
+        subtitle=(
+            f"{_RECIPES[found['preset']]}; {frames['learned']} frames learned, {frames['held_out']} held out"
+        ),
         summary=cards,
         strips=shown,
         plots=plots,
@@ -114,7 +117,7 @@ def _memory(found: dict[str, Any]) -> str:
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """The run in a few lines."""
-    console, grid = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0))
+    grid = Grid.grid(padding=(0, 3, 0, 0))
     test, tracks, seconds = found["test"], found["tracks"], found["seconds"]
     words = [f"{test['psnr_masked']:.2f} dB"] if test["psnr_masked"] is not None else []
     for key, name in (("ssim", "SSIM"), ("ms_ssim", "MS-SSIM")):
@@ -145,8 +148,4 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     took = f"{found['steps']:,} in {seconds['steps'] / 60:.1f} min"
     took += f" ({seconds['steps'] / max(1, found['steps']):.2f} s each)" if seconds["steps"] else ""
     grid.add_row("[bold]steps[/]", f"{took}, compiling {seconds['compile'] / 60:.1f} min")
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
+    print_grid(folder, found, grid)

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.cli.deform.data import DeformData, Tools
-from gsjax.cli.fit.results import PANELS, mean_scores
 from gsjax.cli.machine import peak_memory_mb
 from gsjax.cli.run.folder import RunFolder
-from gsjax.cli.track.outputs import write_png
+from gsjax.cli.run.pictures import PANELS
+from gsjax.cli.run.scores import mean_scores
 from gsjax.geometry.cameras import Camera, pixels_of
+from gsjax.io.pictures import write_png
 from gsjax.methods.surgical import (
     DeformingScene,
     Look,

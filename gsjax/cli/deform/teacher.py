@@ -13,8 +13,9 @@ from rich.console import Console
 from scipy.cluster.hierarchy import fcluster, ward
 
 from gsjax.cli.distill.cache import FeatureCache, content_digest
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.distill.source import Source
-from gsjax.cli.distill.teacher import Asked, Teaching
+from gsjax.cli.distill.teacher import Teaching
 from gsjax.cli.messages import Notes, describe
 from gsjax.data import Photographs, Sequence
 from gsjax.data.photographs import photographs_of
@@ -158,7 +159,7 @@ class EncodedTeacher:
         )
 
 
-def teaching_of(sequence: Sequence, train: Many[int], asked: Asked, console: Console) -> Teaching:
+def teaching_of(sequence: Sequence, train: Many[int], asked: TeacherChoice, console: Console) -> Teaching:
     """Have frames of camera 0 segmented and encoded, or their features read.
 
     Args:

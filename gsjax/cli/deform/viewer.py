@@ -58,7 +58,13 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
 
 def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None) -> Asking:
     """How the page asks it; what it saves goes to `extracted/` in the run's folder. Where features change
-    over time, an answer is of the frame that is looked at."""
+    over time, an answer is of the frame that is looked at.
+
+    Args:
+        path: of the run.
+        stored: what it learned.
+        weights: folder of CLIP's, where they are no longer where they were.
+    """
     assert stored.meaning is not None
     meaning = stored.meaning
 

@@ -5,20 +5,22 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import jax
 from rich.console import Console
 
 from gsjax.cli.distill.cache import FeatureCache, cache_folder
+from gsjax.cli.distill.choice import Second, TeacherChoice, TeacherOptions
 from gsjax.cli.distill.file import FOLDER, NAME, StoredField, write_field
 from gsjax.cli.distill.results import judge, print_results, write_results
 from gsjax.cli.distill.scene import FieldScene, SceneOptions, open_scene
-from gsjax.cli.distill.teacher import Asked, Masks, Second, Teaching
+from gsjax.cli.distill.teacher import Teaching
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed
+from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
 from gsjax.cli.recording import located
+from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load
 from gsjax.cli.run.records import digest
@@ -33,29 +35,17 @@ _LOSSES = ("rec", "cos", "contrast", "tv")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Timed, Seeded, SceneOptions):
+class Options(Common, Resuming, Timed, Seeded, TeacherOptions, SceneOptions):
     """What `gsjax distill` is told."""
 
     out: Path | None = None
     """Folder for the field. Unless given, `field` in the run's."""
-    features: str = "auto"
-    """What is to be learned: classes (a code for each class of the mask files), closed (colour and outline of
-    each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
-    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz). auto: classes if there are mask files, else closed."""
     second: Second = "none"
     """Who teaches beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches, by
     the same --weights. What they count is --field.weights.map."""
-    masks: Masks = "auto"
-    """Whose masks: the recording's own, or a segmenter's that needs no weights. auto: files if there are."""
-    sam: Path | None = None
-    """Folder of SAM's weights: let it segment."""
     snap: int = 0
     """Put outlines of masks on the picture's edges, where there are any within so many pixels: for masks
     whose outlines are off, as many segmenters' are."""
-    weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
-    level: Literal["default", "small", "medium", "large"] = "default"
-    """Of LangSplat's files, which size of objects."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """How it is learned."""
 
@@ -66,9 +56,10 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
-        asked = Asked(
+        asked = TeacherChoice(
             options.features,
             options.masks,
             options.sam,
@@ -142,12 +133,9 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        folder.write_metrics(found)
-        write_results(folder, found)
-        if found["complete"]:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
-    return learning.exit_code()
+    return exit_code(learning.stopped)
 
 
 def _told(row: Mapping[str, Any]) -> str:
@@ -174,7 +162,7 @@ def _out(options: Options, scene: Path) -> Path:
     return out
 
 
-def _settings(options: Options, asked: Asked) -> Options:
+def _settings(options: Options, asked: TeacherChoice) -> Options:
     """The options by which a run finds everything again from elsewhere."""
     found = asked.located() | {"scene": options.scene and Path(located(str(options.scene)))}
     if options.images is not None:

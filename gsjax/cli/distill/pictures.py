@@ -18,9 +18,9 @@ from rich.progress import track
 
 from gsjax.cli.distill.saved import FieldRun, short_names
 from gsjax.cli.messages import Notes, describe
-from gsjax.cli.track.outputs import write_png
 from gsjax.geometry.cameras import Camera, camera_centers
 from gsjax.geometry.spherical_harmonics import evaluate_sh
+from gsjax.io.pictures import write_png
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.selection import hidden

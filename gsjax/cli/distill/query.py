@@ -81,6 +81,7 @@ class Selection:
 
     @property
     def selected(self) -> Bool[np.ndarray, "n"]:
+        """Which Gaussians score above the threshold."""
         return self.scores > self.threshold.value
 
 

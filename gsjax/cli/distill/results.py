@@ -12,12 +12,13 @@ from gsjax.cli.distill.file import StoredField
 from gsjax.cli.distill.scene import FieldScene
 from gsjax.cli.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
 from gsjax.cli.distill.teacher import Teaching
-from gsjax.cli.fit.results import mean_scores
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, describe
+from gsjax.cli.run.ending import print_grid
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.report import Media, Table, write_report
-from gsjax.cli.track.outputs import write_png
+from gsjax.cli.run.scores import mean_scores
+from gsjax.io.pictures import write_png
 from gsjax.methods.feature_field import FeatureField, FieldConfig, carried
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import Located
@@ -46,7 +47,16 @@ def judge(
     notes: Notes,
 ) -> dict[str, Any]:
     """Compares held-out views, or those that taught where none is held out, with what the teacher says of
-    them, and draws some. What cannot be read is noted, and nothing is compared there."""
+    them, and draws some. What cannot be read is noted, and nothing is compared there.
+
+    Args:
+        folder: of the run, for pictures.
+        scene: what the field is of, and its photographs.
+        teaching: who says what of them.
+        stored: the field.
+        config: how it was learned.
+        notes: told of what cannot be read.
+    """
     held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
     field, located = stored.at(scene.gaussians.means)
@@ -110,7 +120,13 @@ def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[
 def draw_features(
     numbers: Float[Array, "n three"], frozen: Frozen, pca: PcaColors
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A view in the colours of its features; what shows little of the scene is near black."""
+    """A view in the colours of its features; what shows little of the scene is near black.
+
+    Args:
+        numbers: three of each Gaussian, as `feature_colors` has them.
+        frozen: the view.
+        pca: which colours they are.
+    """
     image, alphas = (np.asarray(a) for a in paint(frozen[0], numbers, frozen[1]))
     alphas = alphas[..., None]
     return colorize_features(np.where(alphas > 0.5, image / np.maximum(alphas, 0.5), np.nan), pca)
@@ -159,7 +175,7 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """The run in a few lines."""
-    console, grid, test = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0)), found["test"]
+    grid, test = Grid.grid(padding=(0, 3, 0, 0)), found["test"]
     words = []
     if test["miou_3d"] is not None:
         words.append(f"mIoU {test['miou_3d']:.3f} by 3D query, {test['miou_2d']:.3f} by 2D query")
@@ -181,9 +197,5 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     pace = f" ({seconds['steps'] / max(1, found['steps']):.2f} s each)" if seconds["steps"] else ""
     minutes = (seconds["steps"] + seconds["compile"]) / 60
     grid.add_row("[bold]steps[/]", f"{found['steps']:,} in {minutes:.1f} min{pace}")
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
-    console.print(f"[bold]ask it[/]  gsjax query {folder.path} TEXT", soft_wrap=True)
+    print_grid(folder, found, grid)
+    Console(highlight=False).print(f"[bold]ask it[/]  gsjax query {folder.path} TEXT", soft_wrap=True)

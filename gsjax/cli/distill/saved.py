@@ -72,6 +72,7 @@ class FieldRun:
 
     @property
     def rasterize_mode(self) -> str:
+        """How its scene was fitted, and is drawn."""
         return str(self.stored.scene.get("rasterize_mode", "classic"))
 
     @property

@@ -57,7 +57,13 @@ class ClassScores:
         in_space: Int[np.ndarray, "h w"],
         truth: Int[np.ndarray, "h w"],
     ) -> None:
-        """Count one view; -1 where nothing is said."""
+        """Count one view; -1 where nothing is said.
+
+        Args:
+            by_pixel: class of each pixel by its own features.
+            in_space: the same by the Gaussians that it shows.
+            truth: its true label.
+        """
         for label in self.names:
             self.by_pixel[label].add(by_pixel == label, truth == label)
             self.in_space[label].add(in_space == label, truth == label)
@@ -107,7 +113,13 @@ def class_maps(
 def classes_of(
     field: FeatureField, located: Located | None, codes: Float[np.ndarray, "k d"]
 ) -> Int[np.ndarray, "n"]:
-    """Which class each Gaussian is nearest to."""
+    """Which class each Gaussian is nearest to.
+
+    Args:
+        field: of features.
+        located: where in its grid the Gaussians lie, or None where it has a vector for each.
+        codes: what each class is called, in features.
+    """
     return np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)).argmax(axis=-1))
 
 
@@ -132,7 +144,13 @@ def angle_error(config: FieldConfig) -> Callable[[FeatureField, Located | None, 
 
 def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: str) -> Iterator[Frozen]:
     """The scene in each camera, of which only one is in memory. Lists are filled up to few lengths, which
-    never shrink, so that views of one size share what is compiled for them."""
+    never shrink, so that views of one size share what is compiled for them.
+
+    Args:
+        gaussians: the scene.
+        cameras: views of it.
+        rasterize_mode: as the scene was fitted.
+    """
     largest: dict[tuple[int, int], tuple[int, int, int]] = {}
     for camera in cameras:
         ((view, plan),) = frozen_views(gaussians, [camera], rasterize_mode)

@@ -2,9 +2,8 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,8 +12,8 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.distill.cache import FeatureCache, content_digest, folder_digest
-from gsjax.cli.distill.source import KINDS, SAID, Source
-from gsjax.cli.recording import located
+from gsjax.cli.distill.choice import TeacherChoice
+from gsjax.cli.distill.source import SAID, Source
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.methods.feature_field import Teacher, teacher_of_maps, teacher_of_objects, with_maps
@@ -24,85 +23,10 @@ from gsjax.perception.feature_files import PictureFeatures, read_feature_folder
 from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
-Masks = Literal["auto", "files", "segment"]
-Second = Literal["none", "maskclip"]
-_OF_CLIP, _OF_OBJECTS = ("clip", "maskclip"), ("classes", "closed", "clip")
+_OF_OBJECTS = ("classes", "closed", "clip")
 _STRETCH = 0.02  # by which the sides of a feature file's masks may be off
 _IN_FILES = "in the feature files"
 _VERSION = 2  # of what is kept; another one is worked out anew
-
-
-@dataclass(frozen=True)
-class Asked:
-    """Whose masks and features.
-
-    Attributes:
-        features: an encoder (`field_source.KINDS`), a folder of files, or "auto".
-        masks: those of files, those of a segmenter, or "auto".
-        sam: folder of SAM's weights; a segmenter without weights unless given.
-        weights: folder of CLIP's.
-        level: of LangSplat's files.
-        second: who teaches beside CLIP's vectors of masks.
-        snap: pixels within which outlines of masks are put on the picture's edges.
-    """
-
-    features: str = "auto"
-    masks: Masks = "auto"
-    sam: Path | None = None
-    weights: Path | None = None
-    level: str = "default"
-    second: Second = "none"
-    snap: int = 0
-
-    @property
-    def of_files(self) -> bool:
-        return self.features not in ("auto", *KINDS)
-
-    def located(self) -> dict[str, Any]:
-        """Its paths as they are found from elsewhere, by the options that name them."""
-        paths = {"sam": self.sam, "weights": self.weights}
-        found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
-        return found | ({"features": located(self.features)} if self.of_files else {})
-
-    def check(self, also: tuple[str, ...] = ()) -> None:
-        """Raises ValueError where these contradict each other, FileNotFoundError for files not there.
-        `also`: what else --features may be, to say so."""
-        if self.of_files and not Path(self.features).is_dir():
-            known = ", ".join(("auto", *KINDS, *also))
-            raise FileNotFoundError(
-                f"--features {self.features}: expected {known}, or a folder of feature files, "
-                f"found {_what_is(Path(self.features), 'none of these')}"
-            )
-        for option, folder, model in (("weights", self.weights, "CLIP"), ("sam", self.sam, "SAM")):
-            if folder is not None and not folder.is_dir():
-                raise FileNotFoundError(
-                    f"--{option} {folder}: expected a folder of {model}'s weights, in the layout of Hugging "
-                    f"Face, found {_what_is(folder, 'nothing there')}"
-                )
-        if self.features in _OF_CLIP and self.weights is None:
-            raise ValueError(
-                f"--features {self.features}: expected --weights PATH too, a folder of CLIP's "
-                "weights; closed needs none"
-            )
-        if self.features not in _OF_CLIP and self.weights is not None:
-            raise ValueError(
-                f"--weights: expected --features {' or '.join(_OF_CLIP)}, which have them, found "
-                f"{self.features}"
-            )
-        if self.sam is not None and self.masks == "files":
-            raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
-        if self.snap < 0:
-            raise ValueError(f"--snap: expected 0 or more pixels, found {self.snap}")
-        if self.level != "default" and not self.of_files:
-            raise ValueError(
-                f"--level {self.level}: expected --features FOLDER, with LangSplat's files, found "
-                f"{self.features}"
-            )
-        if self.second != "none" and self.features != "clip":
-            raise ValueError(
-                f"--second {self.second}: expected --features clip, whose second teacher it is, found "
-                f"{self.features}"
-            )
 
 
 class _View(NamedTuple):
@@ -132,7 +56,7 @@ class Teaching:
         self,
         photographs: Photographs,
         indices: Sequence[int],
-        asked: Asked,
+        asked: TeacherChoice,
         cache: FeatureCache,
         console: Console,
     ):
@@ -308,7 +232,7 @@ class Teaching:
         return [tuple(self._photographs.sizes[i][::-1].tolist()) for i in indices]
 
 
-def _settled(asked: Asked, files: bool, name: str) -> tuple[Any, str]:
+def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
     """Which features and whose masks it is to be.
 
     Args:
@@ -342,7 +266,7 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
         raise ValueError(f"--weights: {error}") from error
 
 
-def _segmenter(asked: Asked, masks: str) -> tuple[Segmenter | None, str]:
+def _segmenter(asked: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]:
     """Whose masks are nobody's yet, and by what its answers are told from those of others."""
     if masks in ("files", "none"):
         return None, ""
@@ -392,5 +316,3 @@ def _as_large(one: PictureFeatures, photographs: Photographs, i: int) -> Int[np.
     return cv2.resize(one.ids, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def _what_is(path: Path, nothing: str) -> str:
-    return "a file" if path.exists() else nothing

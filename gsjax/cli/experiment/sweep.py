@@ -71,6 +71,7 @@ class Experiment:
 
     @property
     def script(self) -> Path:
+        """What a cell runs."""
         return self.folder / self.config.script
 
     @cached_property
@@ -130,6 +131,11 @@ def experiment_names(root: Path) -> list[str]:
 
 def read_experiment(root: Path, name: str, out: Path) -> Experiment:
     """Read and check the experiment `name`, whose cells are in `out`/`name`.
+
+    Args:
+        root: folder of the experiments.
+        name: its folder below that.
+        out: folder for what cells give.
 
     Raises:
         ValueError: there is none, or a key of its config is not as it should be.

@@ -45,7 +45,13 @@ def _columns(experiment: Experiment, rows: list[dict[str, Any]]) -> tuple[Column
 
 
 def figures(column: Column, values: list[Any], num_seeds: int) -> str:
-    """One cell of the table: a figure, or mean ± standard deviation of those there are over the seeds."""
+    """One cell of the table: a figure, or mean ± standard deviation of those there are over the seeds.
+
+    Args:
+        column: says how figures are written.
+        values: those of the cells that a line is of.
+        num_seeds: how many there should be.
+    """
     numbers = [value for value in values if isinstance(value, (int, float))]
     if not numbers:
         return " / ".join(dict.fromkeys(in_words(value) for value in values if value is not None)) or "–"
@@ -55,7 +61,13 @@ def figures(column: Column, values: list[Any], num_seeds: int) -> str:
 
 
 def remarks(experiment: Experiment, records: list[dict[str, Any]], done: list[dict[str, Any]]) -> list[str]:
-    """What a reader must know beside the table, one sentence each."""
+    """What a reader must know beside the table, one sentence each.
+
+    Args:
+        experiment: as its config has it.
+        records: of all cells that were run.
+        done: those of them that the table shows.
+    """
     config, num_cells, notes = experiment.config, len(experiment.cells), []
     if len(config.seeds) > 1:
         n = len(config.seeds)

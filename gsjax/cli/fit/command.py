@@ -20,19 +20,10 @@ from gsjax.cli.fit.tensorboard import TensorBoard
 from gsjax.cli.fit.worth import parts
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
-from gsjax.cli.options import (
-    OF_NO_BEARING,
-    Common,
-    DatasetAndOut,
-    HeldOutFrames,
-    Resuming,
-    Seeded,
-    Selection,
-    Timed,
-    preset_options,
-)
+from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, preset_options
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
 from gsjax.cli.recording import located
+from gsjax.cli.run.ending import ended, exit_code, finish
 from gsjax.cli.run.folder import RunFolder
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
@@ -53,7 +44,7 @@ _OF_NO_BEARING = (*OF_NO_BEARING, "tensorboard", "save_every")  # on what is fit
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
+class Options(OfDataset):
     """What `gsjax fit` is told."""
 
     preset: Literal["default", "quick", "classic", "depth", "published"] = "default"
@@ -82,6 +73,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
     """
+    options = checked(options)
     _check(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
@@ -150,9 +142,7 @@ def run(options: Options) -> int:
         found = {
             "kind": "fit",
             "dataset": photographs.name,
-            "complete": finished,
-            "report": True,
-            "stopped": None if stopped is None else reason(stopped),
+            **ended(stopped),
             "steps": state.step,
             "skipped": curve.skipped,
             "num_gaussians": gaussians.num,
@@ -174,16 +164,9 @@ def run(options: Options) -> int:
         }
         if board is not None:
             board.close({f"held_out/{row['view']}": folder.path / row["picture"] for row in scores.rows})
-        folder.write_metrics(found)
-        write_results(folder, found, curve)
-        if finished:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
-    if isinstance(stopped, KeyboardInterrupt):
-        return 130
-    if stopped is not None:
-        raise stopped
-    return 0
+    return exit_code(stopped)
 
 
 def _check(options: Options) -> None:
@@ -244,7 +227,14 @@ def write_cameras(folder: RunFolder, names: list[str], views: list[View], model:
 def without_needless(
     views: list[View], config: FitConfig, gaussians: Gaussians, notes: Notes
 ) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
-    """Those that some photograph needs, and the light that each sends."""
+    """Those that some photograph needs, and the light that each sends.
+
+    Args:
+        views: the photographs that were fitted.
+        config: how; its `prune` is the share of light below which one is not needed.
+        gaussians: the scene.
+        notes: told how many were left out.
+    """
     if not gaussians.num:
         return gaussians, np.zeros(0)
     light = light_of(gaussians, views, "antialiased" if config.antialiased else "classic")

@@ -13,7 +13,7 @@ from rich.progress import track
 from rich.table import Table as Grid
 from rich.text import Text
 
-from gsjax.cli.fit.results import Seen, look, mean_scores, write_panel
+from gsjax.cli.fit.results import Seen, look, write_panel
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes
@@ -22,7 +22,8 @@ from gsjax.cli.photographs import photographs_of_run, read_views, split
 from gsjax.cli.run.folder import replaced_folder
 from gsjax.cli.run.records import EVALUATION, Record, digest, read_record
 from gsjax.cli.run.report import Media, Table, format_number, write_report
-from gsjax.cli.track.summary import Column
+from gsjax.cli.run.scores import mean_scores
+from gsjax.cli.run.tables import Column
 from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
 from gsjax.io.atomic import write_json

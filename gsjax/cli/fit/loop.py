@@ -101,7 +101,21 @@ def follow(
     board: TensorBoard | None = None,
 ) -> tuple[Any, BaseException | None]:
     """Fit until the steps, the minutes or the wanted PSNR are reached, Ctrl-C or an error; returns the last
-    state, and what stopped it early."""
+    state, and what stopped it early.
+
+    Args:
+        problem: what is fitted to what.
+        state: where to begin.
+        curve: how it went so far; it is added to.
+        judged: held-out photographs with their names.
+        folder: of the run.
+        console: shows how far it is.
+        minutes: of steps, compiling included, after which it is enough.
+        until_psnr: of held-out photographs, dB, with which it is enough.
+        judge_every: steps between looks at them.
+        save_every: seconds of fitting that may be lost.
+        board: is told of every row, or None.
+    """
     budget, saver = Budget(problem.config.steps, minutes, curve), Saver(folder, save_every)
     some, tenths = some_of(judged), int(_LOOKS * budget(state.step))
     plans: Plans = {}

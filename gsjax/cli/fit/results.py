@@ -1,24 +1,25 @@
 """What a fit came to: its curve, its scores, pictures of views that it never saw, and the report."""
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 from rich.table import Table as Grid
 
 from gsjax.cli.fit.orbit import NAME as ORBIT
 from gsjax.cli.machine import in_words
 from gsjax.cli.messages import counted
+from gsjax.cli.run.ending import print_grid
 from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.run.pictures import PANELS
 from gsjax.cli.run.report import Media, Table, write_report
-from gsjax.cli.track.outputs import write_png
+from gsjax.cli.run.scores import mean_scores
 from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import atomic_write
+from gsjax.io.pictures import write_png
 from gsjax.methods.reconstruction import Fitted, Problem, View
 from gsjax.metrics.image import depth_error, psnr, ssim, with_matched_colors
 from gsjax.optim.densification import is_alive
@@ -46,8 +47,6 @@ _TIMES = {
     "video": "the video",
     "total": "in all, with reading and the start",
 }
-PANELS = ("photograph", "rendered", "difference")
-"""What a picture of a view shows, from left to right."""
 
 
 @dataclass
@@ -85,7 +84,13 @@ class Curve:
             self._rate = 0.95 * self._rate + 0.05 * seconds if self._rate else seconds
 
     def add(self, fitted: Fitted, test_psnr: float | None, folder: RunFolder) -> None:
-        """A row, which stands in metrics.jsonl at once."""
+        """A row, which stands in metrics.jsonl at once.
+
+        Args:
+            fitted: the step.
+            test_psnr: of held-out photographs, dB, where they were looked at.
+            folder: of the run.
+        """
         row = {
             "step": fitted.state.step,
             "seconds": self.seconds + self.compile_seconds,
@@ -131,15 +136,6 @@ class Scores:
     def mean(self) -> dict[str, float | None]:
         """Over the views that have a number."""
         return mean_scores(self.rows, ("psnr", "ssim", "depth_mm", "psnr_matched"))
-
-
-def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
-    """Of each score, over the views that have a finite one; None where none has."""
-    known = {
-        name: [row[name] for row in rows if row.get(name) is not None and np.isfinite(row[name])]
-        for name in names
-    }
-    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
 def living(gaussians: Gaussians) -> tuple[Gaussians, int]:
@@ -254,10 +250,10 @@ def write_panel(path: Path, seen: Seen) -> None:
     write_png(path, side_by_side(*pair, captions=PANELS))
 
 
-def write_results(folder: RunFolder, found: dict[str, Any], curve: Curve) -> None:
+def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Writes the curve and report.html."""
     plot = folder.plot("curve")
-    save(fit_curve(curve.rows), plot)
+    save(fit_curve(found["curve"]), plot)
     test, cards = found["test"], {}
     if test and test["psnr"] is not None:
         cards["PSNR, held out"] = (f"{test['psnr']:.2f}", "dB")
@@ -306,7 +302,7 @@ def _tables_of_parts(parts: list[dict[str, Any]], looked: str) -> list[Table]:
 
 def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """The run in a few lines."""
-    console, grid = Console(highlight=False), Grid.grid(padding=(0, 3, 0, 0))
+    grid = Grid.grid(padding=(0, 3, 0, 0))
     photographs, seconds = found["photographs"], found["seconds"]
     test = found["test"]
     if test and test["psnr"] is not None:
@@ -319,8 +315,4 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     rate = found["steps"] / seconds["fit"] if seconds["fit"] else 0
     words = f"{found['steps']:,} steps in {_minutes(found):.1f} min ({rate:.1f} a second), "
     grid.add_row("[bold]fit[/]", f"{words}{seconds['compile']:.0f} s of it compiling")
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
+    print_grid(folder, found, grid)

@@ -1,16 +1,13 @@
 """What an unfinished fit leaves from time to time, so that another can go on from it to the same bits."""
 
-import warnings
 from pathlib import Path
-from time import perf_counter
 
 import jax
 import numpy as np
 
 from gsjax.cli.fit.results import Curve
-from gsjax.cli.messages import describe
+from gsjax.cli.run import saving
 from gsjax.cli.run.folder import RunFolder
-from gsjax.data.errors import DataWarning
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.reconstruction import FitState, Problem
 from gsjax.methods.reconstruction.fit import enlarged
@@ -28,12 +25,13 @@ class Saver:
     """
 
     def __init__(self, folder: RunFolder, every: float):
-        self._folder, self._every, self._at = folder.resume, every, perf_counter()
+        self._folder, self._save = folder.resume, saving.Saver("the fit", every)
 
     def __call__(self, state: FitState, curve: Curve, *, last: bool) -> None:
         """Save if the last time is long enough ago, or this is the last; where the disk is full, say so."""
-        if not last and perf_counter() - self._at < self._every:
-            return
+        self._save(lambda: self._write(state, curve), last=last)
+
+    def _write(self, state: FitState, curve: Curve) -> None:
         metadata = {
             "degree": state.gaussians.sh_degree,
             "slots": state.gaussians.num,
@@ -41,19 +39,19 @@ class Saver:
             "step": state.step,
             "curve": curve.metadata(),
         }
-        try:
-            save_checkpoint(_path(self._folder, state.step), jax.device_get(state), metadata)
-            for old in _saved(self._folder)[:-KEPT]:
-                old.unlink()
-        except OSError as error:
-            message = f"could not save what --resume needs ({describe(error)}); the fit goes on"
-            warnings.warn(message, DataWarning, stacklevel=2)
-        self._at = perf_counter()
+        save_checkpoint(_path(self._folder, state.step), jax.device_get(state), metadata)
+        for old in _saved(self._folder)[:-KEPT]:
+            old.unlink()
 
 
 def load(folder: Path, problem: Problem, start: FitState) -> tuple[FitState, Curve]:
     """The newest state that is whole, and the curve until then; the start where a run was stopped before it
     had saved any.
+
+    Args:
+        folder: RUN/resume.
+        problem: what is fitted to what.
+        start: the state before the first step.
 
     Raises:
         CheckpointError: there are only damaged ones.

@@ -21,10 +21,10 @@ Groups = Mapping[str, np.ndarray]
 
 def by_split(photographs: Photographs) -> Groups:
     """What `gsjax fit` does with each photograph unless it is told otherwise."""
-    from gsjax.cli.fit.command import Options
+    from gsjax.cli.options import HeldOutFrames
     from gsjax.cli.photographs import split
 
-    fitted, held_out = split(photographs, Options.test_every)
+    fitted, held_out = split(photographs, HeldOutFrames.test_every)
     others = np.setdiff1d(np.arange(photographs.num), np.concatenate([fitted, held_out]))
     groups = {"fitted": fitted, "held out": held_out, _OTHERS: others}
     return {name: indices for name, indices in groups.items() if len(indices)}

@@ -13,19 +13,12 @@ from rich.console import Console
 
 from gsjax.cli.fit import command as fit_command
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import (
-    OF_NO_BEARING,
-    Common,
-    DatasetAndOut,
-    HeldOut,
-    Resuming,
-    Seeded,
-    Selection,
-)
+from gsjax.cli.options import OF_NO_BEARING, OfRecording, Seeded, checked
 from gsjax.cli.parts.loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts.results import finished, print_results, write_results
 from gsjax.cli.parts.resume import Saver, load
-from gsjax.cli.recording import Recording, located, open_recording, parse_frames
+from gsjax.cli.recording import Recording, chosen_recording, located, parse_frames
+from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
@@ -52,7 +45,7 @@ _EVERYTHING = 0.6  # share of pixels that change
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, Seeded, HeldOut, Selection, DatasetAndOut):
+class Options(Seeded, OfRecording):
     """What `gsjax parts` is told."""
 
     anchor: int | None = None
@@ -78,17 +71,11 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: what was asked cannot be done; everything found before that is on disk.
     """
+    options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        recording = open_recording(
-            options.dataset,
-            options.cameras,
-            options.eval_cameras,
-            options.frames,
-            options.read,
-            options.scale,
-        )
+        recording = chosen_recording(options)
         _check(options, recording)
         segmenter = _segmenter(options)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
@@ -143,16 +130,9 @@ def run(options: Options) -> int:
         found = finished(folder, recording, start, parts, following, options.parts, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
         found["notes"] = notes.all
-        folder.write_metrics(found)
-        write_results(folder, found, following)
-        if found["complete"]:
-            folder.forget_resume()
+        finish(folder, found, write_results)
     print_results(folder, found)
-    if isinstance(following.stopped, KeyboardInterrupt):
-        return 130
-    if following.stopped is not None:
-        raise following.stopped
-    return 0
+    return exit_code(following.stopped)
 
 
 def _check(options: Options, recording: Recording) -> None:

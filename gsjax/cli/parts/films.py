@@ -82,7 +82,13 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
 
 
 def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
-    """The id of the camera, of those that a run had, to which most looks different from the recording."""
+    """The id of the camera, of those that a run had, to which most looks different from the recording.
+
+    Args:
+        film: what is filmed.
+        saved: the run.
+        script: the edits.
+    """
     plain = apply(replace(script, edits=(), length=_lasting(script, film, saved)), saved.layer, saved.names)
     moments = _edited_moments(film, plain)
     if not len(moments):
@@ -140,6 +146,11 @@ def write_film(
     """Film it: the script, a video and what is known of it take the place of an earlier film in the folder.
 
     Args:
+        folder: for it.
+        script: the edits.
+        film: what is filmed.
+        saved: the run.
+        watch: shows how far it is.
         camera: the id of that which films.
         notes: of the film.
         ply: write the Gaussians of each frame too.
@@ -212,7 +223,13 @@ def _placed(film: Film, order: Int[Array, "n"] | None, blend: Blend) -> Gaussian
 
 
 def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
-    """A film as a camera sees it, frame by frame."""
+    """A film as a camera sees it, frame by frame.
+
+    Args:
+        film: what is filmed.
+        camera: that which films.
+        saved: the run.
+    """
     at = frames_of(film, saved.blend)
     cameras, plan = jax.tree.map(lambda leaf: leaf[None], camera), None
     for t in range(len(film[0].trajectory.times)):

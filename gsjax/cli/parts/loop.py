@@ -43,7 +43,16 @@ def follow_parts(
     views: Sequence, start: Start, following: Following, config: PartsConfig, save: Any, console: Console
 ) -> Following:
     """Go on from what there is until all frames are found, Ctrl-C or an error; `save(following, last=...)` is
-    called after each."""
+    called after each.
+
+    Args:
+        views: the cameras that are looked through.
+        start: the canonical scene and what may move.
+        following: how far it is.
+        config: how parts are followed.
+        save: as above.
+        console: shows how far it is.
+    """
     columns = (TextColumn("following parts"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     words = TextColumn("{task.description}")
     if not console.is_terminal:
@@ -80,7 +89,16 @@ def refine_parts(
     views: Sequence, parts: Parts, following: Following, config: PartsConfig, notes: Notes, console: Console
 ) -> Parts:
     """Parts with the scene and all poses fitted to all frames, as far as it came where it was stopped.
-    `following` is told of Ctrl-C."""
+    `following` is told of Ctrl-C.
+
+    Args:
+        views: the cameras that are looked through.
+        parts: as they were followed.
+        following: how that went.
+        config: how parts are refined.
+        notes: told of what was left out.
+        console: shows how far it is.
+    """
     done, skipped, steps = 0, [], config.refine.iterations
     columns = (TextColumn("refining the scene over all frames"), BarColumn(), MofNCompleteColumn())
     if steps and not console.is_terminal:

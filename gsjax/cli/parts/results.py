@@ -13,13 +13,14 @@ from gsjax.cli.machine import in_words
 from gsjax.cli.messages import Notes, counted, reason
 from gsjax.cli.parts.loop import Following
 from gsjax.cli.parts.scoring import joints_of, part_rows, score_parts
+from gsjax.cli.parts.views import part_views
 from gsjax.cli.recording import Recording
+from gsjax.cli.run.ending import ended
 from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.run.pictures import Film
 from gsjax.cli.run.report import Media, format_number, write_report
-from gsjax.cli.track.outputs import Film
-from gsjax.cli.track.scoring import Scores, camera_metrics
-from gsjax.cli.track.summary import CAMERA_COLUMNS, Column, camera_rows, grid, table, time_table
-from gsjax.cli.track.views import part_views
+from gsjax.cli.run.scores import CAMERA_COLUMNS, Scores, camera_metrics, camera_rows
+from gsjax.cli.run.tables import Column, grid, table, time_table
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
@@ -64,7 +65,19 @@ def finished(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes."""
+    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes.
+
+    Args:
+        folder: of the run.
+        recording: what was looked through, and who judges.
+        start: the canonical scene.
+        parts: as they were found.
+        following: how that went.
+        config: how they were found.
+        seconds: by stage, so far.
+        notes: told of what is odd.
+        console: shows how far it is.
+    """
     frames = np.flatnonzero(parts.done)
     stopped = following.stopped
     complete = stopped is None
@@ -103,8 +116,7 @@ def finished(
     return {
         "kind": "parts",
         "dataset": sequence.name,
-        "complete": following.stopped is None,
-        "stopped": None if following.stopped is None else reason(following.stopped),
+        **ended(following.stopped),
         "anchor": start.anchor.frame,
         "frames": {
             "followed": len(frames),
@@ -156,7 +168,7 @@ def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: in
     write_npz(path, {name: np.asarray(array) for name, array in arrays.items()})
 
 
-def write_results(folder: RunFolder, found: dict[str, Any], following: Following) -> None:
+def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Writes report.html."""
     rows = _in_words(found["parts"])
     colors = [label_color(row["part"]) for row in rows]

@@ -2,32 +2,29 @@
 
 from pathlib import Path
 
+import jax
+
 from gsjax.cli.parts.loop import Following
 from gsjax.cli.run import saving
-from gsjax.io.checkpoints import load_checkpoint, load_metadata
+from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 
 _STATE = "parts.npz"
+_KEPT = ("update_s", "losses", "skipped", "joined", "divided")
 
 
 class Saver:
     """Writes the state of a run into its folder `resume/`."""
 
     def __init__(self, folder: Path):
-        self._save = saving.Saver(folder / _STATE, "following")
+        self._path, self._save = folder / _STATE, saving.Saver("following")
 
     def __call__(self, following: Following, *, last: bool) -> None:
         """Save if the last time is long enough ago, or this is the last; where the disk is full, say so."""
-        self._save(
-            following.parts,
-            lambda: {
-                "update_s": following.update_s,
-                "losses": following.losses,
-                "skipped": following.skipped,
-                "joined": following.joined,
-                "divided": following.divided,
-            },
-            last=last,
-        )
+        self._save(lambda: self._write(following), last=last)
+
+    def _write(self, following: Following) -> None:
+        metadata = {name: getattr(following, name) for name in _KEPT}
+        save_checkpoint(self._path, jax.device_get(following.parts), metadata)
 
 
 def load(folder: Path, first: Following) -> Following:

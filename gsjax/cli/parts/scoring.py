@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from gsjax.cli.messages import Notes
 from gsjax.cli.recording import Recording
-from gsjax.cli.track.scoring import motion_metrics
+from gsjax.cli.run.scores import motion_metrics
 from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
@@ -44,7 +44,14 @@ def joints_of(
     scene: PartScene, trajectory: Trajectory, done: Bool[np.ndarray, "T"], noise_m: float
 ) -> dict[int, FittedJoint]:
     """The joint that explains the motion of each part best, over the frames that were found; what following
-    errs by is `noise_m`, metres."""
+    errs by is `noise_m`, metres.
+
+    Args:
+        scene: the parts.
+        trajectory: where they went.
+        done: frames that were found.
+        noise_m: as above.
+    """
     motions, labels = motions_in_world(scene, trajectory)[done], np.asarray(scene.labels)
     means = np.asarray(scene.gaussians.means, np.float64)
     found = {}
@@ -60,7 +67,13 @@ def joints_of(
 def part_rows(
     scene: PartScene, trajectory: Trajectory, joints: dict[int, FittedJoint]
 ) -> list[dict[str, Any]]:
-    """What is known of each part without truth, by the keys of `PART_COLUMNS`."""
+    """What is known of each part without truth, by the keys of `PART_COLUMNS`.
+
+    Args:
+        scene: the parts.
+        trajectory: where they went.
+        joints: what explains that, by part.
+    """
     motions, labels = motions_in_world(scene, trajectory), np.asarray(scene.labels)
     means = np.asarray(scene.gaussians.means, np.float64)
     rows = []
@@ -95,6 +108,15 @@ def score_parts(
     notes: Notes,
 ) -> dict[str, Any]:
     """Scores of the whole, and in each row those of the part; nothing where the recording has no truth.
+
+    Args:
+        scene, trajectory: the parts, and where they went.
+        joints: what explains that, by part.
+        rows: of `part_rows`; each gets the scores of its part.
+        recording: with the truth.
+        anchor: the canonical frame.
+        blend: how turns of several parts are blended.
+        notes: told of what was not scored.
 
     Returns:
         `ari` (over the Gaussians whose true label is known), `true_parts` (those that move), `missed` (the

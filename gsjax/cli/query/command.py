@@ -331,5 +331,11 @@ def _asked(options: Options) -> ObjectQuery:
         camera = int(options.camera)
     told = options.track
     return ObjectQuery(
-        options.run, options.text, camera, told.encoder, options.weights, told.min_score, options.debug
+        run=options.run,
+        text=options.text,
+        camera=camera,
+        encoder=told.encoder,
+        weights=options.weights,
+        min_score=told.min_score,
+        debug=options.debug,
     )

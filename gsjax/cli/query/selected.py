@@ -78,7 +78,15 @@ def write_scenes(
     labels: Int[np.ndarray, "n"] | None = None,
 ) -> None:
     """Writes PLY files of what was found, of the rest, and of the changed scenes, with labels where there are
-    any."""
+    any.
+
+    Args:
+        folder: for them.
+        gaussians: the scene.
+        selected: which were found.
+        scenes: changed ones, by their files' names.
+        labels: of the Gaussians, or None.
+    """
     for name, kept in (("object", selected), ("without", ~selected)):
         if kept.any():
             part = None if labels is None else labels[kept]
@@ -95,7 +103,15 @@ def keep_part(
     labels: Int[np.ndarray, "n"] | None = None,
 ) -> Path:
     """Writes some Gaussians as a PLY file that is called about like `name`; returns which. None is written
-    over."""
+    over.
+
+    Args:
+        folder: for it.
+        name: what it is.
+        gaussians: the scene.
+        selected: which are written.
+        labels: of the Gaussians, or None.
+    """
     folder.mkdir(exist_ok=True)
     stem = "_".join(re.findall(r"[^\W_]+", name.lower())) or "selection"
     names = (folder / (f"{stem}.ply" if number == 1 else f"{stem}_{number}.ply") for number in count(1))

@@ -24,6 +24,11 @@ _SETTINGS = ("dataset", "cameras", "frames")
 def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.ndarray]:
     """The arrays of a .npz file, those that are wanted among them.
 
+    Args:
+        file: a .npz.
+        wanted: names.
+        again: what to do where one is missing, for the error.
+
     Raises:
         ValueError: it cannot be read, or lacks one of them.
     """
@@ -46,6 +51,9 @@ def check_arrays(
     """Check that arrays of a file hold finite numbers and fit each other.
 
     Args:
+        file: where they are from, for the error.
+        arrays: by name.
+        again: what to do where one is wrong, for the error.
         shapes: of each that is checked. A letter is as many as where it first stands, one at least.
 
     Returns:
@@ -92,6 +100,12 @@ def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
 def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
     """The Gaussians of a run's scene.ply, as many as its file `arrays` tells of.
 
+    Args:
+        path: of the run.
+        count: how many there have to be.
+        arrays: the name of the file that says so.
+        again: what to do where they differ, for the error.
+
     Raises:
         ValueError: there are not as many, or not all of them can be drawn.
     """
@@ -110,6 +124,12 @@ def reopen(
 ) -> tuple[Recording, Any]:
     """The recording of a run, by what its config.yml says, and what else is wanted of the settings. `opened`
     opens it, as that command does.
+
+    Args:
+        config: the file.
+        again: what to do where it cannot be used, for the error.
+        also: takes what else is wanted out of the settings.
+        opened: as above; `open_sequence` unless given.
 
     Raises:
         ValueError: these are no such settings, or the recording cannot be opened.

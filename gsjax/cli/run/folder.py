@@ -173,10 +173,12 @@ class RunFolder:
 
     @property
     def config(self) -> Path:
+        """Where the settings belong."""
         return self.path / "config.yml"
 
     @property
     def metrics_lines(self) -> Path:
+        """Where the rows of a run that learns belong, a line each."""
         return self.path / "metrics.jsonl"
 
     @property
@@ -190,10 +192,12 @@ class RunFolder:
 
     @property
     def report(self) -> Path:
+        """Where the report belongs."""
         return self.path / "report.html"
 
     @property
     def scene(self) -> Path:
+        """Where the Gaussians belong."""
         return self.path / "scene.ply"
 
     def render(self, camera: int | str, frame: int) -> Path:

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.interrupts import hear, undisturbed
-from gsjax.cli.messages import reason
+from gsjax.cli.run.ending import ended
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.saving import Saver
 from gsjax.io.atomic import atomic_write
-from gsjax.io.checkpoints import load_checkpoint, load_metadata
+from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 
 _STATE = "state.npz"
 _LOGGED_EVERY = 10  # steps
@@ -89,9 +89,7 @@ class Learning:
     def found(self, begun: float) -> dict[str, Any]:
         """What metrics.json says of it; `begun` is by the performance counter."""
         return {
-            "complete": self.stopped is None,
-            "report": True,
-            "stopped": None if self.stopped is None else reason(self.stopped),
+            **ended(self.stopped),
             "steps": self.state.step,
             "skipped": self.skipped,
             "seconds": {
@@ -101,18 +99,6 @@ class Learning:
             },
             "curve": self.rows,
         }
-
-    def exit_code(self) -> int:
-        """That of the command.
-
-        Raises:
-            BaseException: what ended it early, unless that was Ctrl-C.
-        """
-        if self.stopped is None:
-            return 0
-        if isinstance(self.stopped, KeyboardInterrupt):
-            return 130
-        raise self.stopped
 
 
 def load(folder: Path, first: Learning, form_at: Callable[[Any, int], Any] | None = None) -> Learning:
@@ -162,11 +148,15 @@ def learn(
         console: that shows it.
         minutes: of steps, compiling included, after which it is enough.
     """
-    save, total = Saver(folder.resume / _STATE, course.doing), course.total
+    saver, total = Saver(course.doing), course.total
     columns = (TextColumn(course.doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
     words = TextColumn("{task.description}")
     if not console.is_terminal:
         console.print(f"{course.doing}; compiling, which takes half a minute the first time", soft_wrap=True)
+
+    def save(last: bool) -> None:
+        saver(lambda: _save(folder.resume / _STATE, learning), last=last)
+
     shown = 0.0
     with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=total, completed=learning.state.step)
@@ -181,7 +171,7 @@ def learn(
                 if not console.is_terminal and _is_told(step, total):
                     told = f": {course.told(learning.rows[-1])}" if learning.rows else ""
                     console.print(f"{step:,} of {total:,} steps{told}", soft_wrap=True)
-                save(learning.state, learning.metadata, last=False)
+                save(last=False)
                 hear()
         except (KeyboardInterrupt, Exception) as stopped:
             if any(
@@ -189,8 +179,12 @@ def learn(
             ):
                 raise  # a step that failed took it along: what --resume needs was saved before
             learning.stopped = stopped
-        save(learning.state, learning.metadata, last=True)
+        save(last=True)
     return learning
+
+
+def _save(path: Path, learning: Learning) -> None:
+    save_checkpoint(path, jax.device_get(learning.state), learning.metadata())
 
 
 def _made_one_more(steps: Iterator[Made], learning: Learning) -> bool:

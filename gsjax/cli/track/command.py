@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
@@ -11,32 +12,26 @@ from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import FITTING, Notes, reason, say_error, stage
-from gsjax.cli.options import (
-    OF_NO_BEARING,
-    Common,
-    DatasetAndOut,
-    HeldOut,
-    Resuming,
-    Selection,
-    checked,
-    preset_options,
-)
+from gsjax.cli.options import OF_NO_BEARING, OfRecording, checked, preset_options
 from gsjax.cli.recording import (
     FirstMask,
     Recording,
+    chosen_recording,
     draw_ahead,
     first_mask,
     located,
-    open_recording,
     warn_of_missing,
 )
+from gsjax.cli.run.ending import ended, exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset
+from gsjax.cli.run.pictures import Film
 from gsjax.cli.run.report import format_number
+from gsjax.cli.run.scores import Scores
 from gsjax.cli.track.loop import Tracking, begin, follow
-from gsjax.cli.track.outputs import Film, write_first_mask, write_plots, write_tracking
+from gsjax.cli.track.outputs import write_first_mask, write_plots, write_tracking
+from gsjax.cli.track.results import print_results, write_results
 from gsjax.cli.track.resume import Saver, load
 from gsjax.cli.track.scoring import (
-    Scores,
     budget_metrics,
     group_values,
     lost_over_frames,
@@ -45,14 +40,13 @@ from gsjax.cli.track.scoring import (
     score_motion,
     turn_unknown_from,
 )
-from gsjax.cli.track.summary import print_summary, write_run_report
 from gsjax.cli.track.views import views
 from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, scene_from_shapes, start_scene
 from gsjax.scene.frame import Frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Resuming, HeldOut, Selection, DatasetAndOut):
+class Options(OfRecording):
     """What `gsjax track` is told."""
 
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
@@ -89,14 +83,7 @@ def run(options: Options) -> int:
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)
-        recording = open_recording(
-            options.dataset,
-            options.cameras,
-            options.eval_cameras,
-            options.frames,
-            options.read,
-            options.scale,
-        )
+        recording = chosen_recording(options)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = dataclasses.replace(
             options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids
@@ -126,16 +113,9 @@ def run(options: Options) -> int:
         )
         seconds["total"] = perf_counter() - begun
         found |= {"seconds": seconds, "notes": notes.all}
-        folder.write_metrics(found)
-        write_run_report(folder, found, **report)
-        if found["complete"]:
-            folder.forget_resume()
-    print_summary(folder, found)
-    if isinstance(tracking.stopped, KeyboardInterrupt):
-        return 130
-    if error := tracking.stopped or failed:
-        raise error
-    return 0
+        finish(folder, found, partial(write_results, **report))
+    print_results(folder, found)
+    return exit_code(tracking.stopped or failed)
 
 
 def _start(
@@ -242,11 +222,11 @@ def _what_ran(
 ) -> dict[str, Any]:
     """The part of metrics.json that says what ran, and how fast."""
     ids, updates = recording.tracked.frame_ids, np.asarray(tracking.update_s[1:]) * 1e3
-    stopped = tracking.stopped
     return {
+        "kind": "track",
         "dataset": recording.tracked.name,
-        "complete": stopped is None and scores.num_frames == tracking.num_frames,
-        "stopped": None if stopped is None else reason(stopped),
+        **ended(tracking.stopped),
+        "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
         "frames": {
             "tracked": tracking.num_frames,
             "asked": recording.tracked.num_frames,

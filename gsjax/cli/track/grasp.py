@@ -16,16 +16,17 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.options import Seeded
+from gsjax.cli.options import Seeded, checked
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.folder import replaced_folder
-from gsjax.cli.track.outputs import frame_rate, write_png
+from gsjax.cli.run.pictures import frame_rate
 from gsjax.cli.track.query import Answer, ObjectQuery, ask, progress, show
 from gsjax.cli.track.saved import SavedRun
 from gsjax.cli.track.views import views
 from gsjax.geometry.cameras import project
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp
 from gsjax.optim.compiler import host_options
@@ -64,6 +65,7 @@ def run(options: Options) -> int:
     Raises:
         ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
     """
+    options = checked(options)
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         saved, answer = ask(options, console, notes)
@@ -111,6 +113,12 @@ def _write(
 
 def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Console) -> Grasp:
     """The best grasp of each frame, stacked, on the host; none is feasible while the object is lost.
+
+    Args:
+        options: gripper, samples and where to approach from.
+        saved: the run.
+        answer: the object.
+        console: shows how far it is.
 
     Raises:
         ValueError: nothing says which side of the object's surface is outside.
@@ -172,7 +180,15 @@ def draw_grasp(
     K: Float[np.ndarray, "3 3"],
     zoom: float = 1.0,
 ) -> np.ndarray:
-    """The picture with the closed gripper drawn in: fingers, palm and wrist; green where it is feasible."""
+    """The picture with the closed gripper drawn in: fingers, palm and wrist; green where it is feasible.
+
+    Args:
+        picture: [H,W,3], uint8.
+        grasp: one, in the world.
+        gripper: its measures.
+        viewmat, K: of the camera, the picture's size before it was enlarged.
+        zoom: by which it was enlarged.
+    """
     half, back = float(grasp.width) / 2, gripper.tip - gripper.finger_height
     wrist = back - gripper.palm_height
     corners = [(0, 0, wrist), (0, 0, back), (0, -half, gripper.tip), (0, -half, back), (0, half, back)]

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import resident_mb
-from gsjax.cli.messages import FITTING, MEASURING, Notes, reason, stage
+from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
 from gsjax.cli.options import Common, Overwriting, Selection, checked
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
+from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.track.scoring import budget_metrics
 from gsjax.data.opencv_cameras import open_camera, snapshots
@@ -91,23 +92,19 @@ def run(options: Options) -> int:
         source = _open(options, console)
         log = Log(source.scene.label_ids, source.names)
         stopped = follow(options, source, log, console)
-        found = log.metrics() | {
+        found = {
+            "kind": "live",
             "source": options.source,
-            "complete": stopped is None,
-            "report": False,  # a stream has none
-            "stopped": None if stopped is None else reason(stopped),
-            "notes": notes.all,
+            **ended(stopped, report=False),
+            **log.metrics(),
             "machine": describe_machine(),
+            "notes": notes.all,
         }
         folder.write_metrics(found)
         if log.times:
             folder.write_trajectory(**log.trajectory())
     _print(found, folder)
-    if isinstance(stopped, KeyboardInterrupt):
-        return 130
-    if stopped is not None:
-        raise stopped
-    return 0
+    return exit_code(stopped)
 
 
 def _check(options: Options) -> None:
@@ -180,7 +177,13 @@ class Log:
         self._memory_at = 0.0
 
     def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
-        """One update."""
+        """One update.
+
+        Args:
+            update: what the tracker says.
+            arrival: the frame, and when it came.
+            budget: seconds, beyond which an update is late.
+        """
         now = perf_counter()
         self.times.append(now)
         self.stamps.append(arrival.snapshot.stamp)
@@ -269,7 +272,14 @@ def _spread(seconds: list[float]) -> dict[str, float] | None:
 
 
 def follow(options: Options, source: Source, log: Log, console: Console) -> BaseException | None:
-    """Track until the stream ends; returns what ended it early, or None."""
+    """Track until the stream ends; returns what ended it early, or None.
+
+    Args:
+        options: budget, patience and how long.
+        source: where frames come from.
+        log: is told of every update.
+        console: shows how far it is.
+    """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
     newest = Newest(source.snapshots, patience=options.patience)
     arrived: list[Arrival] = []

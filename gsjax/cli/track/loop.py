@@ -130,7 +130,7 @@ def follow(
     *,
     budget_ms: float | None = None,
     after: Tracked | None = None,
-    saved: Callable[[Tracking, Tracked, bool], None] = lambda tracking, update, last: None,
+    saved: Callable[..., None] = lambda tracking, update, *, last: None,
 ) -> Tracking:
     """Track all frames that are left. Ctrl-C or an error ends the loop; what was tracked until then stays.
 
@@ -142,7 +142,7 @@ def follow(
         console: for the progress bar.
         budget_ms: what an update may take, or None.
         after: the last update, where tracking goes on from an earlier run.
-        saved: called after each update, and once more, with True, where the loop is stopped early.
+        saved: called after each update, and once more, with `last` on, where the loop is stopped early.
     """
     shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
     ahead = 0 if shared else LOADED_AHEAD
@@ -179,18 +179,18 @@ def follow(
                 tracking.turn_known.append(np.asarray(update.info["turn_known"]))
                 tracking.skipped += int(update.info["skipped"])
                 plans.add(update.plan)
-                saved(tracking, update, False)
+                saved(tracking, update, last=False)
                 progress.update(task, advance=1, rate=_rate(tracking))
                 if perf_counter() - drawn > _SHOWN_EVERY_S:
                     progress.refresh()
                     drawn = perf_counter()
             if update is not None and update.info:
-                saved(tracking, update, True)
+                saved(tracking, update, last=True)
         except (KeyboardInterrupt, Exception) as stopped:
             tracking.stopped = stopped
             progress.update(task, rate="stopped")
             if update is not None and update.info:
-                saved(tracking, update, True)
+                saved(tracking, update, last=True)
     tracking.loop_s = perf_counter() - begun
     tracking.loading_s, tracking.plans = frames.waited, len(plans)
     return tracking

@@ -1,32 +1,29 @@
 """What a run writes: trajectory, scene, renders, videos, plots."""
 
-import contextlib
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from gsjax.cli.recording import FirstMask, Recording
 from gsjax.cli.run.folder import RunFolder
+from gsjax.cli.run.scores import Scores
 from gsjax.cli.track.loop import Tracking
-from gsjax.cli.track.scoring import Scores
-from gsjax.cli.track.views import View
-from gsjax.io.atomic import atomic_write
+from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
-from gsjax.io.video import VideoWriter
 from gsjax.metrics.tracking import ObjectScore
 from gsjax.viz import plots
-from gsjax.viz.colors import overlay_labels, side_by_side, to_uint8
-
-RENDERS = 5
-"""Rendered pictures a camera that are kept as files, from the first frame to the last."""
-MAX_VIDEO_HZ = 60.0
-MIN_VIDEO_HZ = 1.0
+from gsjax.viz.colors import overlay_labels
 
 
 def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
-    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped."""
+    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped.
+
+    Args:
+        folder: of the run.
+        tracking: the scene and its poses.
+        times: [T] of the frames, seconds.
+    """
     # Parts of one object are one label in the files.
     label_ids, label_of = np.unique(tracking.scene.label_ids, return_inverse=True)
     labels = label_of[np.asarray(tracking.scene.labels)].astype(np.int32)
@@ -62,45 +59,6 @@ def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -
     return path
 
 
-def frame_rate(times: Float[np.ndarray, "t"]) -> float:
-    """Frames a second of a video, near the recording's own."""
-    steps = np.diff(times)
-    return float(np.clip(1 / np.median(steps), MIN_VIDEO_HZ, MAX_VIDEO_HZ)) if len(steps) else MIN_VIDEO_HZ
-
-
-class Film:
-    """Writes each camera's video and a few of its renders as views go by: `with Film(...) as film`."""
-
-    def __init__(self, folder: RunFolder, recording: Recording, num_frames: int, colors: np.ndarray):
-        """
-        Args:
-            num_frames: how many will be shown.
-            colors: the label that gives each group its colour, [K+1].
-        """
-        self._folder, self._frame_ids, self._colors = folder, recording.judged.frame_ids, colors
-        self._kept = set(np.linspace(0, num_frames - 1, RENDERS).round().astype(int).tolist())
-        self._fps = frame_rate(recording.judged.times)
-        self._stack = contextlib.ExitStack()
-        self._videos: dict[int, VideoWriter] = {}
-
-    def add(self, view: View) -> None:
-        """Append one view to its camera's video."""
-        if view.camera not in self._videos:
-            writer = VideoWriter(self._folder.video(view.camera), self._fps)
-            self._videos[view.camera] = self._stack.enter_context(writer)
-        panel = side_by_side(view.image, view.render, labels=self._colors[view.groups])
-        self._videos[view.camera].write(panel)
-        if view.t in self._kept:
-            path = self._folder.render(view.camera, self._frame_ids[view.t])
-            write_png(path, to_uint8(view.render))
-
-    def __enter__(self) -> "Film":
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self._stack.__exit__(*exception)
-
-
 def write_plots(
     folder: RunFolder,
     tracking: Tracking,
@@ -110,7 +68,16 @@ def write_plots(
     names: dict[int, str],
     colors: np.ndarray,
 ) -> list[tuple[Path, str]]:
-    """Writes the plots; returns each one's path and what it shows."""
+    """Writes the plots; returns each one's path and what it shows.
+
+    Args:
+        folder: of the run.
+        tracking, recording: what was tracked, and what judges.
+        scores: of views.
+        motion: of objects, by mask value.
+        names: of objects, by mask value.
+        colors: [K+1], the label that gives each group its colour.
+    """
     written = []
 
     def keep(name: str, figure, caption: str) -> None:
@@ -181,13 +148,3 @@ def _true_paths(
     return true
 
 
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """Writes an RGB picture [H,W,3] or a grey one [H,W], uint8.
-
-    Raises:
-        OSError: it could not be written.
-    """
-    with atomic_write(path) as temporary:
-        rows = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(str(temporary), rows):
-            raise OSError(f"{path}: the picture could not be written; is there space, and permission?")

@@ -17,10 +17,12 @@ from rich.table import Table
 from gsjax.cli.messages import Notes
 from gsjax.cli.options import Common
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
-from gsjax.cli.track.outputs import frame_rate, write_png
+from gsjax.cli.run.pictures import frame_rate
+from gsjax.cli.run.views import View
 from gsjax.cli.track.saved import SavedRun, open_run
-from gsjax.cli.track.views import View, views
+from gsjax.cli.track.views import views
 from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
 from gsjax.methods.object_tracker import find_object
 from gsjax.methods.protocols import LanguageEncoder
@@ -114,6 +116,11 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
 def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
     """Open the run and find the object; prints the scores of all.
 
+    Args:
+        options: the run and the text.
+        console: for the scores.
+        notes: told of what is odd.
+
     Raises:
         ValueError, OSError: as `ask_for_object`.
     """
@@ -144,7 +151,13 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
 
 
 def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
-    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged."""
+    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged.
+
+    Args:
+        view: of one camera.
+        mask: where the object is.
+        group: that of the object, for its colour.
+    """
     size = enlarged(mask.shape[1], mask.shape[0])
     image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
     # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
@@ -159,7 +172,13 @@ def enlarged(width: int, height: int) -> tuple[int, int]:
 
 
 def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
-    """The one view of each frame, with a progress bar."""
+    """The one view of each frame, with a progress bar.
+
+    Args:
+        frames: the views of each frame, one camera.
+        saved: the run.
+        console: for the bar.
+    """
     count = saved.tracking.num_frames
     for frame in track(frames, "rendering", total=count, console=console, transient=True):
         yield frame[0]

@@ -1,17 +1,14 @@
 """What an unfinished run leaves behind from time to time, so that another can go on from it."""
 
-import warnings
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cli.messages import describe
+from gsjax.cli.run import saving
 from gsjax.cli.track.loop import Tracking
-from gsjax.data.errors import DataWarning
 from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.object_tracker import (
@@ -26,9 +23,6 @@ from gsjax.methods.object_tracker.budget import Chosen, Costs, ladder
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
-EVERY_S = 20.0
-"""Seconds of tracking that a run may lose when it is killed."""
-
 
 class Saver:
     """Writes the state of a run into its folder `resume/`, and what poses have come since the last time.
@@ -39,18 +33,11 @@ class Saver:
     """
 
     def __init__(self, folder: Path, saved: int = 0):
-        self._folder, self._saved, self._at = folder, saved, perf_counter()
+        self._folder, self._saved, self._save = folder, saved, saving.Saver("tracking")
 
-    def __call__(self, tracking: Tracking, update: Tracked, last: bool) -> None:
-        """Save if the last time is `EVERY_S` ago, or this is the last; where the disk is full, say so."""
-        if not last and perf_counter() - self._at < EVERY_S:
-            return
-        try:
-            self._write(tracking, update)
-        except OSError as error:
-            message = f"could not save what --resume needs ({describe(error)}); tracking goes on"
-            warnings.warn(message, DataWarning, stacklevel=2)
-        self._at = perf_counter()
+    def __call__(self, tracking: Tracking, update: Tracked, *, last: bool) -> None:
+        """Save if the last time is long enough ago, or this is the last; where the disk is full, say so."""
+        self._save(lambda: self._write(tracking, update), last=last)
 
     def _write(self, tracking: Tracking, update: Tracked) -> None:
         for path in _parts(self._folder):

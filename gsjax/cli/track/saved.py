@@ -68,7 +68,11 @@ def open_run(path: Path) -> SavedRun:
 
 
 def read_tracking(path: Path) -> Tracking:
-    """The scene of scene.ply with the poses of trajectory.npz."""
+    """The scene of scene.ply with the poses of trajectory.npz.
+
+    Raises:
+        ValueError: they do not fit each other, or one of them is something else.
+    """
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
     arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
     means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]

@@ -1,80 +1,15 @@
 """Scores of a run, added up view by view so that memory stays flat, and the metrics that come of them."""
 
-from collections import defaultdict
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
 from gsjax.cli.recording import FirstMask, Recording, label_names
+from gsjax.cli.run.scores import Scores, camera_metrics, motion_metrics
 from gsjax.cli.track.loop import Tracking
-from gsjax.cli.track.views import View
 from gsjax.methods.object_tracker.budget import Chosen
-from gsjax.metrics.image import depth_error, psnr, ssim
-from gsjax.metrics.segmentation import LabelOverlap
 from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
-
-SMALLEST_FOR_SSIM = 11
-
-
-@dataclass
-class CameraScores:
-    """Scores of one camera, one entry a frame; NaN where there was nothing to compare."""
-
-    held_out: bool
-    values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-
-    def mean(self, name: str) -> float | None:
-        """The mean over frames of those that are finite; None without any."""
-        values = np.asarray(self.values.get(name, []), np.float64)
-        values = values[np.isfinite(values)]
-        return float(values.mean()) if len(values) else None
-
-
-class Scores:
-    """Pictures, depth and labels against what the cameras saw.
-
-    Args:
-        values: the mask value that each group of the scene stands for, [K+1]; None scores no labels.
-        robot: the robot's mask value, or None.
-    """
-
-    def __init__(self, values: np.ndarray | None, robot: int | None):
-        self._values, self._robot = values, robot
-        self.cameras: dict[int, CameraScores] = {}
-        self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
-        self.num_frames = 0
-
-    def add(self, view: View) -> None:
-        """Score one view."""
-        self.num_frames = max(self.num_frames, view.t + 1)
-        camera = self.cameras.setdefault(view.camera, CameraScores(view.held_out))
-        scored = {"psnr": psnr(view.render, view.image), "coverage": float(view.covered.mean())}
-        scored["psnr_covered"] = psnr(view.render, view.image, view.covered)
-        if min(view.image.shape[:2]) >= SMALLEST_FOR_SSIM:
-            scored["ssim"] = ssim(view.render, view.image)
-        if view.depth is not None:
-            error = depth_error(view.render_depth, view.depth)
-            scored |= {"depth_error_mm": error.mean_abs_mm, "depth_within_1cm": error.within_1cm}
-        if view.mask is not None and self._robot is not None:
-            inside = view.mask == self._robot
-            scored["psnr_robot"] = psnr(view.render, view.image, inside)
-            if "ssim" in scored:
-                scored["ssim_robot"] = ssim(view.render, view.image, inside)
-            if view.depth is not None:
-                error = depth_error(view.render_depth, view.depth, inside)
-                scored["depth_error_robot_mm"] = error.mean_abs_mm
-        for name, value in scored.items():
-            camera.values[name].append(value)
-        if view.mask is not None and self._values is not None:
-            self.overlaps[view.held_out].add(self._values[view.groups], view.mask)
-
-
-CAMERA_SCORES = (
-    *("psnr", "ssim", "coverage", "psnr_covered", "depth_error_mm", "depth_within_1cm"),
-    *("psnr_robot", "ssim_robot", "depth_error_robot_mm"),
-)
 
 
 def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> np.ndarray | None:
@@ -128,7 +63,16 @@ def metrics(
     values: np.ndarray | None,
 ) -> dict[str, Any]:
     """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
-    though some Gaussian may lie on it. docs/tracker.md says what each score means."""
+    though some Gaussian may lie on it. docs/tracker.md says what each score means.
+
+    Args:
+        tracking: the scene and its poses.
+        recording: what judges.
+        mask: the first one.
+        scores: of views.
+        motion: of objects, by mask value.
+        values: the mask value of each group, [K+1], or None.
+    """
     names = object_names(tracking, recording, mask, values)
     motion = {label: score for label, score in motion.items() if _members(tracking, values, label).any()}
     objects = {
@@ -157,16 +101,6 @@ def metrics(
     }
 
 
-def camera_metrics(scores: Scores) -> dict[str, Any]:
-    """Each score's mean over frames, by camera, and over the cameras of each kind."""
-    cameras = {
-        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
-        for camera, found in scores.cameras.items()
-    }
-    kinds = {kind: _mean_of(cameras, tracked=kind == "tracked") for kind in ("tracked", "held_out")}
-    return {"cameras": cameras, **kinds}
-
-
 def budget_metrics(chosen: Chosen) -> dict[str, Any]:
     """What was chosen for a budget, and why, for metrics.json."""
     tried = {
@@ -189,25 +123,9 @@ def object_names(
     }
 
 
-def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
-    fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
-    scored = {name: getattr(score, name, None) for name in fields}
-    return scored | {"gaussians_scored": 0 if score is None else score.num_scored}
-
-
 def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
     overlap = scores.overlaps[held_out]
     return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
-
-
-def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]:
-    """Each score's mean over the cameras of one kind."""
-    chosen = [found for found in cameras.values() if found["tracked"] == tracked]
-    means = {}
-    for name in CAMERA_SCORES:
-        there = [found[name] for found in chosen if found[name] is not None]
-        means[name] = float(np.mean(there)) if there else None
-    return means
 
 
 def _members(tracking: Tracking, values: np.ndarray | None, label: int) -> np.ndarray:
@@ -237,18 +155,32 @@ def _frames_lost(tracking: Tracking, values: np.ndarray | None, label: int) -> i
 def lost_over_frames(
     tracking: Tracking, values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates"]:
-    """In which updates the tracker held the object, or a part of it, for lost."""
+    """In which updates the tracker held the object, or a part of it, for lost.
+
+    Args:
+        tracking: the scene and what the tracker said of it.
+        values: the mask value of each group, [K+1], or None.
+        label: the object's.
+    """
     return _of_object(tracking, tracking.lost, values, label).any(axis=1)
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
-    """After which updates the tracker did not know how the object, or a part of it, is turned."""
+    """After which updates the tracker did not know how the object, or a part of it, is turned.
+
+    Args:
+        tracking, values, label: as for `lost_over_frames`.
+    """
     return ~_of_object(tracking, tracking.turn_known, values, label).all(axis=1)
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
     """The frame from which on, to the end, the tracker did not know how the object is turned, lost or not;
-    None if it knew at the end."""
+    None if it knew at the end.
+
+    Args:
+        tracking, values, label: as for `lost_over_frames`.
+    """
     known = np.flatnonzero(~turn_unknown(tracking, values, label))
     first = known[-1] + 2 if len(known) else 1
     return int(first) if first < tracking.num_frames else None

@@ -14,9 +14,9 @@ from rich.console import Console
 from gsjax.cli.distill.saved import Whereabouts
 from gsjax.cli.messages import Notes, say_error, stage
 from gsjax.cli.options import Common
-from gsjax.cli.track.outputs import write_png
 from gsjax.cli.view.viewables import open_viewable
 from gsjax.io.atomic import write_new
+from gsjax.io.pictures import write_png
 from gsjax.optim.compiler import host_options
 from gsjax.viz.viewer import Viewable, Viewer, open_viewer
 from gsjax.viz.viewer.server import PORT, is_loopback, load_viser

@@ -23,16 +23,11 @@ from gsjax.methods.object_tracker.features import (
 from gsjax.methods.object_tracker.grow import EMPTY, with_slots
 from gsjax.methods.object_tracker.layers import render_labels
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
+from gsjax.methods.object_tracker.plan import TrackerPlan, plan_tracker
 from gsjax.methods.object_tracker.query import Match, find_object
-from gsjax.methods.object_tracker.region import TrackerPlan
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.shapes import scene_from_shapes
-from gsjax.methods.object_tracker.tracker import (
-    TrackerBatch,
-    TrackerState,
-    object_tracker,
-    plan_tracker,
-)
+from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker
 from gsjax.methods.object_tracker.tracking import Tracked, first_state, start_scene, track
 
 __all__ = [

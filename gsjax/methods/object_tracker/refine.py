@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -10,6 +11,7 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import camera_centers
+from gsjax.losses.extra import ExtraLosses, extra_terms
 from gsjax.losses.photometric import weighted_mean
 from gsjax.methods.object_tracker.config import RefineConfig
 from gsjax.methods.object_tracker.motion import Motion, Pose, facing, group_means, move, place
@@ -18,6 +20,7 @@ from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.optim.residuals import block_residual
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import Rendered, render
 
 
@@ -33,7 +36,13 @@ class RefineBatch(NamedTuple):
 
 
 def refine_loss(
-    motion: Motion, batch: RefineBatch, *, step: Any, key: Any, config: RefineConfig
+    motion: Motion,
+    batch: RefineBatch,
+    *,
+    step: Any,
+    key: Any,
+    config: RefineConfig,
+    extra_losses: ExtraLosses = (),
 ) -> tuple[Float[Array, ""], dict[str, Any]]:
     """Truncated colour and depth differences over the region of interest, and what delta costs.
 
@@ -45,10 +54,11 @@ def refine_loss(
         batch: scene, frame, pose and plan.
         step, key: not used; they are part of a loss's form.
         config: limits and weights.
+        extra_losses: added to it (`gsjax.losses.extra`); their scene is a `TrackedScene` after the motion.
     """
     scene, frame = batch.scene, batch.frame
     groups = scene.labels[: scene.num_moving]
-    rendered, weights = _moved(motion, batch)
+    gaussians, rendered, weights = _moved(motion, batch)
     difference = jnp.minimum(jnp.abs(rendered.colors - frame.images), config.color_limit).mean(-1)
     # Sums over pixels, in units of a thousand: an object's pull does not depend on what else is in view.
     color = 1e-3 * jnp.sum(difference * weights)
@@ -66,6 +76,10 @@ def refine_loss(
         "overflow": rendered.meta.overflow.any(),
         "needed": rendered.meta.needed.max(),
     }
+    if extra_losses:
+        now = eqx.tree_at(lambda s: s.gaussians, scene, gaussians)
+        info["extra"] = extra_terms(extra_losses, now, rendered, frame)
+        loss += sum(info["extra"].values())
     return loss, info
 
 
@@ -92,7 +106,7 @@ def refine_residual(
         block, softness: of `block_residual`.
     """
     twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
-    rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
+    _, rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
     frame = batch.frame
     residual = partial(block_residual, block=block, softness=softness)
     residuals = {
@@ -105,19 +119,26 @@ def refine_residual(
     return residuals, {"overflow": rendered.meta.overflow.any(), "needed": rendered.meta.needed.max()}
 
 
-def _moved(motion: Motion, batch: RefineBatch) -> tuple[Rendered, Float[Array, "c height width"]]:
-    """The scene after the motion, and what each of its pixels counts."""
+def _moved(motion: Motion, batch: RefineBatch) -> tuple[Gaussians, Rendered, Float[Array, "c height width"]]:
+    """The scene after the motion, drawn, and what each of its pixels counts."""
     scene, cameras = batch.scene, batch.frame.cameras
     pose = move(batch.pose, motion, batch.centers, scene.labels[: scene.num_moving])
     visibility = facing(scene, pose, camera_centers(cameras.viewmat))
-    rendered = render(place(scene, pose), cameras, batch.plan, roi=batch.roi, visibility=visibility)
-    return rendered, jax.lax.stop_gradient(rendered.alphas) * batch.roi
+    gaussians = place(scene, pose)
+    rendered = render(gaussians, cameras, batch.plan, roi=batch.roi, visibility=visibility)
+    return gaussians, rendered, jax.lax.stop_gradient(rendered.alphas) * batch.roi
 
 
 def refine(
-    motion: Motion, batch: RefineBatch, config: RefineConfig
+    motion: Motion, batch: RefineBatch, config: RefineConfig, extra_losses: ExtraLosses = ()
 ) -> tuple[Motion, Float[Array, "b 3"] | None, dict[str, Any]]:
     """Adam from `motion`, with rates that fall to a tenth over the iterations.
+
+    Args:
+        motion: of groups and Gaussians, where to start.
+        batch: scene, frame, pose and plan.
+        config: rates, limits and weights.
+        extra_losses: beside that of pictures; see `refine_loss`.
 
     Returns:
         the motion, how far each Gaussian of the batch's background moved (None if that is frozen), info.
@@ -140,7 +161,7 @@ def refine(
     def loss(trained):
         motion, shifts = trained
         moved = batch if shifts is None else batch._replace(scene=shift_background(batch.scene, shifts))
-        return refine_loss(motion, moved, step=0, key=None, config=config)
+        return refine_loss(motion, moved, step=0, key=None, config=config, extra_losses=extra_losses)
 
     def iterate(carry, _):
         trained, state = carry
@@ -154,5 +175,5 @@ def refine(
     end, infos = jax.lax.scan(iterate, (trained, optimizer.init(trained)), None, length=config.iterations)
     motion, shifts = end[0]
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
-    info = {name: values[-1] for name, values in infos.items()}
+    info = jax.tree.map(lambda values: values[-1], infos)
     return motion, shifts, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}

@@ -1,55 +1,14 @@
 """Only what may change is refined: tiles a moving Gaussian touches, and the background that reaches them."""
 
-import dataclasses
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from gsjax.methods.object_tracker.scene import TrackedScene
-from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.gaussians import take
 from gsjax.scene.region import TILE
 from gsjax.scene.render import Rendered
-
-
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class TrackerPlan:
-    """Static capacities of a tracker's step.
-
-    Attributes:
-        full: for rendering the whole scene.
-        near: for rendering what lies in the region of interest.
-        num_near: background Gaussians that may lie there.
-    """
-
-    full: Plan
-    near: Plan
-    num_near: int
-
-    def grown(self, needed: "Needed", headroom: float) -> "TrackerPlan":
-        """The same with every capacity on the lowest rung that holds what was needed."""
-        return TrackerPlan(
-            self.full.grown(int(needed.full), headroom),
-            self.near.grown(int(needed.near), headroom),
-            max(self.num_near, rung(int(needed.num_near) * headroom)),
-        )
-
-
-class Needed(NamedTuple):
-    """What a step needed of each capacity."""
-
-    full: Int[Array, ""]
-    near: Int[Array, ""]
-    num_near: Int[Array, ""]
-
-    def exceeds(self, plan: TrackerPlan) -> Bool[Array, ""]:
-        """Whether any capacity was too small."""
-        num_near = self.num_near > plan.num_near
-        return (self.full > plan.full.capacity) | (self.near > plan.near.capacity) | num_near
 
 
 def near_background(

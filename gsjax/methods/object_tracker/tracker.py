@@ -8,26 +8,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.firsts import all_facing, as_last_seen, firsts_of, radii
 from gsjax.methods.object_tracker.layers import (
     Backdrop,
     Shown,
     are_same,
-    background_of,
     draw_backdrop,
     keep_backdrop,
-    moving_of,
-    plan_moving,
     reduced,
     render_labels,
     show_moving,
     shown_by,
-    thinned,
 )
 from gsjax.methods.object_tracker.lost import Confidence, confidence, is_found
 from gsjax.methods.object_tracker.matching import Template, lift, match_templates
-from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move, place
+from gsjax.methods.object_tracker.motion import Motion, Pose, group_means, move
+from gsjax.methods.object_tracker.plan import Needed, TrackerPlan
 from gsjax.methods.object_tracker.points import (
     Keyframe,
     Points,
@@ -53,21 +51,13 @@ from gsjax.methods.object_tracker.recover import (
     with_strangers,
 )
 from gsjax.methods.object_tracker.refine import RefineBatch, refine
-from gsjax.methods.object_tracker.region import (
-    Needed,
-    TrackerPlan,
-    near_background,
-    near_scene,
-    shift_background,
-    spread,
-)
+from gsjax.methods.object_tracker.region import near_background, near_scene, shift_background, spread
 from gsjax.methods.object_tracker.scene import TrackedScene
 from gsjax.methods.object_tracker.search import Watch, first_watch, judge, search
 from gsjax.optim.step import Step, all_finite, keep_if
-from gsjax.rasterize.plan import rung
 from gsjax.scene.frame import Frame
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
-from gsjax.scene.render import Rendered, plan_render, render
+from gsjax.scene.render import Rendered
 
 # Pixels that must show a group for it to be moved: fewer cannot decide six numbers. So many are enough, and
 # this share of what there once were, for what is small.
@@ -108,7 +98,13 @@ class _Last(NamedTuple):
     rendered: Rendered | None  # where the whole scene was drawn
 
 
-def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch, reduction: int = 1) -> Step:
+def object_tracker(
+    config: TrackerConfig,
+    num_objects: int,
+    first: TrackerBatch,
+    reduction: int = 1,
+    extra_losses: ExtraLosses = (),
+) -> Step:
     """The step of the object-aware tracker.
 
     params: the `Pose` of the moving Gaussians. state: `TrackerState`. batch: `TrackerBatch`.
@@ -127,7 +123,19 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         num_objects: groups that can move, K.
         first: the frame that the first pose shows, with the scene, for `init`.
         reduction: factor by which images shrink for template matching (objects larger than the template).
+        extra_losses: of one's own (`gsjax.losses.extra`), beside that of the refinement. Their scene is a
+            `TrackedScene`: what moves and the background near it, with labels. What they lead to is kept, for
+            they know what pixels do not, and `info["extra"]` has their values.
+
+    Raises:
+        ValueError: there are extra losses, and no refinement to add them to.
     """
+    if named_losses(extra_losses) and not config.refine.iterations:
+        raise ValueError(
+            "extra_losses: expected none where config.refine.iterations is 0, for they are added to the "
+            f"refinement's; found {len(extra_losses)}: take PRESETS['paper'], or set redraw to all and "
+            "refine.iterations above 0"
+        )
     keep = config.redraw == "moving"
 
     def init(params: Pose) -> TrackerState:
@@ -262,7 +270,9 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
         needed, info, shifted = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
         if config.refine.iterations:
             assert last.rendered is not None
-            refined, shifted, needed, info = _refine(begun, params, centers, last.rendered, batch, config)
+            refined, shifted, needed, info = _refine(
+                begun, params, centers, last.rendered, batch, config, extra_losses
+            )
             if shifted is not None:
                 scene = shift_background(scene, shifted)
             # Points know nothing of outlines, which rendered images do, so these are overruled only where
@@ -270,6 +280,8 @@ def object_tracker(config: TrackerConfig, num_objects: int, first: TrackerBatch,
             lead = 0.1 if frame.depths is None else 0.01
             of_refined = judge(refined.twists, points, centers, sight, config.align)
             better = of_refined - lead <= residual
+            if extra_losses:  # of which points know nothing either
+                better = jnp.ones_like(better)
             kept = _select(better, refined, begun, groups)
             residual = jnp.where(better, of_refined, residual)
         kept = _select(visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
@@ -349,7 +361,15 @@ def _match(template: Template | None, frame: Frame, num_objects: int, config: Tr
     return *lift(match, frame, config.match), match.score
 
 
-def _refine(begun: Motion, params: Pose, centers, last: Rendered, batch: TrackerBatch, config: TrackerConfig):
+def _refine(
+    begun: Motion,
+    params: Pose,
+    centers,
+    last: Rendered,
+    batch: TrackerBatch,
+    config: TrackerConfig,
+    extra_losses: ExtraLosses,
+):
     """Refined motion, shifts of the background (None if that is frozen), capacities needed, and info."""
     scene, frame, plan, _ = batch
     groups = scene.labels[: scene.num_moving]
@@ -358,7 +378,7 @@ def _refine(begun: Motion, params: Pose, centers, last: Rendered, batch: Tracker
     around = near_scene(scene, near, plan.num_near)
     roi = tiles_to_pixels(tiles, frame)
     refine_batch = RefineBatch(around, frame, plan.near, params, centers, roi)
-    refined, shifts, info = refine(begun, refine_batch, config.refine)
+    refined, shifts, info = refine(begun, refine_batch, config.refine, extra_losses)
     needed = Needed(jnp.int32(0), info.pop("needed"), near.sum())
     return refined, None if shifts is None else spread(near, shifts), needed, info
 
@@ -369,22 +389,3 @@ def _select(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "
         jnp.where(chosen[:, None], a.twists, b.twists),
         jnp.where(chosen[groups - 1][:, None], a.delta, b.delta),
     )
-
-
-def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackerConfig) -> TrackerPlan:
-    """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds."""
-    headroom = config.headroom
-    if config.redraw == "moving":
-        views, moving = (
-            reduced(frame.cameras, config.coarseness),
-            thinned(moving_of(scene, pose), config.coarseness),
-        )
-        full = plan_render(background_of(scene), views, headroom=headroom)
-        near = plan_moving(moving, views, headroom)
-        return TrackerPlan(full, near, 0)
-    full = plan_render(place(scene, pose), frame.cameras, headroom=headroom)
-    rendered = render(place(scene, pose), frame.cameras, full)
-    near = near_background(scene, rendered, touched_tiles([pose.means], frame))
-    num_near = rung(int(near.sum()) * headroom)
-    around = near_scene(scene, near, num_near)
-    return TrackerPlan(full, plan_render(place(around, pose), frame.cameras, headroom=headroom), num_near)

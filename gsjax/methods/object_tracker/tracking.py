@@ -11,19 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.object_tracker.budget import Chosen, Costs, Governor, choose, ladder
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
 from gsjax.methods.object_tracker.grow import empty_slots, grow, with_slots
 from gsjax.methods.object_tracker.motion import Pose, first_pose, place
-from gsjax.methods.object_tracker.region import TrackerPlan, shift_background
+from gsjax.methods.object_tracker.plan import TrackerPlan, plan_tracker
+from gsjax.methods.object_tracker.region import shift_background
 from gsjax.methods.object_tracker.scene import TrackedScene, labelled_cloud, scene_from_cloud
-from gsjax.methods.object_tracker.tracker import (
-    TrackerBatch,
-    TrackerState,
-    object_tracker,
-    plan_tracker,
-)
+from gsjax.methods.object_tracker.tracker import TrackerBatch, TrackerState, object_tracker
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import keep_if
 from gsjax.scene.frame import Frame, part_of, without_broken
@@ -97,11 +94,20 @@ def first_state(
     return _first_state(pose, TrackerBatch(scene, first, plan), config, scene.num_objects)
 
 
-@partial(jax.jit, static_argnames=("config", "num_objects", "reduction"))
-def _update(pose, state, batch, step, config: TrackerConfig, num_objects: int, reduction: int):
+@partial(jax.jit, static_argnames=("config", "num_objects", "reduction", "extra_losses"))
+def _update(
+    pose,
+    state,
+    batch,
+    step,
+    config: TrackerConfig,
+    num_objects: int,
+    reduction: int,
+    extra_losses: ExtraLosses,
+):
     frame, broken = without_broken(part_of(batch.frame, config.cameras, config.shrink))
     batch = batch._replace(frame=frame)
-    tracker = object_tracker(config, num_objects, batch, reduction)
+    tracker = object_tracker(config, num_objects, batch, reduction, extra_losses)
     with jax.default_matmul_precision("highest"):  # poses compound: no TF32 on GPUs that have it
         pose, state, info = tracker.update(pose, state, batch, step=step, key=None)
     shown, background, scene = info.pop("shown"), info.pop("background"), batch.scene
@@ -136,6 +142,7 @@ def track(
     *,
     budget_ms: float | None = None,
     after: Tracked | None = None,
+    extra_losses: ExtraLosses = (),
 ) -> Iterator[Tracked]:
     """Follow the objects of `scene` through `frames` (those after the first one), one `Tracked` a frame.
 
@@ -150,13 +157,21 @@ def track(
         budget_ms: what an update may take, milliseconds. The richest settings that keep to it are then chosen
             by measured cost, and of `config` only what says how a scene starts is used (see `budget`).
         after: the update to go on from, with its scene, state and settings; the first frame unless given.
+        extra_losses: functions `loss(scene, rendered, frame)` of one's own beside the refinement's loss; see
+            `object_tracker`.
 
     Raises:
-        ValueError: a frame has other shapes than the first one, or the budget is not above 0.
+        ValueError: a frame has other shapes than the first one, the budget is not above 0, or there are extra
+            losses and no refinement to add them to.
     """
     config = TrackerConfig() if config is None else config
     if budget_ms is not None and not budget_ms > 0:
         raise ValueError(f"budget_ms: expected milliseconds above 0, found {budget_ms}")
+    if budget_ms is not None and extra_losses:
+        raise ValueError(
+            "extra_losses: expected none under budget_ms, whose settings have no refinement to add them to; "
+            "leave one of the two out"
+        )
     chosen = None
     if after is not None:
         scene, pose, chosen = after.scene, after.pose, after.chosen
@@ -175,7 +190,7 @@ def track(
             measure = partial(_measured, scene, pose, first, second)
             chosen = choose(ladder(config, len(first.images)), measure, budget_ms / 1e3, count)
         config, governor = chosen.config, Governor(budget_ms / 1e3, chosen.costs, count)
-    run = _Runner(scene, pose, first, config)
+    run = _Runner(scene, pose, first, config, extra_losses)
     state = first_state(scene, pose, first, config, run.plan) if after is None else after.state
     usually = count if config.align.everywhere is None else min(config.align.everywhere, count)
     for index, frame in enumerate(frames):
@@ -194,12 +209,24 @@ def track(
 class _Runner:
     """The compiled update of one configuration, compiled again where a plan has become too small."""
 
-    def __init__(self, scene: TrackedScene, pose: Pose, first: Frame, config: TrackerConfig):
+    def __init__(
+        self,
+        scene: TrackedScene,
+        pose: Pose,
+        first: Frame,
+        config: TrackerConfig,
+        extra_losses: ExtraLosses = (),
+    ):
         first, _ = without_broken(part_of(first, config.cameras, config.shrink))
         self.plan = plan_tracker(scene, pose, first, config)
         self._config = config
         reduction = _reduction(scene, first, config)
-        self._static = {"config": config, "num_objects": scene.num_objects, "reduction": reduction}
+        self._static = {
+            "config": config,
+            "num_objects": scene.num_objects,
+            "reduction": reduction,
+            "extra_losses": extra_losses,
+        }
         self._compiled: dict[TrackerPlan, Any] = {}
 
     def __call__(self, scene, pose, state, frame: Frame, index: int, everywhere: int):

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from gsjax.cli.deform.data import deform_data
-from gsjax.cli.distill.teacher import Asked
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.messages import Notes
 from gsjax.data import open_sequence
 
@@ -30,7 +30,7 @@ def recording(masked=range(10), names=NAMES):
 def read(sequence, tools="leave-out", tool_values=(), features="auto"):
     console = Console(quiet=True)
     notes = Notes(console)
-    told = (tools, None if features == "none" else Asked(features), 8, tool_values, notes, console)
+    told = (tools, None if features == "none" else TeacherChoice(features), 8, tool_values, notes, console)
     return deform_data(sequence, 8, *told), " ".join(notes.all)
 
 

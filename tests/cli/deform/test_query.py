@@ -17,7 +17,7 @@ from gsjax.cli import main
 from gsjax.cli.deform.command import Options, write_scene
 from gsjax.cli.deform.data import deform_data
 from gsjax.cli.deform.file import read_deformation, write_deformation
-from gsjax.cli.distill.teacher import Asked
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.messages import Notes
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.view.viewables import open_viewable
@@ -41,7 +41,8 @@ FAINT = 0.3  # of a feature's length
 def taught(tmp_path_factory):
     """A run whose Gaussians in the lower left of frame 1 are tool, and all others tissue."""
     run, console = tmp_path_factory.mktemp("taught") / "run", Console(quiet=True)
-    data = deform_data(open_sequence(SCENE), 8, "draw", Asked("classes"), 4, (), Notes(console), console)
+    told = ("draw", TeacherChoice("classes"), 4, ())
+    data = deform_data(open_sequence(SCENE), 8, *told, Notes(console), console)
     moves = DeformationConfig(resolution=8, time_resolution=4, levels=1)
     config = SurgicalConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
     problem, state = begin_surgical(data.looks, config, data.codes)

@@ -18,8 +18,8 @@ from gsjax.cli.deform.data import deform_data
 from gsjax.cli.deform.file import read_deformation, write_deformation
 from gsjax.cli.deform.prompts import wanted_like, wanted_text
 from gsjax.cli.deform.teacher import GROUPS, Meaning, basis_of, groups_of
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.distill.source import Source
-from gsjax.cli.distill.teacher import Asked
 from gsjax.cli.messages import Notes
 from gsjax.cli.run import learning
 from gsjax.data import open_sequence
@@ -66,7 +66,7 @@ def query(run, *options):
 
 def data_of(features, folder, channels=4, **asked):
     console = Console(quiet=True)
-    given = (Asked(str(features), **asked), channels, (), notes := Notes(console), console)
+    given = (TeacherChoice(str(features), **asked), channels, (), notes := Notes(console), console)
     return deform_data(open_sequence(SCENE), 8, "draw", *given), " ".join(notes.all)
 
 
@@ -180,7 +180,7 @@ def test_one_kind_of_thing_is_one_group(tmp_path):
 
 def test_cells_of_which_a_tool_has_a_part_do_not_count(files):
     seen, console = open_sequence(SCENE), Console(quiet=True)
-    given = ("leave-out", Asked(str(files)), 4, (), Notes(console), console)
+    given = ("leave-out", TeacherChoice(str(files)), 4, (), Notes(console), console)
     data = deform_data(seen, 8, *given)
     mask = seen.mask(data.train[0], 0) > 0
     cells = mask.reshape(13, 4, 16, 4).any(axis=(1, 3))
@@ -199,7 +199,7 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
     whole = replace(open_sequence(SCENE), locate=lambda kind, t, c: f"{tmp_path}/frame-{t:06d}.color.png")
     seen = whole.select(frames=range(2, 10)).scaled(0.5)
     console = Console(quiet=True)
-    given = ("draw", Asked(str(tmp_path)), 4, (), Notes(console), console)
+    given = ("draw", TeacherChoice(str(tmp_path)), 4, (), Notes(console), console)
     found = deform_data(seen, 8, *given)
     assert sorted(found.held_out) == [1]
     ids, codes = found.said(0)

@@ -19,10 +19,11 @@ from gsjax.cli.distill import command as distill
 from gsjax.cli.distill import scores as field_scores
 from gsjax.cli.distill import teacher as field_teacher
 from gsjax.cli.distill.cache import FeatureCache
+from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.distill.command import Options
 from gsjax.cli.distill.results import draw_features, feature_colors
 from gsjax.cli.distill.scores import class_maps, classes_of, one_by_one
-from gsjax.cli.distill.teacher import Asked, Teaching
+from gsjax.cli.distill.teacher import Teaching
 from gsjax.cli.run import learning
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
@@ -157,7 +158,7 @@ THREE, TWO, OTHER = np.array([[0, 0, 1, 2]] * 3), np.array([[0, 0, 1, 1]] * 3), 
 @pytest.mark.parametrize("features", ["classes", "closed"])
 def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_path, features):
     shown = photographs([THREE, TWO, OTHER, None])
-    said = taught(shown, [0], Asked(features), tmp_path)
+    said = taught(shown, [0], TeacherChoice(features), tmp_path)
     assert said.source.names == {1: "background", 2: "object 1", 3: "object 2"}
     alone, others, nobody = (said.of(i) for i in (1, 2, 3))
     assert alone.dimension == others.dimension == said.teacher.dimension
@@ -166,7 +167,7 @@ def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_pa
         code = said.source.encoder().embed_text("object 1")
         np.testing.assert_array_equal(others.codebook[others.ids[0][0, 8]], code / np.linalg.norm(code))
         assert others.ids[0][0, 4] == -1  # nobody taught what 5 is
-    one_more = taught(photographs([TWO, THREE]), [0], Asked(features), tmp_path)
+    one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features), tmp_path)
     assert one_more.source.names == {1: "background", 2: "foreground"}
     assert one_more.of(1).dimension == one_more.teacher.dimension
 
@@ -180,7 +181,8 @@ def test_outlines_can_be_put_on_edges(tmp_path):
         load_image=lambda i: np.uint8(200 * true[..., None] + 30).repeat(3, 2),
         load_labels=lambda i: off,
     )
-    as_they_are, snapped = (taught(shown, [0], Asked("classes", snap=n), tmp_path).teacher for n in (0, 2))
+    choices = [TeacherChoice("classes", snap=pixels) for pixels in (0, 2)]
+    as_they_are, snapped = (taught(shown, [0], choice, tmp_path).teacher for choice in choices)
     thing = {k: t.ids[0] == t.ids[0][6, 8] for k, t in (("off", as_they_are), ("on", snapped))}
     np.testing.assert_array_equal(thing["off"], off == 1)
     assert (
@@ -189,7 +191,7 @@ def test_outlines_can_be_put_on_edges(tmp_path):
         > (off & true).sum() / (off | true).sum()
     )
     with pytest.raises(ValueError, match="--snap: expected 0 or more pixels, found -1"):
-        Asked(snap=-1).check()
+        TeacherChoice(snap=-1).check()
 
 
 def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
@@ -203,7 +205,7 @@ def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ClassCodebook, "embed_objects", counted)
     large = np.array([[0, 26003, 7, 7]] * 3, np.int32)
-    said = taught(photographs([large, THREE], {26003: "car", 7: "road"}), [0], Asked(), tmp_path)
+    said = taught(photographs([large, THREE], {26003: "car", 7: "road"}), [0], TeacherChoice(), tmp_path)
     assert said.source.names == {1: "background", 8: "road", 26004: "car"}
     code = ClassCodebook({1: "car"}).embed_text("car")
     np.testing.assert_allclose(said.teacher.codebook[said.teacher.ids[0][0, 4]], code, atol=1e-6)
@@ -218,14 +220,14 @@ def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeyp
         "gsjax.perception.sam.load_sam", lambda path: lambda image, depth, K: image[..., 0] // 64
     )
     monkeypatch.setattr(field_teacher, "folder_digest", lambda path: digested.append(path) or "digest")
-    said = taught(photographs([None] * 3), [0, 1, 2], Asked("closed", sam=weights), tmp_path)
+    said = taught(photographs([None] * 3), [0, 1, 2], TeacherChoice("closed", sam=weights), tmp_path)
     assert (said.masks, digested) == ("sam", [weights])
 
 
 def test_features_of_files_are_found_by_all_photographs(tmp_path):
     shown, maps = photographs([None] * 3), np.random.default_rng(0).normal(size=(3, 3, 4, 5))
     np.save(tmp_path / "level_0.npy", maps)  # LERF's: those of all pictures, in order
-    said = taught(shown, [0, 2], Asked(str(tmp_path)), tmp_path)
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
     cosines = np.einsum("hwd,hwd->hw", said.teacher.maps[1], maps[2]) / np.linalg.norm(maps[2], axis=-1)
     np.testing.assert_allclose(cosines, np.linalg.norm(said.teacher.maps[1], axis=-1), rtol=1e-5)
     assert said.of(1).maps[0].shape == (3, 4, 5)
@@ -233,7 +235,7 @@ def test_features_of_files_are_found_by_all_photographs(tmp_path):
     for i in (0, 2):
         (tmp_path / f"cam{i}").mkdir()
         np.save(tmp_path / f"cam{i}/a.npy", maps[i])
-    said = taught(shown, [0, 2], Asked(str(tmp_path)), tmp_path)  # held-out ones need not be there
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)  # held-out ones need not be there
     with pytest.raises(FileNotFoundError, match=r"cam1/a\.png"):
         said.of(1)
     (tmp_path / "cam1").mkdir()
@@ -242,12 +244,12 @@ def test_features_of_files_are_found_by_all_photographs(tmp_path):
         said.of(1)
     np.save(tmp_path / "cam2/a.npy", maps[2, :, :1])
     with pytest.raises(ValueError, match=r"cam2/a\.npy: expected features .* cam2/a\.png, 16x12, found 1x3"):
-        taught(shown, [0, 2], Asked(str(tmp_path)), tmp_path)
+        taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
 
 
 def test_photographs_without_masks_are_named(tmp_path):
     with pytest.warns(DataWarning, match=r"teach nothing: cam1/a\.png, cam3/a\.png$"):
-        said = taught(photographs([THREE, None, TWO, None]), [0, 1, 2, 3], Asked(), tmp_path)
+        said = taught(photographs([THREE, None, TWO, None]), [0, 1, 2, 3], TeacherChoice(), tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert said.of(1) is None
@@ -358,11 +360,11 @@ def test_a_run_is_told_by_what_paths_mean_not_by_how_they_are_typed(monkeypatch,
 
     def settings(base):
         told = Options(base / "scene.ply", features=str(base / "features"), sam=base / "sam")
-        asked = Asked(told.features, sam=told.sam)
+        asked = TeacherChoice(told.features, sam=told.sam)
         return distill._settings(told, asked)
 
     assert settings(Path()) == settings(tmp_path)
-    asked = Asked("clip", weights=Path("clip"))
+    asked = TeacherChoice("clip", weights=Path("clip"))
     named = distill._settings(Options(Path("run"), features="clip", weights=Path("clip")), asked)
     assert (named.features, named.weights) == ("clip", tmp_path / "clip")
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import gsjax.cli.run.saving
 import gsjax.cli.track.loop
 import gsjax.cli.track.resume
 import gsjax.methods.object_tracker
@@ -73,7 +74,7 @@ def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, 
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(gsjax.cli.track.resume, "EVERY_S", -1.0)
+    monkeypatch.setattr(gsjax.cli.run.saving, "EVERY_S", -1.0)
     monkeypatch.setattr(gsjax.cli.track.resume, "write_npz", full)
     code, said = gsjax_track(pristine, "--cameras", "0")
     assert code == 0, said
@@ -100,7 +101,7 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
         monkeypatch.setattr(gsjax.cli.track.resume, "save_checkpoint", lambda path, *_, save=save: save(path))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            saver(tracked_up_to(frames), update, True)
+            saver(tracked_up_to(frames), update, last=True)
     assert len(written) == 2
     saved = gsjax.cli.track.resume._saved_poses(tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0]))
     assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))

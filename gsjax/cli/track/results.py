@@ -1,24 +1,15 @@
 """A run in words: the tables at the end of the terminal, and the same on the report's page."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
-from rich.table import Table as Grid
 
 from gsjax.cli.machine import in_words
 from gsjax.cli.run.folder import RunFolder
-from gsjax.cli.run.report import Media, Table, format_number, write_report
-
-
-class Column(NamedTuple):
-    """A column of a table: its head, the metric in it, the unit, and digits behind the point."""
-
-    head: str
-    key: str
-    unit: str = ""
-    decimals: int | None = None
-
+from gsjax.cli.run.report import Media, format_number, write_report
+from gsjax.cli.run.scores import CAMERA_COLUMNS, camera_rows
+from gsjax.cli.run.tables import Column, grid, table, time_table
 
 OBJECT_COLUMNS = (
     Column("object", "name"),
@@ -33,16 +24,6 @@ OBJECT_COLUMNS = (
     Column("IoU held out", "iou_held_out", "", 3),
     Column("mask", "mask_pixels", "pixels"),
     Column("Gaussians", "gaussians"),
-)
-CAMERA_COLUMNS = (
-    Column("camera", "name"),
-    Column("", "kind"),
-    Column("PSNR", "psnr", "dB", 2),
-    Column("SSIM", "ssim", "", 3),
-    Column("depth error", "depth_error_mm", "mm", 1),
-    Column("drawn", "coverage", "%", 1),
-    Column("PSNR drawn", "psnr_covered", "dB", 2),
-    Column("PSNR robot", "psnr_robot", "dB", 2),
 )
 TIMES = (
     ("preparing", "opening the recording, the first mask; drawing it if simulated"),
@@ -72,25 +53,7 @@ def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, Any]]:
-    """One row a camera, by the keys of `CAMERA_COLUMNS`; one that is not held out is called `seen`."""
-    return [
-        {
-            **scored,
-            "name": camera,
-            "kind": seen if scored["tracked"] else "held out",
-            "coverage": None if scored["coverage"] is None else 100 * scored["coverage"],
-        }
-        for camera, scored in found["cameras"].items()
-    ]
-
-
-def _shown(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> list[Column]:
-    """The columns in which something stands."""
-    return [column for column in columns if any(row.get(column.key) is not None for row in rows)]
-
-
-def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
+def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
     """Print objects, cameras, the rate and where the report is, to stdout."""
     console = Console(highlight=False)
     console.print()
@@ -111,26 +74,17 @@ def print_summary(folder: RunFolder, found: dict[str, Any]) -> None:
     console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
 
 
-def grid(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> Grid:
-    """The columns in which something stands, for the terminal."""
-    drawn = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    shown = _shown(columns, rows)
-    for column in shown:
-        text = any(isinstance(row.get(column.key), str) for row in rows)
-        *first, last = column.head.split(" ", 1)
-        head = "\n".join([*first, last] if first else ["", last])
-        unit = f"\n[dim]{column.unit}[/]" if any(c.unit for c in shown) else ""
-        drawn.add_column(head + unit, justify="left" if text else "right", no_wrap=True)
-    for row in rows:
-        drawn.add_row(*(format_number(row.get(c.key), c.decimals) for c in shown))
-    drawn.add_row()
-    return drawn
-
-
-def write_run_report(
+def write_results(
     folder: RunFolder, found: dict[str, Any], plots: list[tuple[Path, str]], first_mask: Path | None
 ) -> None:
-    """Writes report.html."""
+    """Writes report.html.
+
+    Args:
+        folder: of the run.
+        found: what metrics.json holds.
+        plots: files with their captions.
+        first_mask: its picture, or None.
+    """
     caption = f"Where objects come from: the first mask of camera {found['mask']['camera']}"
     write_report(
         folder.report,
@@ -188,22 +142,6 @@ def _headline(found: dict[str, Any]) -> dict[str, Any]:
     if found["held_out"]["psnr"] is not None:
         cards["PSNR, held out"] = (format_number(found["held_out"]["psnr"], 1), "dB")
     return cards | {"Gaussians": found["gaussians"]["all"], "Frames": found["frames"]["tracked"]}
-
-
-def table(title: str, columns: tuple[Column, ...], rows: list[dict[str, Any]], note: str) -> list[Table]:
-    """The table with the columns in which something stands; none if there are no rows."""
-    if not rows:
-        return []
-    shown = _shown(columns, rows)
-    cells = [[row.get(c.key) for c in shown] for row in rows]
-    heads, units = [c.head for c in shown], [c.unit for c in shown]
-    return [Table(title, heads, cells, units, note, [c.decimals for c in shown])]
-
-
-def time_table(times: tuple[tuple[str, str], ...], seconds: dict[str, float]) -> Table:
-    """Where time went: `times` has the name of each stage, and what it does."""
-    rows = [[says, seconds.get(name)] for name, says in times]
-    return Table("Time", ("what", "time"), rows, ("", "s"), decimals=(None, 2))
 
 
 def _cameras(ids: list[int]) -> str:

@@ -1,0 +1,137 @@
+"""A loss of one's own beside a method's: it pulls where it should, by the right gradient, and costs nothing
+where there is none."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.losses.extra import extra_terms
+from gsjax.methods.object_tracker import AlignConfig, track
+from gsjax.methods.object_tracker.config import RefineConfig
+from gsjax.methods.object_tracker.motion import Motion
+from gsjax.methods.object_tracker.refine import refine, refine_loss
+from tests.methods.test_refine import batch_after
+
+CALLS = []
+
+
+def upwards(scene, rendered, frame):
+    """The first group is to rise, before anything else."""
+    CALLS.append(1)
+    return -1e3 * jnp.mean(scene.gaussians.means[:, 2], where=scene.labels == 1)
+
+
+def brighter(scene, rendered, frame):
+    """What is drawn is to be brighter than what was seen."""
+    return jnp.mean((rendered.colors - frame.images - 1.0) ** 2)
+
+
+def nothing(scene, rendered, frame):
+    return jnp.zeros(())
+
+
+@pytest.fixture
+def batch():
+    batch = batch_after([0.02, -0.01, -0.015, 0.0, 0.1, 0.05])  # which has sunk
+    return batch._replace(plan=replace(batch.plan, derivative="reverse"))
+
+
+def still(batch):
+    return Motion(jnp.zeros((1, 6)), jnp.zeros_like(batch.pose.means))
+
+
+class TestInRefinement:
+    @pytest.mark.usefixtures("x64")
+    @pytest.mark.parametrize("loss", [upwards, brighter])
+    def test_its_derivative_is_that_of_differences(self, loss):
+        batch = batch_after([0.01, 0.0, 0.0, 0.0, 0.05, 0.0])
+        # Nothing is left out of a picture, however faint: differences would jump where derivatives do not.
+        room = replace(batch.plan, capacity=200_000)
+        batch = batch._replace(plan=replace(room, alpha_min=1e-9, min_transmittance=1e-12))
+        direction = jnp.asarray([[0.3, -0.2, 0.5, 1.0, -1.0, 0.5]])
+
+        @jax.jit
+        def both(along):
+            """Of the motion along a line: the loss with it, and without."""
+            motion = Motion(along * direction, jnp.zeros_like(batch.pose.means))
+            of = {"step": 0, "key": None, "config": RefineConfig()}
+            value, info = refine_loss(motion, batch, extra_losses=(loss,), **of)
+            return value - refine_loss(motion, batch, **of)[0], info["extra"]
+
+        # Forward mode, for which this batch's plan is made; `refine` takes the other one, below.
+        (value, told), (found, _) = jax.jvp(both, (1e-3,), (1.0,))
+        step = 1e-6
+        expected = (both(1e-3 + step)[0] - both(1e-3 - step)[0]) / (2 * step)
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+        assert abs(expected) > 1e-3
+        np.testing.assert_allclose(value, told[loss.__name__], rtol=1e-6)
+
+    def test_it_pulls_and_its_value_is_told(self, batch):
+        config = RefineConfig(iterations=5)
+        plain, _, info = refine(still(batch), batch, config)
+        pulled, _, told = refine(still(batch), batch, config, (upwards, nothing))
+        assert pulled.twists[0, 2] > 1e-3 > plain.twists[0, 2]
+        assert told["extra"].keys() == {"upwards", "nothing"}
+        assert "extra" not in info
+
+    def test_one_of_zero_leaves_every_bit(self, batch):
+        config = RefineConfig(iterations=2)
+        plain, _, info = refine(still(batch), batch, config)
+        with_zero, _, told = refine(still(batch), batch, config, (nothing,))
+        jax.tree.map(np.testing.assert_array_equal, plain, with_zero)
+        np.testing.assert_array_equal(info["loss"], told["loss"])
+
+
+@pytest.fixture(scope="module")
+def config(quick):
+    align = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
+    return replace(quick, align=align, matching=False, headroom=1.52)
+
+
+def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
+    _, frames, _ = table()
+    *_, plain = track(started, frames[0], frames[1:], config)
+    calls, heights = [], []
+    CALLS.clear()
+    for now in track(started, frames[0], frames[1:], config, extra_losses=(upwards,)):
+        calls.append(len(CALLS))
+        heights.append(float(now.info["extra"]["upwards"]))
+    assert calls[0] > 0
+    assert calls == calls[:1] * len(calls)  # nothing was traced after the first frame
+
+    def lift(tracked, group):
+        member = np.asarray(tracked.scene.labels[: tracked.scene.num_moving]) == group
+        return float(np.asarray(tracked.pose.means)[member, 2].mean())
+
+    assert plain.info["visible"][0]
+    assert lift(now, 1) > lift(plain, 1) + 2e-3
+    assert abs(lift(now, 2) - lift(plain, 2)) < 1e-3
+    assert heights[-1] < heights[0]
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("losses", "said"),
+        [
+            ([nothing], r"expected a tuple of functions, \(loss,\) for one, found list"),
+            (nothing, "found function"),
+            ((1.0,), "expected functions loss"),
+            ((nothing, nothing), "two named 'nothing'"),
+            ((lambda *_: jnp.zeros(3),), r"expected a scalar of <lambda>, found shape \(3,\)"),
+            ((lambda *_: None,), "expected a scalar of <lambda>, found None"),
+        ],
+    )
+    def test_what_is_no_loss_is_refused(self, losses, said):
+        with pytest.raises(ValueError, match=f"extra_losses: .*{said}"):
+            extra_terms(losses, None, None, None)
+
+    def test_a_tracker_that_refines_nothing_has_no_use_for_one(self, table, started, config):
+        _, frames, _ = table()
+        without = replace(config, refine=replace(config.refine, iterations=0))
+        with pytest.raises(ValueError, match=r"extra_losses: expected none where config\.refine\.iterations"):
+            next(track(started, frames[0], frames[1:], without, extra_losses=(nothing,)))
+        with pytest.raises(ValueError, match="extra_losses: expected none under budget_ms"):
+            next(track(started, frames[0], frames[1:], config, budget_ms=50.0, extra_losses=(nothing,)))
