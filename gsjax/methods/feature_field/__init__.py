@@ -5,11 +5,11 @@
     for distilled in distill(problem, state): ...
     scores = relevancy(gaussian_cosines(field, located, queries))
 
-config.py    what can be set              distill.py   the losses, and one step
-teacher.py   what pixels are to say       training.py  the loop on the host
-field.py     hash grid and convolution    query.py     what a query means
-inverse.py   from the teacher's channels back to the field's
-votes.py     labels by majority, to be held against
+    config.py    what can be set              distill.py   the losses, and one step
+    teacher.py   what pixels are to say       training.py  the loop on the host
+    field.py     hash grid and convolution    query.py     what a query means
+    inverse.py   from the teacher's channels back to the field's
+    votes.py     labels by majority, to be held against
 """
 
 from gsjax.methods.feature_field.config import FieldConfig, FieldRatesConfig, FieldWeightsConfig

@@ -8,12 +8,12 @@
     for refined in refine(views, parts, config): parts = refined.parts
     scene, trajectory = outcome(start, parts, times)
 
-config.py    what can be set              stream.py   one step of the optimisation
-anchor.py    which frame is canonical     unify.py    which parts are one
-masks.py     what moves in every view     follow.py   the loop over frames
-lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
-weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
-discover.py  all that, before any motion  refine.py   all frames together, in the end
+    config.py    what can be set              stream.py   one step of the optimisation
+    anchor.py    which frame is canonical     unify.py    which parts are one
+    masks.py     what moves in every view     follow.py   the loop over frames
+    lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
+    weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
+    discover.py  all that, before any motion  refine.py   all frames together, in the end
 """
 
 from gsjax.methods.motion_parts.anchor import Anchor, choose_anchor, moved_pixels

@@ -4,9 +4,9 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     problem, state = begin(views, config, cloud)
     for fitted in fit(problem, state): ...
 
-config.py  what can be set            start.py  the first Gaussians
-model.py   what a fit may change      step.py   the loss, and one step
-fit.py     the loop on the host       pruning.py  what no photograph needs
+    config.py  what can be set            start.py  the first Gaussians
+    model.py   what a fit may change      step.py   the loss, and one step
+    fit.py     the loop on the host       pruning.py  what no photograph needs
 """
 
 from gsjax.methods.reconstruction.config import (

@@ -1,0 +1,224 @@
+"""Makes the gallery, docs/gallery.md with its pictures in docs/gallery, and the figure of all trades.
+
+    .venv/bin/python docs/make_gallery.py            # `make gallery`
+
+Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet: MINUTES on two
+cores. Figures of experiments are shown from where they are committed, and nothing is measured here.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from gsjax.io.video import read_video_frames
+
+ROOT = Path(__file__).resolve().parents[1]
+RUNS, PICTURES, PAGE = ROOT / "runs/gallery", ROOT / "docs/gallery", ROOT / "docs/gallery.md"
+WIDTH, QUALITY = 900, 85  # of a picture, pixels at most, and of its JPEG
+
+TABLE = "simulated:tabletop?width=160&height=120&frames=1"
+TISSUE = "simulated:tissue?width=160&height=128&frames=16"
+FURNITURE = "simulated:articulated?width=200&height=150&frames=10"
+COMMANDS = {
+    "demo": f"track simulated:tabletop?width=240&height=180 --out {RUNS}/demo --frames 0:30 --cameras 0 1 "
+    "--mask-camera 1 --eval-cameras 2 --tracker.start.iterations 60",
+    "table": f"track {TABLE} --out {RUNS}/table",
+    "table/field": f"distill {RUNS}/table --field.iterations 150",
+    "table/field/query": f"query {RUNS}/table/field can",
+    "tissue": f"deform {TISSUE} --tools draw --deform.warmup 60 --deform.iterations 240 --out {RUNS}/tissue",
+    "tissue/query": f"query {RUNS}/tissue tool",
+    "furniture": f"parts {FURNITURE} --eval-cameras 3 --fit.steps 800 --fit.cap 6000 "
+    f"--parts.stream.iterations 20 --parts.refine.iterations 100 --out {RUNS}/furniture",
+    "furniture/edit/ops": f"edit {RUNS}/furniture --op ghost:parts=1,opacity=0.15",
+}
+"""What is run for the gallery, by the folder that it leaves."""
+
+
+def main() -> None:
+    """Run what is missing, and write pictures and page."""
+    for folder, command in COMMANDS.items():
+        if not (RUNS / folder).exists():
+            subprocess.run([sys.executable, "-m", "gsjax.cli", *command.split()], check=True, cwd=ROOT)
+    PICTURES.mkdir(exist_ok=True)
+    draw_trades(PICTURES / "trades.png")
+    shown = {name: _write(name, picture) for name, picture in pictures().items()}
+    PAGE.write_text(page(shown), encoding="utf-8")
+
+
+def pictures() -> dict[str, np.ndarray]:
+    """Out of the runs: RGB, by the name of the file."""
+    return {
+        "tracker": moments(RUNS / "demo/video_1.mp4"),
+        "field": read(RUNS / "table/field/query/overview.png"),
+        "tissue": beside(list(map(read, sorted(RUNS.glob("tissue/query/frames/*.png"))[:2])), 0),
+        "parts": moments(next(RUNS.glob("furniture/video_*.mp4"))),
+        "edit": moments(RUNS / "furniture/edit/ops/video.mp4"),
+    }
+
+
+def moments(video: Path, count: int = 3) -> np.ndarray:
+    """Frames of a film, from its first to its last."""
+    frames = read_video_frames(video)
+    return beside([frames[t] for t in np.linspace(0, len(frames) - 1, count).round().astype(int)], 1)
+
+
+def beside(parts: list[np.ndarray], axis: int, gap: int = 6) -> np.ndarray:
+    """Pictures side by side, or below each other, with white between them."""
+    shape = list(parts[0].shape)
+    shape[axis] = gap
+    white = np.full(shape, 255, np.uint8)
+    return np.concatenate([piece for part in parts for piece in (white, part)][1:], axis=axis)
+
+
+def read(path: Path) -> np.ndarray:
+    """A picture, RGB."""
+    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+
+
+def _write(name: str, picture: np.ndarray) -> str:
+    scale = min(1.0, WIDTH / picture.shape[1])
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    path = PICTURES / f"{name}.jpg"
+    cv2.imwrite(str(path), cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return f"gallery/{path.name}"
+
+
+# -- the page ------------------------------------------------------------------------------------------------
+
+SECTIONS = {
+    "The tracker": ("tracker", ("tracker_trade", "tracker_ablation", "optimizers", "basin", "hard_cases")),
+    "Parts": ("parts", ("parts_ablation", "parts_trade", "parts_failures", "parts_tracked", "bar_blends")),
+    "Edits": ("edit", ("parts_edits",)),
+    "Semantic fields": ("field", ("field_ablation", "field_trade")),
+    "Scenes that deform": ("tissue", ("deform_trade", "deform_pulling", "deform_flow")),
+    "Static fit": (None, ("static_fit", "fit_trade", "known_scene")),
+    "Grasping and policies": (None, ("grasping", "policies")),
+    "Rasterizer": (None, ("rasterizer_trade/simulated", "rasterizer_trade/real")),
+}
+"""Of the page: the picture of a run, and the experiments whose figures are shown."""
+
+SAYS = {
+    "tracker": ("demo", "Camera 1 at three moments: input and render above, error and labels below."),
+    "parts": ("furniture", "One camera at three moments: picture, render, error, and the parts in colours."),
+    "edit": ("furniture/edit/ops", "Only the first part that was found is shown; all else is a ghost."),
+    "field": ("table/field/query", "The can: in the photograph, its scores, alone, left out, recoloured."),
+    "tissue": ("tissue/query", "Two held-out frames: the scene, without the tool, it alone, recoloured."),
+}
+"""Which run a picture is of, and what it shows."""
+
+
+def page(shown: dict[str, str]) -> str:
+    """The page's Markdown."""
+    lines = [
+        "# Gallery",
+        "",
+        "Made by `make gallery`: small runs on built-in scenes (simulated; MINUTES on two cores the first "
+        "time, then seconds), and the figures of [experiments](experiments.md) as they are committed. Small "
+        "runs look worse than long ones, and are no results.",
+        "",
+        "## Speed against accuracy",
+        "",
+        "![Six plots: errors and scores over time](gallery/trades.png)",
+        "",
+        "*[Choosing](choosing.md) explains each.*",
+        "",
+    ]
+    for title, (picture, experiments) in SECTIONS.items():
+        lines += [f"## {title}", ""]
+        if picture is not None:
+            folder, says = SAYS[picture]
+            command = COMMANDS[folder].replace(f"{RUNS}/", "runs/gallery/")
+            lines += [f"![{says}]({shown[picture]})", "", f"*{says}* `gsjax {command}`", ""]
+        for name in experiments:
+            lines += [f"![{name}](../experiments/{name}/figure.png)", "", _caption(name), ""]
+    return "\n".join(lines)
+
+
+def _caption(name: str) -> str:
+    config = yaml.safe_load((ROOT / f"experiments/{name}/config.yaml").read_text(encoding="utf-8"))
+    says = (config.get("figure") or {}).get("caption") or config["claim"]
+    return f"*{' '.join(says.split())}* `gsjax experiment run {name}`"
+
+
+# -- speed against accuracy ----------------------------------------------------------------------------------
+
+INK, FRONT = "#4b5563", "#d55e00"
+TRADES = (
+    ("tracker: tabletop_1", "update, times that of fast", "centroid error [mm]", "lower"),
+    ("static fit: fox", "minutes", "held-out PSNR [dB]", "higher"),
+    ("parts: articulated_0", "seconds a frame", "median point error [mm]", "lower"),
+    ("field: articulated_0", "minutes", "mIoU, 3D query", "higher"),
+    ("deforming: tissue_0", "all steps, times the first row's", "held-out PSNR [dB]", "higher"),
+    ("rasterizer: garden", "forward and backward, times the defaults", "PSNR against them [dB]", "higher"),
+)
+
+
+def rows(name: str) -> Iterator[tuple[dict, dict]]:
+    """Options and result of each row of an experiment."""
+    for row in json.loads((ROOT / f"experiments/{name}/results.json").read_text(encoding="utf-8"))["rows"]:
+        yield row["options"], row["result"]
+
+
+def points() -> list[list[tuple[float, float, bool]]]:
+    """Of each trade: what it costs, what it gives, and whether it is what the others differ from."""
+    tracker = [(o, r) for o, r in rows("tracker_trade") if o["recording"] == "tabletop_1"]
+    fast = {"knob": "preset", "value": "fast"}
+    fox = [(o["setting"] == "default", r["curve"]) for o, r in rows("fit_trade") if o["scene"] == "fox"]
+    # A region of interest leaves out part of the picture, which is not compared.
+    garden = [(o, r) for o, r in rows("rasterizer_trade/real") if o["scene"] == "garden"]
+    drawn = [(o, r) for o, r in garden if o["knob"] != "roi"]
+    return [
+        [(r["ratio"], r["centroid_mm"], fast.items() <= o.items()) for o, r in tracker],
+        [(*at, default) for default, curve in fox for at in curve],
+        [(r["update_s"], r["point_mm"], o["setting"] == "default") for o, r in rows("parts_trade")],
+        [(r["minutes"], r["miou_3d"], o == {"iterations": 100}) for o, r in rows("field_trade")],
+        # Paces were measured beside the first row's, minutes were not; steps are 100 and 300 unless told.
+        [
+            (r["pace"] * (100 + o.get("iterations", 300)) / 400, r["psnr"], o == {"kind": "hexplane"})
+            for o, r in rows("deform_trade")
+        ],
+        [(r["both_ratio"], r["psnr"], r["is_default"]) for _, r in drawn],
+    ]
+
+
+def draw_trades(path: Path) -> None:
+    """One plot for each method: every setting that was measured, and the best that each cost buys."""
+    drawing = Figure(figsize=(11, 6.4), facecolor="white", layout="constrained")
+    for axes, trade, found in zip(drawing.subplots(2, 3).flat, TRADES, points(), strict=True):
+        _draw(axes, *trade, found)
+    drawing.savefig(path, dpi=80)
+
+
+def _draw(axes: Axes, title: str, cost: str, gain: str, better: str, found: list) -> None:
+    costs, gains, default = (np.array(column) for column in zip(*found, strict=True))
+    axes.set_xscale("log")
+    if better == "lower":
+        axes.set_yscale("log")
+    axes.plot(costs[~default], gains[~default], "o", color=INK, ms=4, alpha=0.7)
+    axes.plot(costs[default], gains[default], "*", color=INK, ms=12, label="what the others differ from")
+    order = np.argsort(costs, kind="stable")
+    best = (np.minimum if better == "lower" else np.maximum).accumulate(gains[order])
+    axes.step(costs[order], best, where="post", color=FRONT, lw=1.5, label="best at that cost")
+    axes.set(title=title, xlabel=cost, ylabel=gain)
+    for axis in (axes.xaxis, axes.yaxis)[: 2 if better == "lower" else 1]:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
+    axes.grid(color="#e4e7eb")
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.legend(frameon=False, fontsize="small")
+
+
+if __name__ == "__main__":
+    main()
