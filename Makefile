@@ -8,10 +8,10 @@ RUN := runs/demo
 DEMO := "simulated:tabletop?width=240&height=180"
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all bench gallery docs lint clean
+.PHONY: help demo test test-all test-floors bench gallery docs lint dist clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 	@rm -rf $(RUN)
@@ -28,6 +28,17 @@ test: $(VENV)/installed-test ## the tests; slow ones left out
 test-all: $(VENV)/installed-test ## every test, the slow ones too
 	XLA_FLAGS= $(PYTEST) -m "slow or not slow" --cov=gsjax --cov-report=term
 
+# Of the tests those that touch every dependency and are quick. Some floors have no wheel for a newer Python.
+FLOORS := build/floors
+QUICK := geometry rasterize losses scene optim io viz data/test_files.py cli/test_main.py
+test-floors: pyproject.toml ## quick tests with the lowest versions that pyproject.toml allows, on Python 3.11
+	rm -rf $(FLOORS) && mkdir -p build
+	python3.11 -m venv $(FLOORS)
+	$(FLOORS)/bin/python tests/floors.py test > build/floors.txt
+	$(FLOORS)/bin/python -m pip install --quiet --disable-pip-version-check -e ".[test]" -c build/floors.txt
+	$(FLOORS)/bin/python -m pip check
+	$(FLOORS)/bin/python -m pytest $(addprefix tests/,$(QUICK))
+
 bench: $(VENV)/installed-test ## the whole benchmark suite, on a machine that does nothing else
 	$(BIN)/gsjax bench
 
@@ -40,6 +51,20 @@ docs: $(VENV)/installed-dev ## build the documentation into site/
 lint: $(VENV)/installed-dev ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# What others will install is tried where there is nothing else, and away from these files.
+EMPTY := $(CURDIR)/build/empty
+dist: $(VENV)/installed-dev ## build the wheel and the sdist, check them, and track a few frames by the wheel alone
+	rm -rf dist $(EMPTY) build/tried && mkdir -p build/tried
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python -m venv $(EMPTY)
+	$(EMPTY)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	$(EMPTY)/bin/python -m pip check
+	cd build/tried && $(EMPTY)/bin/gsjax --help && $(EMPTY)/bin/gsjax info simulated:tabletop
+	cd build/tried && $(EMPTY)/bin/gsjax track "simulated:tabletop?width=160&height=120" --out run --frames 0:5 \
+	  --cameras 0 1 --mask-camera 1 --eval-cameras 2 --tracker.start.iterations 20
+	cd build/tried && test -s run/report.html && $(EMPTY)/bin/gsjax query run can
 
 clean: ## remove .venv and everything that was built
 	rm -rf $(VENV) site dist build .pytest_cache .ruff_cache .hypothesis .coverage*

@@ -81,8 +81,8 @@ def _flags_of(command: str, arguments: list[str]) -> set[str]:
     return set(re.findall(r"--[a-z](?:[\w.-]*\w)?", said.getvalue()))
 
 
-OTHERS = {"--help", "--stride", "--xla", "--no-deps"}
-"""Options of scripts, XLA and pip that pages name."""
+OTHERS = {"--help", "--stride", "--xla", "--no-deps", "--nthreads"}
+"""Options of scripts, XLA, pip and Dask that pages name."""
 
 
 @pytest.mark.parametrize("page", PAGES)

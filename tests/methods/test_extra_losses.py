@@ -2,19 +2,42 @@
 where there is none."""
 
 from dataclasses import replace
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.losses.extra import extra_terms
+from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
+from gsjax.methods.motion_parts.refine import RefineBatch as PartsBatch
+from gsjax.methods.motion_parts.refine import RefineParams, refine_step
+from gsjax.methods.motion_parts.stream import StreamParams, skinning_weights, stream_loss
 from gsjax.methods.object_tracker import AlignConfig, track
 from gsjax.methods.object_tracker.config import RefineConfig
 from gsjax.methods.object_tracker.motion import Motion
 from gsjax.methods.object_tracker.refine import refine, refine_loss
-from tests.methods.test_refine import batch_after
+from gsjax.methods.reconstruction import Batch, FitConfig, StartConfig, begin, fit, fit_loss
+from gsjax.methods.reconstruction.fit import _observe
+from gsjax.methods.surgical import (
+    Look,
+    SurgicalConfig,
+    begin_surgical,
+    reconstruct,
+    surgical_loss,
+    with_field,
+)
+from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.handles import at_rest
+from gsjax.scene.render import plan_render
+from tests.methods.ball_before_wall import batch_after
+from tests.methods.photographed_blobs import photographed_blobs
+from tests.methods.two_boxes import batch_of, shifted, soft, two_boxes
 
+FIT = FitConfig(steps=4, cap=60, sh_degree=0, coarse_until=0.0, start=StartConfig(count=50))
+TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
 CALLS = []
 
 
@@ -31,6 +54,45 @@ def brighter(scene, rendered, frame):
 
 def nothing(scene, rendered, frame):
     return jnp.zeros(())
+
+
+HEIGHT_WEIGHT = 5.0
+
+
+def height(scene, rendered, frame):
+    CALLS.append(1)
+    return HEIGHT_WEIGHT * jnp.mean(scene.gaussians.means[:, 2])
+
+
+def mean_height(canonical):
+    means = np.r_[canonical.movable.means, canonical.fixed.means]
+    return HEIGHT_WEIGHT * means[:, 2].mean()
+
+
+def uphill(means):
+    """The slope of `height`."""
+    return np.broadcast_to([0.0, 0.0, HEIGHT_WEIGHT / len(means)], means.shape)
+
+
+def slope_added(loss_with, params, batch):
+    """By how much the slope of a method's loss differs with `height` from that without."""
+
+    @partial(jax.jit, static_argnums=0)
+    def slope(extra, params):
+        loss = loss_with(extra)
+        return eqx.filter_grad(lambda params: loss(params, batch, step=0, key=None)[0])(params)
+
+    return jax.tree.map(lambda a, b: np.asarray(a - b), slope((height,), params), slope((), params))
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    return photographed_blobs()
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return two_boxes()
 
 
 @pytest.fixture
@@ -110,6 +172,71 @@ def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     assert lift(now, 1) > lift(plain, 1) + 2e-3
     assert abs(lift(now, 2) - lift(plain, 2)) < 1e-3
     assert heights[-1] < heights[0]
+
+
+class TestOtherMethods:
+    """The same function of three arguments beside the losses of a fit, of parts and of a deforming scene."""
+
+    def test_of_a_fit(self, photographs):
+        _, state = begin(photographs, FIT)
+        seen = _observe(photographs[0], 0, 1, (False, True))
+        batch = Batch(seen, jnp.zeros((1, 3)), plan_render(state.gaussians, seen.camera))
+        added = slope_added(lambda extra: fit_loss(FIT, 1.0, extra), state.model, batch)
+        np.testing.assert_allclose(added.gaussians.means, uphill(state.gaussians.means), atol=1e-4)
+        assert not np.any(added.gaussians.sh0)
+
+    def test_of_parts(self, pictures):
+        batch, bodies = batch_of(pictures)
+        params = StreamParams(shifted(0.01), soft(bodies))
+        added = slope_added(lambda extra: stream_loss(StreamConfig(), extra), params, batch)
+        share = np.asarray(skinning_weights(params.field, batch.canonical)).sum(0)
+        share = share / (batch.canonical.movable.num + batch.canonical.fixed.num)
+        np.testing.assert_allclose(added.pose.translations[:, 2], HEIGHT_WEIGHT * share, atol=1e-4)
+        assert np.any(added.field)
+
+    def test_of_all_frames_of_parts(self, pictures):
+        batch, _ = batch_of(pictures)
+        scene, config = batch.canonical, PartsConfig()
+        poses = jax.tree.map(lambda a: jnp.stack([a, a]), at_rest(len(scene.alive)))
+        params = RefineParams(scene.movable, scene.fixed, poses)
+        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), batch.plan)
+
+        @partial(jax.jit, static_argnums=0)
+        def after(extra):
+            step = refine_step(config, extra)
+            return step.update(params, step.init(params), given, step=0.0, key=None)
+
+        (plain, _, _), (pulled, _, info) = after(()), after((height,))
+        assert np.all(pulled.movable.means[:, 2] <= plain.movable.means[:, 2])
+        assert np.any(pulled.movable.means[:, 2] < plain.movable.means[:, 2])
+        np.testing.assert_allclose(info["extra"]["height"], mean_height(scene), rtol=1e-4)
+
+    def test_of_a_deforming_scene(self, photographs):
+        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
+        config = SurgicalConfig(start_pixels=2.0, deformation=TINY)
+        problem, state = begin_surgical(looks, config)
+        batch = problem.batches[0]._replace(plan=problem.plan)
+        scene, *_ = with_field(problem, state.scene)
+        added = slope_added(lambda extra: surgical_loss(config, problem.radius, extra), scene, batch)
+        np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
+        assert np.any(added.field.layers[-1].weight)  # through the deformation
+
+    def test_loops_hand_them_on_and_compile_once(self, photographs):
+        problem, state = begin(photographs, FIT)
+        calls = []
+        CALLS.clear()
+        for fitted in fit(problem, state, share=lambda i: 0.5 + i / 8, extra_losses=(height,)):
+            calls.append(len(CALLS))
+            assert np.isfinite(fitted.info["extra"]["height"])
+        assert len(calls) == 4
+        assert calls[0] > 0
+        assert calls == calls[:1] * 4
+
+        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
+        config = SurgicalConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
+        for advanced in reconstruct(*begin_surgical(looks, config), extra_losses=(height,)):
+            assert np.isfinite(advanced.info["extra"]["height"])
+        assert advanced.state.step == 2
 
 
 class TestMistakes:

@@ -1,6 +1,5 @@
 """Layers drawn together: copies of parts, parts of elsewhere, and nothing that is never seen."""
 
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -134,12 +133,3 @@ def test_an_echo_of_the_film_is_the_part_as_it_was_before():
     rows = np.array([1, 5])  # of part 1
     np.testing.assert_array_equal(one.means[7:], then.means[rows])
     np.testing.assert_allclose(one.opacities[7:], then.opacities[rows] / 2, rtol=1e-5)
-
-
-def test_the_example_of_the_documentation_runs():
-    page = (Path(__file__).resolve().parents[2] / "docs" / "parts.md").read_text()
-    code = page.split("### In Python")[1].split("```python\n")[1].split("```")[0]
-    told = {"scene": scene_of(0, 7, 4), "trajectory": trajectory(0), "t": 3, "jnp": jnp}
-    exec(code, told)
-    assert told["gaussians"].num == sum(layer.scene.gaussians.num for layer in told["film"]) > 7
-    assert told["later"].times.shape == (150,)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, camera_centers, intrinsics, look_at, project
+from gsjax.geometry.cameras import Camera, camera_centers, project
 from gsjax.methods.reconstruction import (
     Batch,
     FitConfig,
@@ -30,36 +30,17 @@ from gsjax.methods.reconstruction.model import exposed, refined
 from gsjax.methods.reconstruction.start import start_points
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import rung
-from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
+from tests.methods.photographed_blobs import HEIGHT, WIDTH, cameras, photographed_blobs
 
-WIDTH, HEIGHT = 40, 30
 QUICK = FitConfig(
     steps=60, cap=120, sh_degree=1, sh_every=40, coarse_until=0.3, start=StartConfig(count=100), seed=1
 )
 
 
-def cameras(count: int) -> Camera:
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    eyes = np.stack([3 * np.cos(angles), 3 * np.sin(angles), 1 + 0.5 * np.sin(3 * angles)], axis=-1)
-    viewmats = jnp.asarray(np.stack([look_at(eye, np.zeros(3)) for eye in eyes]), jnp.float32)
-    Ks = jnp.broadcast_to(jnp.asarray(intrinsics(40.0, WIDTH, HEIGHT), jnp.float32), (count, 3, 3))
-    return Camera(viewmats, Ks, WIDTH, HEIGHT)
-
-
 @pytest.fixture(scope="module")
 def views():
-    """Eight views of thirty blobs before black, with depth."""
-    random, count = np.random.default_rng(0), 30
-    means, colors = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(size=(count, 3))
-    quats, scales = random.normal(size=(count, 4)), random.uniform(0.08, 0.25, (count, 3))
-    scene = gaussians_from_activated(means, quats, scales, np.full(count, 0.9), colors)
-    eight = cameras(8)
-    drawn = render(scene, eight, plan_render(scene, eight))
-    images = np.round(255 * np.clip(np.asarray(drawn.colors), 0, 1)).astype(np.uint8)
-    depths = np.where(np.asarray(drawn.alphas) > 0.9, np.asarray(drawn.depths), 0)
-    viewmats, Ks = np.asarray(eight.viewmat, np.float64), np.asarray(eight.K, np.float64)
-    return [View(images[i], None, depths[i], viewmats[i], Ks[i]) for i in range(8)]
+    return photographed_blobs()
 
 
 def without_depth(views: list[View]) -> list[View]:

@@ -64,6 +64,7 @@ def run_on_cluster(
     killed_worker = _package("distributed").KilledWorker
     if scheduler == PROCESSES:
         workers = workers or usable_cores()
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
     with _client(scheduler, workers) as client, _said_if_gone(scheduler):
         sharing = workers if scheduler == PROCESSES else None
         under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
@@ -299,7 +300,8 @@ def slurm_cluster() -> Any:
             f"{config.PATH}, found no {'cores' if cores is None else 'memory'}"
         )
     # What Dask calls cores are threads of its own, and would be as many cells at once.
-    return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores)
+    free_port = {"dashboard_address": ":0", **config.get("jobqueue.slurm.scheduler-options")}
+    return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores, scheduler_options=free_port)
 
 
 def check_scheduler(scheduler: str, workers: int | None) -> None:

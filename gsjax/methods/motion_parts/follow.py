@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import normalize_quats, quats_to_matrices
+from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
 from gsjax.methods.motion_parts.discover import Start, Views, radii_of
 from gsjax.methods.motion_parts.stream import (
@@ -137,7 +138,9 @@ def order_of_frames(frames: int, anchor: int) -> list[int]:
     return [*range(anchor + 1, frames), *reversed(range(anchor))]
 
 
-def follow(views: Views, start: Start, parts: Parts, config: PartsConfig) -> Iterator[Followed]:
+def follow(
+    views: Views, start: Start, parts: Parts, config: PartsConfig, *, extra_losses: ExtraLosses = ()
+) -> Iterator[Followed]:
     """Frame by frame, until all are found. The same parts, start and config give the same bits, wherever the
     discovery was begun or resumed.
 
@@ -146,8 +149,10 @@ def follow(views: Views, start: Start, parts: Parts, config: PartsConfig) -> Ite
         start: from `begin`.
         parts: from `first_parts`, or those of an earlier `Followed`.
         config: how.
+        extra_losses: functions `loss(scene, rendered, frame)` (`gsjax.losses.extra`) of one's own, whose
+            scene is a `PosedScene`; give `refine` the same.
     """
-    run = _Frames(views, config)
+    run = _Frames(views, config, extra_losses)
     order = order_of_frames(views.num_frames, start.anchor.frame)
     for count, t in enumerate(order, 1):
         if parts.done[t]:
@@ -168,9 +173,9 @@ def follow(views: Views, start: Start, parts: Parts, config: PartsConfig) -> Ite
 class _Frames:
     """Finds the pose at one frame after the other; keeps pictures of the past, and plans."""
 
-    def __init__(self, views: Views, config: PartsConfig):
+    def __init__(self, views: Views, config: PartsConfig, extra_losses: ExtraLosses):
         self._views, self._config = views, config
-        self._advance = _compiled(config.stream)
+        self._advance = _compiled(config.stream, extra_losses)
         self._past: dict[int, Frame] = {}  # pictures of half the size, on the host, colours in bytes
         self._plans: dict[int, Plan] = {}
         self._known: set[Any] = set()
@@ -252,9 +257,9 @@ class _Frames:
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: StreamConfig) -> Callable:
+def _compiled(config: StreamConfig, extra_losses: ExtraLosses) -> Callable:
     """The jitted step; what it replaces is given away."""
-    step = stream_step(config)
+    step = stream_step(config, extra_losses)
 
     @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
     def advance(params, state, batch, share):

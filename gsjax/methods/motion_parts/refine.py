@@ -17,10 +17,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
+from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.methods.motion_parts.config import PartsConfig
 from gsjax.methods.motion_parts.discover import Views
 from gsjax.methods.motion_parts.follow import Parts
-from gsjax.methods.motion_parts.stream import Canonical, Seen, moved_on, picture_loss, posed
+from gsjax.methods.motion_parts.stream import Canonical, PosedScene, Seen, moved_on, picture_loss, posed
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import Step, all_finite, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
@@ -62,12 +63,17 @@ class RefineBatch(NamedTuple):
     plan: Plan
 
 
-def refine_step(config: PartsConfig) -> Step:
+def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on `RefineParams`, with a state for each frame's pose; `step` is the share that is done.
 
     The background's handle does not move, nor does any at the canonical frame. A step whose loss or gradient
     is not finite, or whose plan overflowed, changes nothing, and `info["skipped"]` says so.
+
+    Args:
+        config: of the parts.
+        extra_losses: of one's own (`gsjax.losses.extra`), beside that of pictures.
     """
+    named_losses(extra_losses)
     poses = optax.adam(1.0, b2=0.99)
 
     def scene(params: RefineParams) -> optax.GradientTransformation:
@@ -89,7 +95,12 @@ def refine_step(config: PartsConfig) -> Step:
             moved = posed(canonical, batch.weights, pose, config.stream.blend)
             drawn = render(moved, batch.seen.frame.cameras, batch.plan)
             told = {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
-            return picture_loss(drawn, batch.seen, config.stream), told
+            value = picture_loss(drawn, batch.seen, config.stream)
+            if extra_losses:
+                scene = PosedScene(moved, batch.weights, pose)
+                told["extra"] = extra_terms(extra_losses, scene, drawn, batch.seen.frame)
+                value += sum(told["extra"].values())
+            return value, told
 
         (value, told), slope = jax.value_and_grad(loss, (0, 1), has_aux=True)(both(params), pose)
         fall = _FINAL_RATE**step
@@ -130,7 +141,9 @@ class Refined(NamedTuple):
     skipped: Bool[Array, ""]
 
 
-def refine(views: Views, parts: Parts, config: PartsConfig) -> Iterator[Refined]:
+def refine(
+    views: Views, parts: Parts, config: PartsConfig, *, extra_losses: ExtraLosses = ()
+) -> Iterator[Refined]:
     """Step by step over all frames that were found, in a random order; one may stop after any. The same
     arguments give the same bits.
 
@@ -138,8 +151,9 @@ def refine(views: Views, parts: Parts, config: PartsConfig) -> Iterator[Refined]
         views: what the cameras saw.
         parts: all that is to be known of them, from `without_needless`.
         config: how.
+        extra_losses: as for `follow`.
     """
-    advance, rng = _compiled(config), np.random.default_rng((config.seed, 1))
+    advance, rng = _compiled(config, extra_losses), np.random.default_rng((config.seed, 1))
     canonical, weights, frames = parts.canonical, parts.weights, np.flatnonzero(parts.done)
     anchor = jnp.asarray(int(np.flatnonzero(parts.found == 0)[0]))
     poses = HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))
@@ -175,9 +189,9 @@ def _whole(frame: Frame) -> Seen:
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: PartsConfig):
+def _compiled(config: PartsConfig, extra_losses: ExtraLosses):
     """The jitted step; it leaves whole what it replaces, a megabyte or two, for one may stop at any step."""
-    step = refine_step(config)
+    step = refine_step(config, extra_losses)
 
     @partial(jax.jit, compiler_options=host_options())
     def advance(params, state, batch, share):

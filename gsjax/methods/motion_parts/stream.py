@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import normalize_quats
+from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import l1_loss, ssim, weighted_mean
 from gsjax.methods.motion_parts.config import StreamConfig
 from gsjax.methods.motion_parts.trajectory import BACKGROUND
@@ -64,6 +65,20 @@ class Seen(NamedTuple):
 
     frame: Frame
     counts: Bool[Array, "C H W"]
+
+
+class PosedScene(NamedTuple):
+    """The scene at one moment, as extra losses are given it.
+
+    Attributes:
+        gaussians: where they are, the movable ones first.
+        weights: of the movable ones.
+        pose: of the handles.
+    """
+
+    gaussians: Gaussians
+    weights: Float[Array, "M P"]
+    pose: HandlePose
 
 
 class StreamBatch(NamedTuple):
@@ -172,20 +187,16 @@ def gaps_between(
     return jnp.einsum("nkij,nj->nki", apart[..., :3], at) + apart[..., 3]
 
 
-def stream_loss(config: StreamConfig):
+def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()):
     """`loss(params, batch, *, step, key, nudges=None)`: of this frame by pose and field, and of past ones, in
     the mean, by the field alone. `nudges` [M,3] are added to where Gaussians are now, for who asks where each
-    would go.
+    would go. Extra losses are given this frame's `PosedScene`, its picture and the frame.
     """
 
     def loss(params: StreamParams, batch: StreamBatch, *, step: Any, key: Any, nudges: Array | None = None):
         weights = skinning_weights(params.field, batch.canonical)
-        drawn = render(
-            posed(batch.canonical, weights, params.pose, config.blend, nudges),
-            batch.now.frame.cameras,
-            batch.plan,
-            roi=batch.now.counts,
-        )
+        gaussians = posed(batch.canonical, weights, params.pose, config.blend, nudges)
+        drawn = render(gaussians, batch.now.frame.cameras, batch.plan, roi=batch.now.counts)
         value = picture_loss(drawn, batch.now, config)
         fixed = jax.lax.stop_gradient(weights)  # what stands still in all frames so far tears at no part
         scale = config.tear_scale * batch.canonical.pixel
@@ -205,6 +216,10 @@ def stream_loss(config: StreamConfig):
             told["past"] = jnp.stack(past).mean()
             told |= {"past_overflow": jnp.stack(overflow).any(), "past_needed": jnp.stack(needed).max()}
             value += told["past"]
+        if extra_losses:
+            scene = PosedScene(gaussians, weights, params.pose)
+            told["extra"] = extra_terms(extra_losses, scene, drawn, batch.now.frame)
+            value += sum(told["extra"].values())
         return value, told
 
     return loss
@@ -248,13 +263,18 @@ def moved_on(
     return HandlePose(normalize_quats(quats), pose.translations + shift * moves.translations)
 
 
-def stream_step(config: StreamConfig) -> Step:
+def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on `StreamParams`; `step` is the share of the frame's iterations that is done, 0 to 1.
 
     The background's handle does not move. A step whose loss or gradient is not finite, or whose plan
     overflowed, changes nothing, and `info["skipped"]` says so. `info` is what the loss tells, with `loss`.
+
+    Args:
+        config: of the stream.
+        extra_losses: of one's own (`gsjax.losses.extra`), beside that of pictures.
     """
-    loss = stream_loss(config)
+    named_losses(extra_losses)
+    loss = stream_loss(config, extra_losses)
     poses = optax.adam(1.0, b2=0.99)
 
     def fields(field: Field) -> optax.GradientTransformationExtraArgs:

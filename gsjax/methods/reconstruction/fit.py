@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
+from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.reconstruction.config import FitConfig
 from gsjax.methods.reconstruction.model import Model, carried_over, model_of, refined, with_degree, with_slots
 from gsjax.methods.reconstruction.start import Extent, View, extent_of, in_slots, start_points
@@ -131,7 +132,11 @@ def begin(
 
 
 def fit(
-    problem: Problem, state: FitState, *, share: Callable[[int], float] | None = None
+    problem: Problem,
+    state: FitState,
+    *,
+    share: Callable[[int], float] | None = None,
+    extra_losses: ExtraLosses = (),
 ) -> Iterator[Fitted]:
     """Step by step, until all is done. The same state, problem and `share` give the same bits, wherever the
     fit was begun or resumed.
@@ -141,11 +146,13 @@ def fit(
         state: from `begin`, or that of an earlier `Fitted`.
         share: step -> what share of the fit is done before it, by which rates fall and photographs grow; at 1
             it ends. That of the config's steps unless given.
+        extra_losses: functions `loss(scene, rendered, frame)` of one's own, whose scene is a `Model`; see
+            `gsjax.losses.extra`. `info["extra"]` has their values.
     """
     config, views = problem.config, problem.views
     key = jax.random.key(config.seed)
     plans = {tuple(row[:3].tolist()): int(row[3]) for row in state.capacity}
-    advance, densify = _compiled(config, problem.extent.radius)
+    advance, densify = _compiled(config, problem.extent.radius, extra_losses)
     seen: dict[tuple[int, int], Observation] = {}
     model, optimizer = state.model, state.optimizer
     compiled: set[Any] = set()
@@ -195,9 +202,9 @@ def fit(
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: FitConfig, radius: float) -> tuple[Callable, Callable]:
+def _compiled(config: FitConfig, radius: float, extra_losses: ExtraLosses) -> tuple[Callable, Callable]:
     """The jitted step and what makes more Gaussians; buffers that they replace are given away."""
-    step, options = reconstruction_step(config, radius), host_options()
+    step, options = reconstruction_step(config, radius, extra_losses), host_options()
 
     @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
     def advance(model, optimizer, batch, share, key):

@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from gsjax.geometry.cameras import Camera
+from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.reconstruction.config import FitConfig
 from gsjax.methods.reconstruction.model import Model, exposed, refined
@@ -19,6 +20,7 @@ from gsjax.optim.densification import EMPTY_LOGIT, exploration, forgotten, is_al
 from gsjax.optim.splitting import Pull, divide, wanted, watch_pull, with_low_opacities
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
@@ -51,9 +53,10 @@ class Batch(NamedTuple):
     plan: Plan
 
 
-def fit_loss(config: FitConfig, radius: float) -> Callable:
+def fit_loss(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and under relocation what
-    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph."""
+    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph. Extra losses are
+    given the `Model`, how it was drawn, and the photograph; what does not count is drawn as photographed."""
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
         seen, background, plan = batch
@@ -83,16 +86,21 @@ def fit_loss(config: FitConfig, radius: float) -> Callable:
             alive = jax.lax.stop_gradient(is_alive(gaussians).astype(value.dtype))
             value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
             value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / radius
-        return value, {
+        told = {
             "psnr": -10 * jnp.log10(mse),
             "overflow": drawn.meta.overflow.any(),
             "needed": drawn.meta.needed.max(),
         }
+        if extra_losses:
+            rendered = drawn._replace(colors=image)
+            told["extra"] = extra_terms(extra_losses, model, rendered, Frame(target, seen.depth, camera))
+            value += sum(told["extra"].values())
+        return value, told
 
     return loss
 
 
-def reconstruction_step(config: FitConfig, radius: float) -> Step:
+def reconstruction_step(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on a `Model`, and under relocation the walk of 3DGS-MCMC.
 
     `batch` is a `Batch`, `step` the share of the fit that is done, 0 to 1, and `key` is needed. `info` has
@@ -101,9 +109,11 @@ def reconstruction_step(config: FitConfig, radius: float) -> Step:
     Args:
         config: of the fit.
         radius: of the scene, the unit in which means move.
+        extra_losses: of one's own (`gsjax.losses.extra`), beside that of photographs.
     """
+    named_losses(extra_losses)
     rates = vars(config.rates)
-    loss = fit_loss(config, radius)
+    loss = fit_loss(config, radius, extra_losses)
 
     def of(model: Model) -> Step:
         there = [name for name in rates if getattr(model.gaussians, name, None) is not None]

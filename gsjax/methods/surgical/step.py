@@ -10,6 +10,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gsjax.geometry.cameras import Camera
+from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.losses.regularization import plane_variation, second_differences
 from gsjax.methods.surgical.config import SurgicalConfig
@@ -18,6 +19,7 @@ from gsjax.methods.twisted import twisted
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows, features_at
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
@@ -105,15 +107,16 @@ class Batch(NamedTuple):
     look: Int[Array, ""] | None = None
 
 
-def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
+def surgical_loss(config: SurgicalConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of pixels that count (papers/003, eq. 13), depth,
     features against the teacher's (papers/004, eq. 10), the graph (`graph_loss`), and smoothness of the
-    field's planes (4DGS)."""
+    field's planes (4DGS). Extra losses are given the `DeformingScene`, with its Gaussians where they are
+    at this time, how it was drawn, and the picture; what does not count is drawn as photographed."""
     weights = config.weights
 
     def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
-        there = scene.at(batch.time, batch.moving)
-        drawn = render(there, _seen_from(scene, batch, radius), batch.plan)
+        there, camera = scene.at(batch.time, batch.moving), _seen_from(scene, batch, radius)
+        drawn = render(there, camera, batch.plan)
         target = batch.image.astype(drawn.colors.dtype) / 255
         # What does not count is as it was photographed: no slope, no edge.
         image = jnp.where(batch.counts[..., None], drawn.colors, target)
@@ -140,6 +143,11 @@ def surgical_loss(config: SurgicalConfig, radius: float) -> Callable:
         mse = jnp.square(image - target).mean() / area
         meta = drawn.meta
         told = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
+        if extra_losses:
+            now = eqx.tree_at(lambda s: s.gaussians, scene, there)
+            rendered = drawn._replace(colors=image)
+            told["extra"] = extra_terms(extra_losses, now, rendered, Frame(target, batch.depth, camera))
+            return sum(terms.values()) + sum(told["extra"].values()), terms | told
         return sum(terms.values()), terms | told
 
     return loss
@@ -175,20 +183,22 @@ def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Fl
     return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=True)
 
 
-def surgical_step(config: SurgicalConfig, radius: float) -> Step:
+def surgical_step(config: SurgicalConfig, radius: float, extra_losses: ExtraLosses = ()) -> Step:
     """Adam or AdamW on a `DeformingScene`. `batch` is a `Batch`, `step` counts from 0.
 
     Args:
         config: of the reconstruction.
         radius: of the scene, the unit in which means move.
+        extra_losses: of one's own (`gsjax.losses.extra`), beside those of the method.
     """
+    named_losses(extra_losses)
     total = max(1, config.warmup + config.iterations)
     if config.schedule == "cosine":
         fall = optax.cosine_decay_schedule(1.0, total)
     else:
         fall = optax.exponential_decay(1.0, total, _FINAL_RATE)
     told = vars(config.rates)
-    loss = surgical_loss(config, radius)
+    loss = surgical_loss(config, radius, extra_losses)
 
     def of(scene: DeformingScene) -> Step:
         rates = {name: told[name] for name in ("quats", "log_scales", "logit_opacities", "sh0")}

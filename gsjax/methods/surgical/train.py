@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
+from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
@@ -160,12 +161,20 @@ def begin_surgical(
     return problem, state
 
 
-def reconstruct(problem: SurgicalProblem, state: SurgicalState) -> Iterator[Advanced]:
+def reconstruct(
+    problem: SurgicalProblem, state: SurgicalState, *, extra_losses: ExtraLosses = ()
+) -> Iterator[Advanced]:
     """Step by step, until all is done: the canonical scene alone, then with its deformation. The same state
-    and problem give the same bits, wherever the reconstruction was begun or resumed. The arrays of `state`
-    are given away in the first step."""
+    and problem give the same bits, wherever the reconstruction was begun or resumed.
+
+    Args:
+        problem: from `begin_surgical`.
+        state: likewise, or that of an earlier `Advanced`. Its arrays are given away in the first step.
+        extra_losses: functions `loss(scene, rendered, frame)` (`gsjax.losses.extra`) of one's own, whose
+            scene is a `DeformingScene`. `info["extra"]` has their values.
+    """
     config = problem.config
-    advance = compiled_step(config, problem.radius)
+    advance = compiled_step(config, problem.radius, extra_losses)
     key = jax.random.key(config.seed)
     scene, optimizer, moving, graphs = state.scene, state.optimizer, state.moving, state.graphs
     plan = problem.plan_for(state)
@@ -262,9 +271,15 @@ def _graphs(problem: SurgicalProblem, scene: DeformingScene, moving: Moving) -> 
 
 
 @lru_cache(maxsize=4)
-def compiled_step(config: SurgicalConfig, radius: float) -> Callable:
-    """The jitted step: scene, optimizer, batch, number, key. Buffers that it replaces are given away."""
-    step = surgical_step(config, radius)
+def compiled_step(config: SurgicalConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
+    """The jitted step: scene, optimizer, batch, number, key. Buffers that it replaces are given away.
+
+    Args:
+        config: of the reconstruction.
+        radius: of the scene, metres.
+        extra_losses: of one's own.
+    """
+    step = surgical_step(config, radius, extra_losses)
 
     @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
     def advance(scene, optimizer, batch, i, key):

@@ -10,7 +10,7 @@ import pytest
 import gsjax.cli.parts.command
 import gsjax.cli.parts.loop
 from gsjax.cli import main
-from gsjax.cli.recording import open_recording
+from gsjax.cli.recording import chosen_recording
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
 from gsjax.viz.colors import label_color
@@ -166,11 +166,11 @@ def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
 
 
 def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
-    def maskless(*arguments):
-        recording = open_recording(*arguments)
+    def maskless(options):
+        recording = chosen_recording(options)
         return replace(recording, tracked=replace(recording.tracked, load_mask=None))
 
-    monkeypatch.setattr(gsjax.cli.parts.command, "open_recording", maskless)
+    monkeypatch.setattr(gsjax.cli.parts.command, "chosen_recording", maskless)
     code, said = gsjax_parts("--frames", "0:24:8", "--masks", "files")
     assert code == 2
     assert "--masks files: expected a mask of frame" in said

@@ -1,0 +1,47 @@
+"""What an import loads. How long it takes is measured by `python -m benchmarks.imports`."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# Those of extras, which need not be there, and those that only some commands need.
+OPTIONAL = {"viser", "torch", "transformers", "mujoco", "pycolmap", "tensorboardX", "distributed", "dask"}
+LATE = {"matplotlib", "skimage", "jaxopt", "trimesh", "imageio_ffmpeg", "rich", "tyro", "PIL"}
+
+
+def loaded(program: str) -> set[str]:
+    """The top-level modules that stand in `sys.modules` after a program of its own process."""
+    ending = "\nimport json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    command = [sys.executable, "-c", program + ending]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=300)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_gsjax_alone_loads_nothing_else():
+    assert not loaded("import gsjax") & (OPTIONAL | LATE | {"jax", "numpy", "scipy", "cv2", "equinox"})
+
+
+def test_the_public_names_need_no_extra():
+    found = loaded("import gsjax\nfor name in gsjax.__all__: getattr(gsjax, name)")
+    assert {"jax", "equinox"} <= found
+    assert not found & (OPTIONAL | LATE)
+
+
+def test_the_rasterizer_needs_no_files_and_no_solver():
+    found = loaded("import gsjax\ngsjax.rasterization, gsjax.Gaussians, gsjax.render")
+    assert not found & (OPTIONAL | LATE | {"cv2", "optax", "optimistix"})
+
+
+def test_help_does_not_wait_for_jax():
+    found = loaded("from gsjax.cli import main\nassert main(['--help']) == 0")
+    assert not found & (OPTIONAL | {"jax", "numpy", "scipy", "cv2", "matplotlib", "tyro"})
+
+
+@pytest.mark.parametrize("command", ["track", "info", "view", "poses", "distill", "experiment"])
+def test_help_of_a_command_needs_no_extra(command):
+    asked = f"from gsjax.cli import main\ntry: main([{command!r}, '--help'])\nexcept SystemExit: pass"
+    assert not loaded(asked) & OPTIONAL
