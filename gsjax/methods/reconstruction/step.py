@@ -55,8 +55,14 @@ class Batch(NamedTuple):
 
 def fit_loss(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and under relocation what
-    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph. Extra losses are
-    given the `Model`, how it was drawn, and the photograph; what does not count is drawn as photographed."""
+    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph.
+
+    Args:
+        config: its weights.
+        radius: of the scene, in which depth counts and cameras move.
+        extra_losses: given the `Model`, how it was drawn, and the photograph; what does not count is drawn as
+            photographed.
+    """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
         seen, background, plan = batch

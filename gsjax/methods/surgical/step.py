@@ -110,8 +110,14 @@ class Batch(NamedTuple):
 def surgical_loss(config: SurgicalConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of pixels that count (papers/003, eq. 13), depth,
     features against the teacher's (papers/004, eq. 10), the graph (`graph_loss`), and smoothness of the
-    field's planes (4DGS). Extra losses are given the `DeformingScene`, with its Gaussians where they are
-    at this time, how it was drawn, and the picture; what does not count is drawn as photographed."""
+    field's planes (4DGS).
+
+    Args:
+        config: its weights.
+        radius: of the scene, in which depth counts and cameras move.
+        extra_losses: given the `DeformingScene`, with its Gaussians where they are at this time, how it was
+            drawn, and the picture; what does not count is drawn as photographed.
+    """
     weights = config.weights
 
     def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
