@@ -141,6 +141,9 @@ def run_there(
 
     Returns:
         a zip of the cell's record, ID.json, and of its folder, ID.
+
+    Raises:
+        ValueError: the worker has several threads, or another gsjax, script or folder than the client.
     """
     worker = import_module("distributed").get_worker()
     if worker.state.nthreads != 1:
