@@ -127,9 +127,8 @@ def checked(options: Told) -> Told:
     Raises:
         ValueError: one that commands share cannot be.
     """
-    minutes, test_every = getattr(options, "minutes", None), getattr(options, "test_every", 0)
-    if minutes is not None and not minutes > 0:
-        raise ValueError(f"--minutes: expected more than 0, found {minutes}")
+    expect_positive(options, "minutes")
+    test_every = getattr(options, "test_every", 0)
     scale = getattr(options, "scale", 1.0)
     if not 0 < scale <= 1:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
@@ -140,6 +139,14 @@ def checked(options: Told) -> Told:
     nested = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     seeded = {n: replace(c, seed=seed) for n, c in nested.items() if is_dataclass(c) and hasattr(c, "seed")}
     return replace(options, **seeded)
+
+
+def expect_positive(options: Any, *names: str) -> None:
+    """Raises ValueError where one of these options is given, and not above 0."""
+    for name in names:
+        value = getattr(options, name, None)
+        if value is not None and not value > 0:
+            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
 
 
 def preset_options(

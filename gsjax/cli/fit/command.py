@@ -20,7 +20,7 @@ from gsjax.cli.fit.tensorboard import TensorBoard
 from gsjax.cli.fit.worth import parts
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import Notes, reason, stage
-from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, preset_options
+from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, expect_positive, preset_options
 from gsjax.cli.photographs import choose_photographs, read_views, say_if_large, split
 from gsjax.cli.recording import located
 from gsjax.cli.run.ending import ended, exit_code, finish
@@ -74,7 +74,7 @@ def run(options: Options) -> int:
         ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
     """
     options = checked(options)
-    _check(options)
+    expect_positive(options, "until_psnr", "judge_every", "save_every")
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         photographs = choose_photographs(
@@ -167,13 +167,6 @@ def run(options: Options) -> int:
         finish(folder, found, write_results)
     print_results(folder, found)
     return exit_code(stopped)
-
-
-def _check(options: Options) -> None:
-    for name in ("until_psnr", "judge_every", "save_every"):
-        value = getattr(options, name)
-        if value is not None and not value > 0:
-            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {value}")
 
 
 class Aside:

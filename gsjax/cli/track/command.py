@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import FITTING, Notes, reason, say_error, stage
-from gsjax.cli.options import OF_NO_BEARING, OfRecording, checked, preset_options
+from gsjax.cli.options import OF_NO_BEARING, OfRecording, checked, expect_positive, preset_options
 from gsjax.cli.recording import (
     FirstMask,
     Recording,
@@ -78,8 +78,7 @@ def run(options: Options) -> int:
         ValueError, OSError: what was asked cannot be done; everything tracked before that is on disk.
     """
     options = checked(options)
-    if options.budget_ms is not None and not options.budget_ms > 0:
-        raise ValueError(f"--budget-ms: expected more than 0, found {options.budget_ms}")
+    expect_positive(options, "budget_ms")
     console, begun = Console(stderr=True, highlight=False), perf_counter()
     with Notes(console) as notes:
         expect_dataset(options.dataset)

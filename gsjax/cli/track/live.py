@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import resident_mb
 from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
-from gsjax.cli.options import Common, Overwriting, Selection, checked
+from gsjax.cli.options import Common, Overwriting, Selection, checked, expect_positive
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder
@@ -108,10 +108,7 @@ def run(options: Options) -> int:
 
 
 def _check(options: Options) -> None:
-    for name in ("minutes", "hz", "patience", "budget_ms"):
-        found = getattr(options, name)
-        if found is not None and not found > 0:
-            raise ValueError(f"--{name.replace('_', '-')}: expected more than 0, found {found}")
+    expect_positive(options, "hz", "patience", "budget_ms")
     if options.source.startswith(CAMERA_PREFIX):
         for name in ("cameras", "mask_camera", "frames", "masks", "scale", "read"):
             if getattr(options, name) != getattr(Options(options.source, options.out), name):
