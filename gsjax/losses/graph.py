@@ -1,15 +1,7 @@
-"""A graph over nodes seen at several times, and what a teacher's features ask of it (papers/003, section 2.3,
-and papers/004, section 3.3).
+"""What a teacher asks of features that learn, over a graph of nodes and frames (papers/003, section 2.3, and
+papers/004, section 3.3).
 
-Nodes are points picked from those of each frame (`gsjax.geometry.sampling`). Frames, nodes and edges are as
-many everywhere, with masks for what is absent. Edges lead to the nearest nodes of the same frame and to those
-of others that match:
-
-    edges = spatial_edges(positions, k=8) | temporal_edges(teacher, k=4, window=2)
-    weights = edge_weights(positions, teacher, times, edges, tau_x=0.02, tau_t=0.5)
-    wanted = edge_affinities(teacher, edges)
-
-All that is the teacher's, and made once. Then, of features that learn,
+`gsjax.losses.edges` makes edges, their weights and the affinities wanted, once. Then, of features that learn,
 
     loss = 0.1 * node_loss(features, teacher) + 0.1 * structure_loss(features, wanted, edges, weights)
 
@@ -18,214 +10,21 @@ teacher's is fixed (`orthonormal_projection`), for two that learn agree best whe
 means and not sums, so that their weights do not depend on how many nodes and edges there are.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import reduce
-from itertools import groupby
-from operator import or_
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from gsjax.losses.features import Likeness, cosine_error
+from gsjax.losses.edges import (
+    Edges,
+    Features,
+    Matching,
+    There,
+    edge_affinities,
+    edge_cosines,
+    live_edges,
+    present,
+)
 from gsjax.losses.photometric import weighted_mean
-from gsjax.losses.sinkhorn import Derivative, sinkhorn
-
-Features = Float[Array, "t n d"]
-There = Bool[Array, "t n"]
-
-_LEAST = 1e-12  # squared: what is shorter has no direction
-
-
-# -- edges ---------------------------------------------------------------------------------------------------
-
-
-class Edges(eqx.Module):
-    """As many edges from every node: number e from frame t ends in frame t + offsets[e].
-
-    `one | other` has those of both.
-    """
-
-    nodes: Int[Array, "t n e"]
-    """Where in its frame an edge ends."""
-    valid: Bool[Array, "t n e"]
-    """False where there is none."""
-    offsets: tuple[int, ...] = eqx.field(static=True)
-
-    def __or__(self, other: "Edges") -> "Edges":
-        nodes = jnp.concatenate([self.nodes, other.nodes], axis=2)
-        valid = jnp.concatenate([self.valid, other.valid], axis=2)
-        return Edges(nodes, valid, self.offsets + other.offsets)
-
-
-@dataclass(frozen=True)
-class Matching:
-    """How features become affinities (eqs. 9 and 10); `sinkhorn` has the meaning of each."""
-
-    temperature: float = 1.0
-    """In units of sqrt(d), as far as chance takes the score of two layer-normalised features."""
-    slack: float | None = None
-    """A score: those of two features lie between -d and d."""
-    iterations: int = 20
-    derivative: Derivative = "unrolled"
-
-
-def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: There | None = None) -> Edges:
-    """From each node to its `k` nearest of the same frame.
-
-    Args:
-        positions: metres, of n nodes in t frames.
-        k: edges from each node.
-        valid: which nodes are there; all unless given.
-    """
-    positions, there = _present(positions, valid)
-    return _strongest(lambda _: -_squared_distances(positions), there, k)
-
-
-def temporal_edges(
-    features: Features, k: int, window: int, valid: There | None = None, matching: Matching = Matching()
-) -> Edges:
-    """From each node to the `k` of highest affinity in every other frame at most `window` away (Algorithm 1).
-
-    One matrix serves both ways, its rows for the later frame and its columns for the earlier.
-
-    Args:
-        features: of n nodes in t frames.
-        k: edges from each node into each other frame.
-        window: frames.
-        valid: which nodes are there; all unless given.
-        matching: how features become affinities.
-
-    Raises:
-        ValueError: `window` is below 1.
-    """
-    if window < 1:
-        raise ValueError(f"window={window}: expected 1 frame or more; spatial_edges lead to a frame's own")
-    _, there = _present(features, valid)
-    return _strongest(lambda offset: affinities(features, offset, there, matching), there, k, window)
-
-
-def similar_edges(features: Features, k: int, window: int = 0, valid: There | None = None) -> Edges:
-    """From each node to the `k` of highest cosine in its own frame (papers/004, eq. 7), or with a `window` in
-    every other frame at most that far away. None from or to a feature without a length.
-
-    Args:
-        features: of n nodes in t frames.
-        k: edges from each node into each frame.
-        window: frames; 0 for the own one.
-        valid: which nodes are there; all unless given.
-    """
-    features, there = _present(features, valid)
-    squared = jnp.sum(features**2, axis=-1)
-    there &= squared > _LEAST
-    directions = features / jnp.sqrt(jnp.where(there, squared, 1.0))[..., None]
-    return _strongest(lambda offset: _products(directions, offset), there, k, window)
-
-
-def all_edges(valid: There, window: int = 0) -> Edges:
-    """From each node to every other one of its frame and of those at most `window` away."""
-    frames, n = valid.shape
-    window = min(window, frames - 1)
-    runs = []
-    for offset in range(-window, window + 1):
-        pairs = _pairs(valid, abs(offset))
-        ends = _framed(pairs if offset >= 0 else pairs.swapaxes(1, 2), offset)
-        runs.append(Edges(jnp.broadcast_to(jnp.arange(n), ends.shape), ends, (offset,) * n))
-    return reduce(or_, runs)
-
-
-def edge_weights(
-    positions: Float[Array, "t n c"],
-    features: Features,
-    times: Float[Array, "t"],
-    edges: Edges,
-    tau_x: Float[Array, ""] | float,
-    tau_t: Float[Array, ""] | float,
-) -> Float[Array, "t n e"]:
-    """w_uv = exp(-|x_u - x_v|^2 / tau_x^2) max(0, cos(f_u, f_v)) exp(-|t_u - t_v| / tau_t) (eq. 8); 0 where
-    there is no edge.
-
-    Args:
-        positions, tau_x: in metres.
-        features: the teacher's.
-        times, tau_t: in seconds.
-    """
-    positions, placed = _present(positions)
-    features, there = _present(features)
-    squared = jnp.sum((positions[:, :, None] - _at_ends(positions, edges)) ** 2, axis=-1)
-    cosines, known = _edge_cosines(features, edges, there & placed)
-    apart = jnp.abs(times[:, None] - times[_end_frames(edges)])[:, None, :]
-    weights = jnp.exp(-squared / tau_x**2 - apart / tau_t) * jnp.maximum(cosines, 0.0)
-    return jnp.where(known, weights, 0.0)
-
-
-# -- affinities ----------------------------------------------------------------------------------------------
-
-
-def affinities(
-    features: Features, offset: int, valid: There | None = None, matching: Matching = Matching()
-) -> Float[Array, "s n n"]:
-    """A of frames 0 and `offset`, 1 and `offset` + 1, ... (eqs. 9 and 10): Sinkhorn of Phi_U Phi_V^T, Phi the
-    layer-normalised features, at temperature tau sqrt(d).
-
-    No node is matched with itself: that score is the highest there is, and would take most of its row.
-
-    Args:
-        features: of n nodes in t frames.
-        offset: frames between the two that are matched, 0 or more.
-        valid: which nodes are there; all unless given.
-        matching: temperature, slack and iterations.
-    """
-    features, there = _present(features, valid)
-    scores = _products(_layer_normalized(features), offset)
-    if offset == 0:
-        scores = jnp.where(jnp.eye(scores.shape[-1], dtype=bool), -jnp.inf, scores)
-
-    def match(scores, rows, columns):
-        return sinkhorn(
-            scores,
-            matching.temperature * features.shape[-1] ** 0.5,
-            rows=rows,
-            columns=columns,
-            slack=matching.slack,
-            iterations=matching.iterations,
-            derivative=matching.derivative,
-        )
-
-    return jax.vmap(match)(scores, there[: len(scores)], there[offset:])
-
-
-def edge_affinities(
-    features: Features, edges: Edges, valid: There | None = None, matching: Matching = Matching()
-) -> Float[Array, "t n e"]:
-    """A of each edge, times the number of nodes that it might have led to: chance gives 1.
-
-    For rows of A sum to 1: with twice the nodes its entries, and a loss of them, would be half of what they
-    were.
-
-    Args:
-        features: of n nodes in t frames.
-        edges: between them.
-        valid: which nodes are there; all unless given.
-        matching: how features become affinities.
-    """
-    _, there = _present(features, valid)
-    known = {reach: affinities(features, reach, there, matching) for reach in {*map(abs, edges.offsets)}}
-    runs, first = [jnp.zeros((*there.shape, 0), features.dtype)], 0
-    for offset, run in groupby(edges.offsets):
-        last = first + len(tuple(run))
-        starts = slice(max(-offset, 0), len(there) - max(offset, 0))
-        matrix = known[abs(offset)] if offset >= 0 else known[-offset].swapaxes(1, 2)
-        runs.append(_framed(jnp.take_along_axis(matrix, edges.nodes[starts, :, first:last], axis=2), offset))
-        first = last
-    choices = there.sum(axis=1)[_end_frames(edges)] - (np.array(edges.offsets) == 0)
-    return jnp.concatenate(runs, axis=2) * choices[:, None]
-
-
-# -- losses --------------------------------------------------------------------------------------------------
 
 
 def orthonormal_projection(key: PRNGKeyArray, channels: int, width: int) -> Float[Array, "width channels"]:
@@ -252,8 +51,8 @@ def node_loss(
         teacher: V^F, which gets no gradient.
         valid: which nodes are there; all unless given.
     """
-    teacher, known = _present(jax.lax.stop_gradient(teacher), valid)
-    features, there = _present(features, known)
+    teacher, known = present(jax.lax.stop_gradient(teacher), valid)
+    features, there = present(features, known)
     squared = jnp.where(there, jnp.sum((features - teacher) ** 2, axis=-1), 0.0)
     apart = squared > 0  # where not, a length has no slope
     return weighted_mean(jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0), there * 1.0)
@@ -280,8 +79,8 @@ def structure_loss(
         valid: which nodes are there; all unless given.
         matching: how features become affinities, as for `wanted`.
     """
-    features, there = _present(features, valid)
-    live = _live(edges, there) * 1.0
+    features, there = present(features, valid)
+    live = live_edges(edges, there) * 1.0
     weights = live if weights is None else jax.lax.stop_gradient(weights) * live
     found = edge_affinities(features, edges, there, matching)
     return weighted_mean(jnp.abs(found - jax.lax.stop_gradient(wanted)), weights)
@@ -298,104 +97,6 @@ def similarity_loss(features: Features, edges: Edges, valid: There | None = None
         edges: between nodes that are to be alike.
         valid: which nodes are there; all unless given.
     """
-    features, there = _present(features, valid)
-    cosines, known = _edge_cosines(features, edges, there)
+    features, there = present(features, valid)
+    cosines, known = edge_cosines(features, edges, there)
     return weighted_mean((1 - cosines) ** 2, known * 1.0)
-
-
-# -- parts of these ------------------------------------------------------------------------------------------
-
-
-def _present(
-    values: Float[Array, "*n c"], valid: Bool[Array, "*n"] | None = None
-) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
-    """Values with 0 where absent or not finite, for 0 times NaN would spread; and where they are there."""
-    there = jnp.isfinite(values).all(axis=-1)
-    if valid is not None:
-        there &= valid
-    return jnp.where(there[..., None], values, 0.0), there
-
-
-def _layer_normalized(features: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-    """Each with mean 0 and variance 1 over its channels; 0, without a slope, where all those are alike."""
-    centred = features - features.mean(axis=-1, keepdims=True)
-    variance = jnp.mean(centred**2, axis=-1, keepdims=True)
-    varies = variance > _LEAST * (1 + jnp.mean(features**2, axis=-1, keepdims=True))
-    return jnp.where(varies, centred / jnp.sqrt(jnp.where(varies, variance, 1.0)), 0.0)
-
-
-def _products(features: Features, offset: int) -> Float[Array, "s n n"]:
-    """Of every node with every one `offset` frames later."""
-    earlier, later = features[: len(features) - offset], features[offset:]
-    return jnp.matmul(earlier, later.swapaxes(1, 2), precision="highest")
-
-
-def _squared_distances(positions: Float[Array, "t n c"]) -> Float[Array, "t n n"]:
-    """Of differences, as products would lose what is near."""
-    return jnp.sum((positions[:, :, None] - positions[:, None]) ** 2, axis=-1)
-
-
-def _pairs(there: There, offset: int) -> Bool[Array, "s n n"]:
-    """Which nodes an edge may tie: both there, and not a node with itself."""
-    pairs = there[: len(there) - offset, :, None] & there[offset:, None, :]
-    return pairs & ~jnp.eye(there.shape[1], dtype=bool) if offset == 0 else pairs
-
-
-def _strongest(
-    scores: Callable[[int], Float[Array, "s n n"]], there: There, k: int, window: int = 0
-) -> Edges:
-    """Edges to the `k` of highest score in the same frame, or with a window in each of the others.
-
-    Args:
-        scores: of pairs of nodes, for each number of frames between them.
-    """
-    edges = Edges(jnp.zeros((*there.shape, 0), jnp.int32), jnp.zeros((*there.shape, 0), bool), ())
-    for offset in range(1, min(window, len(there) - 1) + 1) if window else (0,):
-        ranked = jnp.where(_pairs(there, offset), scores(offset), -jnp.inf)
-        edges |= _highest(ranked, k, offset)
-        if offset:
-            edges |= _highest(ranked.swapaxes(1, 2), k, -offset)
-    return edges
-
-
-def _highest(scores: Float[Array, "s n n"], k: int, offset: int) -> Edges:
-    """Edges from rows to the columns of highest score; -inf is for no pair."""
-    n = scores.shape[-1]
-    highest, nodes = jax.lax.top_k(scores, min(k, n))
-    valid = highest > -jnp.inf
-    missing = [(0, 0), (0, 0), (0, max(k - n, 0))]
-    nodes, valid = (_framed(jnp.pad(a, missing), offset) for a in (jnp.where(valid, nodes, 0), valid))
-    return Edges(nodes, valid, (offset,) * k)
-
-
-def _framed(values: Shaped[Array, "s ..."], offset: int) -> Shaped[Array, "t ..."]:
-    """With zeros for the frames from which so many lead out of the window."""
-    return jnp.pad(values, [(max(-offset, 0), max(offset, 0))] + [(0, 0)] * (values.ndim - 1))
-
-
-def _end_frames(edges: Edges) -> Int[Array, "t e"]:
-    """Where edges end, kept within the frames there are."""
-    frames = len(edges.nodes)
-    ends = np.arange(frames)[:, None] + np.array(edges.offsets, int)
-    return jnp.asarray(ends.clip(0, frames - 1))
-
-
-def _at_ends(values: Shaped[Array, "t n ..."], edges: Edges) -> Shaped[Array, "t n e ..."]:
-    """What the node has in which an edge ends."""
-    return values[_end_frames(edges)[:, None], edges.nodes]
-
-
-def _live(edges: Edges, there: There) -> Bool[Array, "t n e"]:
-    """Edges between nodes that are there."""
-    return edges.valid & there[:, :, None] & _at_ends(there, edges)
-
-
-def _edge_cosines(
-    features: Features, edges: Edges, there: There
-) -> tuple[Float[Array, "t n e"], Bool[Array, "t n e"]]:
-    """Of the two features that an edge ties; and where both are there and have a length."""
-    squared = jnp.sum(features**2, axis=-1)
-    products = jnp.sum(features[:, :, None] * _at_ends(features, edges), axis=-1)
-    one = jnp.broadcast_to(squared[:, :, None], products.shape)
-    cosines = 1 - cosine_error(Likeness(one, products, _at_ends(squared, edges)))
-    return cosines, _live(edges, there & (squared > _LEAST))

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.losses.graph import (
+from gsjax.losses.edges import (
     Edges,
     Matching,
     affinities,

@@ -314,5 +314,3 @@ def _as_large(one: PictureFeatures, photographs: Photographs, i: int) -> Int[np.
     if one.ids.shape == (height, width):
         return one.ids
     return cv2.resize(one.ids, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-
-

@@ -24,7 +24,8 @@ from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
 from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
 from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
-from gsjax.methods.motion_parts.operations import Edit, label
+from gsjax.methods.motion_parts.operation import Edit
+from gsjax.methods.motion_parts.operations import label
 from gsjax.methods.motion_parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
 from gsjax.methods.motion_parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options

@@ -146,5 +146,3 @@ def _true_paths(
             motion = poses @ np.linalg.inv(poses[0])
             true[name] = motion[:, :3, :3] @ paths[name][0] + motion[:, :3, 3]
     return true
-
-

@@ -51,7 +51,6 @@ class Views(Protocol):
         ...
 
 
-
 class Start(NamedTuple):
     """What is known before anything is followed.
 

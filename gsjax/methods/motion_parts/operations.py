@@ -19,104 +19,21 @@ from gsjax.methods.motion_parts.entries import (
     did_you_mean,
     instance,
     number,
-    part_list,
     read,
     told,
     vector,
     whole,
 )
 from gsjax.methods.motion_parts.film import Film, Layer, composite, placed
+from gsjax.methods.motion_parts.operation import SECONDS, Edit, LookEdit, TimeEdit
 from gsjax.methods.motion_parts.trajectory import Trajectory
 
-_SECONDS = number("seconds from the film's start, 0 or more", 0.0)
 _AXIS = vector("a direction of the world", least=1e-6)
 _POINT = vector("a point in metres")
 _DEGREES = number("degrees")
 _OPACITY = number("a factor on opacities, 0 to 1", 0.0, 1.0)
 _RATE = number("a factor from 0.01 to 100, or from -0.01 to -100 for backwards", 0.01, 100.0, of=abs)
 _SIZE = number("a factor from 0.001 to 1000", 1e-3, 1e3)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Edit(Entry):
-    """One operation on some parts of the film's first layer, from some time on until another.
-
-    Attributes:
-        parts: names or numbers; 0 is the background, "all" every one.
-        begin, end: `from` and `to`; None is the film's own.
-    """
-
-    parts: tuple[str | int, ...] = field(
-        metadata={"check": part_list, "wanted": "a name, a number, all, or several as [drawer, 2]"}
-    )
-    begin: float | None = field(default=None, metadata=_SECONDS | {"key": "from"})
-    end: float | None = field(default=None, metadata=_SECONDS | {"key": "to"})
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.begin is not None and self.end is not None and not self.begin < self.end:
-            raise ValueError(f"to: expected a time after from, {self.begin:g}, found {self.end:g}")
-
-    @classmethod
-    def operation(cls) -> str:
-        """Its name in scripts."""
-        return cls.__name__.lower()
-
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Which parts change, if these are named and the motion of each part of the scene ends at `lasts`."""
-        return parts
-
-    def ends(self, last: float) -> float:
-        """When the motion of a part that concerns it ends, if it ended at `last`, seconds."""
-        return last
-
-    def adds_until(self, last: float) -> float:
-        """When the motion ends of what it adds to the film, which is that of a part that ends at `last`."""
-        return 0.0
-
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
-        """The film after it.
-
-        Args:
-            parts: those that change.
-            lasts: when the motion of each part of the first layer ends, seconds.
-        """
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class TimeEdit(Edit):
-    """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
-
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Those that still move at `from`: what is over stands still, whatever is done to all."""
-        begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
-        moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
-        if not moving:
-            told = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
-            expected = f"a time before {last:g}, where the motion of {told} ends"
-            raise ValueError(f"from: expected {expected}, found {begin:g}")
-        return moving
-
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
-        trajectory = film[0].trajectory
-        for part in parts:
-            trajectory = self.retimed(trajectory, [part], *self.stretch(lasts[part]))
-        return Layer(film[0].scene, trajectory), *film[1:]
-
-    def stretch(self, last: float) -> tuple[float, float]:
-        """From when to when, for a part whose motion ends at `last`."""
-        return self.begin or 0.0, last if self.end is None else self.end
-
-    def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
-        """The trajectory after it.
-
-        Args:
-            trajectory: of all parts.
-            parts: whose time is changed.
-            begin, end: between which it is, seconds.
-        """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +73,7 @@ class Loop(TimeEdit):
 class Freeze(TimeEdit):
     """Parts stand still as they were `at` a time, and go on from there after `to`, if that is given."""
 
-    at: float | None = field(default=None, metadata=_SECONDS)
+    at: float | None = field(default=None, metadata=SECONDS)
 
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return parts
@@ -183,30 +100,6 @@ class Isolate(Freeze):
 
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LookEdit(Edit):
-    """Holds from `from` until `to`, coming and going within `ease` seconds inside of these bounds."""
-
-    ease: float = field(default=0.0, metadata=number("seconds, 0 or more", 0.0))
-
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
-        return Layer(film[0].scene, self.changed(film[0], parts, self.share(film))), *film[1:]
-
-    def share(self, film: Film) -> Float[Array, "T"]:
-        """How far it holds at each moment, 0 to 1."""
-        return edits.during(film[0].trajectory.times, self.begin, self.end, self.ease)
-
-    def changed(self, layer: Layer, parts: list[int], share: Float[Array, "T"]) -> Trajectory:
-        """The layer's trajectory after it.
-
-        Args:
-            layer: the scene and its trajectory.
-            parts: that are changed.
-            share: of the change in each frame, 0 to 1.
-        """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,7 +160,7 @@ class Redirect(LookEdit):
     axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
     degrees: float = field(metadata=_DEGREES | {"example": 30})
     about: Vector | None = field(default=None, metadata=_POINT)
-    at: float | None = field(default=None, metadata=_SECONDS)
+    at: float | None = field(default=None, metadata=SECONDS)
 
     def changed(self, layer, parts, share):
         turn, arm = _turn(self.axis, self.degrees), _arm(layer, parts, self.about)
@@ -279,7 +172,7 @@ class Amplify(LookEdit):
     """Parts go so many times as far from where they were `at` a time, the film's start unless given."""
 
     factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
-    at: float | None = field(default=None, metadata=_SECONDS)
+    at: float | None = field(default=None, metadata=SECONDS)
 
     def changed(self, layer, parts, share):
         return edits.amplify(layer.trajectory, parts, self.factor, self.at, share)

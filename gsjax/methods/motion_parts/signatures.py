@@ -5,7 +5,8 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from gsjax.methods.motion_parts.entries import Entry, key_of
-from gsjax.methods.motion_parts.operations import OPERATIONS, Edit, LookEdit
+from gsjax.methods.motion_parts.operation import Edit, LookEdit
+from gsjax.methods.motion_parts.operations import OPERATIONS
 
 _COMMON = {f.name for kind in (Edit, LookEdit) for f in fields(kind)}  # what an operation shares with others
 

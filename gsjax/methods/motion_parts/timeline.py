@@ -25,7 +25,8 @@ from jaxtyping import Float
 from gsjax.methods.motion_parts.edits import at_times
 from gsjax.methods.motion_parts.entries import ALL, Entry, did_you_mean, key_of, number, read
 from gsjax.methods.motion_parts.film import Film, Layer, trimmed
-from gsjax.methods.motion_parts.operations import Composite, Edit, label, read_edits
+from gsjax.methods.motion_parts.operation import Edit
+from gsjax.methods.motion_parts.operations import Composite, label, read_edits
 from gsjax.methods.motion_parts.trajectory import BACKGROUND, Trajectory
 
 Names = Mapping[str, int]

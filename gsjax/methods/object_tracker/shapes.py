@@ -92,7 +92,6 @@ class Shape(Protocol):
         ...
 
 
-
 def scene_from_shapes(
     shapes: Sequence[Shape], frame: Frame, config: TrackerConfig | None = None
 ) -> TrackedScene:

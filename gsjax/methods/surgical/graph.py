@@ -17,18 +17,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera, pixels_of, project
 from gsjax.geometry.sampling import farthest_points
-from gsjax.losses.graph import (
+from gsjax.losses.edges import (
     Edges,
     Matching,
     edge_affinities,
     edge_weights,
-    node_loss,
     similar_edges,
-    similarity_loss,
     spatial_edges,
-    structure_loss,
     temporal_edges,
 )
+from gsjax.losses.graph import node_loss, similarity_loss, structure_loss
 from gsjax.methods.settings import expect
 from gsjax.methods.surgical.start import Look, known_depth
 
