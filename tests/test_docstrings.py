@@ -7,6 +7,7 @@ says what is raised, and gives the shapes of arrays that their annotations leave
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -26,18 +27,41 @@ Definition = ast.Module | ast.ClassDef | ast.FunctionDef
 def definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
     """All that is public in a module, and the module itself; no method that a base class documents."""
     yield "the module", tree
-    told: dict[str, set[str]] = {}  # by class, the methods that it or its bases document
+    told = documented(tree)
     for node in tree.body:
-        if not isinstance(node, ast.ClassDef | ast.FunctionDef):
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef) or node.name.startswith("_"):
             continue
-        if not node.name.startswith("_"):
-            yield node.name, node
+        yield node.name, node
         if isinstance(node, ast.ClassDef):
-            methods = [member for member in node.body if isinstance(member, ast.FunctionDef)]
             inherited = set().union(*(told.get(ast.unparse(base), set()) for base in node.bases))
-            told[node.name] = inherited | {m.name for m in methods if ast.get_docstring(m)}
-            public = [m for m in methods if not (m.name.startswith("_") or m.name in inherited)]
-            yield from ((f"{node.name}.{m.name}", m) for m in public if not node.name.startswith("_"))
+            public = [m for m in methods(node) if not (m.name.startswith("_") or m.name in inherited)]
+            yield from ((f"{node.name}.{m.name}", m) for m in public)
+
+
+def documented(tree: ast.Module) -> dict[str, set[str]]:
+    """By class that a module has or takes from another of ours, the methods that it or its bases document."""
+    told: dict[str, set[str]] = {}
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gsjax."):
+            file = PACKAGE.parent.joinpath(*node.module.split(".")).with_suffix(".py")
+            classes = [alias.name for alias in node.names if alias.name[0].isupper()]
+            if classes and file.exists():
+                there = documented_in(file)
+                told |= {name: there[name] for name in classes if name in there}
+        elif isinstance(node, ast.ClassDef):
+            inherited = set().union(*(told.get(ast.unparse(base), set()) for base in node.bases))
+            told[node.name] = inherited | {m.name for m in methods(node) if ast.get_docstring(m)}
+    return told
+
+
+@cache
+def documented_in(file: Path) -> dict[str, set[str]]:
+    """The same of a file."""
+    return documented(ast.parse(file.read_text(encoding="utf-8")))
+
+
+def methods(node: ast.ClassDef) -> list[ast.FunctionDef]:
+    return [member for member in node.body if isinstance(member, ast.FunctionDef)]
 
 
 def faults(node: Definition) -> Iterator[str]:
