@@ -1,6 +1,6 @@
 """`gsjax query` on a field: what it finds, writes, refuses, and where it looks for what a field is of.
 
-The fields are made up, one row a class: that of a distillation is asked in test_field.py.
+The fields are made up, one row a class: that of a distillation is asked in test_ply.py.
 """
 
 import json
@@ -8,19 +8,14 @@ import shutil
 
 import cv2
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.cli.distill import pictures as field_pictures
-from gsjax.cli.distill.saved import short_names
 from gsjax.cli.distill.source import Source
-from gsjax.geometry.cameras import Camera
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook
-from gsjax.scene.gaussians import gaussians_from_activated
-from gsjax.viz.viewer.drawing import Drawer
 from tests.cli.conftest import LABELS, first_picture, write_made_field
 
 CAN, CARTON, BALL = 3, 2, 4
@@ -155,19 +150,6 @@ def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, mo
     assert code == 0, said
     assert drawers[0]._program._cache_size() == 1
     assert read == [scene[0]]
-
-
-def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
-    random = np.random.default_rng(0)
-    means, quats = random.uniform(-1, 1, (20, 3)), random.normal(size=(20, 4))
-    shN = random.normal(size=(20, 3, 3)) * 0.3
-    shiny = gaussians_from_activated(means, quats, np.full((20, 3), 0.2), np.full(20, 0.8), means**2, shN=shN)
-    pose, K = np.eye(4), np.array([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
-    pose[2, 3] = 4
-    camera = Camera(jnp.asarray(pose[None], float), jnp.asarray(K[None], float), 24, 18)
-    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_pictures._seen_from(shiny, camera)))
-    assert drawn.max() > 0.2
-    np.testing.assert_allclose(painted, drawn, atol=1e-5)
 
 
 def test_a_point_means_the_thing_that_it_shows(gsjax, field, scene, pristine):
@@ -408,9 +390,3 @@ def test_rows_that_cannot_be_drawn_are_counted_and_rows_are_the_files(gsjax, pri
     np.testing.assert_array_equal(found["indices"], np.flatnonzero(scene[1] == CAN)[2:])
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["all_scores"])), lost)
     assert read_ply(field / "query" / "without.ply")[0].num == (left != CAN).sum()
-
-
-def test_photographs_have_short_names():
-    assert short_names(["3/000000", "12/000000"]) == ("3", "12")
-    assert short_names(["images/a.jpg", "images/b.jpg"]) == ("images_a", "images_b")
-    assert short_names(["a.png", "a.jpg"]) == ("a.png", "a.jpg")
