@@ -3,6 +3,8 @@
 from dataclasses import replace
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ from gsjax.methods.object_tracker import (
     TrackerConfig,
     start_scene,
 )
+from gsjax.methods.object_tracker.points import pixels_of_groups
+from tests.methods.carton import CARTON, CONFIG, SIZE, middle, see
 
 QUICK = replace(
     PRESETS["paper"],
@@ -50,6 +54,21 @@ def started(table):
     """The started scene of the table of 2 cameras."""
     _, frames, mask = table()
     return start_scene(frames[0], mask, 0, QUICK)
+
+
+@pytest.fixture(scope="session")
+def moved(table):
+    """(points of the carton in frame 6, its centre, frame 7, where the points are then,
+    the carton in the masks of frame 6)."""
+    sequence, frames, _ = table(8, 2, **SIZE)
+    labels = np.stack([sequence.mask(6, c) for c in range(2)])
+    labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
+    points = pixels_of_groups(see(frames[6]), labels, frames[6].depths, 1, CONFIG)
+    k = sequence.truth.names.index("carton")
+    motion = sequence.truth.poses[7, k] @ np.linalg.inv(sequence.truth.poses[6, k])
+    one = jax.tree.map(lambda a: a[0], points)
+    then = np.einsum("ij,cjp->cip", motion[:3, :3], np.asarray(one.means, np.float64)) + motion[:3, 3:]
+    return one, middle(one), see(frames[7]), then, labels
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,5 @@
 """`gsjax distill` on a PLY file of the built-in scene, whose first frame's masks teach; and that what it
-learned can be asked. What `gsjax query` does else is tested in test_field_query.py."""
+learned can be asked. What `gsjax query` does else is tested in test_query.py."""
 
 import json
 import shutil
@@ -10,22 +10,12 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.io.ply import write_ply
-from tests.cli.conftest import first_picture
 
 SMALL = ("--field.grid.levels", "4", "--field.grid.most-resolution", "32", "--field.grid.log2-entries", "12")
 SMALL += ("--field.grid.hidden", "16", "--field.channels", "16", "--field.contrast-patch", "8")
 SMALL += ("--field.rates.table", "0.1", "--field.rates.layers", "0.01", "--field.rates.lift", "0.02")
 TABLE = ("--field.encoding", "table")  # learns in fewer steps
 STEPS = 200
-
-
-@pytest.fixture(scope="module")
-def scene(pristine, tmp_path_factory):
-    """A Gaussian for every other pixel of all cameras' first pictures, in a PLY file."""
-    path = tmp_path_factory.mktemp("scene") / "scene.ply"
-    write_ply(path, first_picture(pristine)[0])
-    return path
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,60 +1,29 @@
-"""`gsjax query` on a field: what it finds, writes, refuses, and where it looks for what a field is of.
+"""`gsjax query` on a field: what it finds, writes and refuses.
 
-The fields are made up, one row a class: that of a distillation is asked in test_field.py.
+The fields are made up, one row a class: that of a distillation is asked in test_ply.py.
 """
 
-import json
 import shutil
 
 import cv2
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gsjax.cli.distill import pictures as field_pictures
-from gsjax.cli.distill.saved import short_names
 from gsjax.cli.distill.source import Source
-from gsjax.geometry.cameras import Camera
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook
-from gsjax.scene.gaussians import gaussians_from_activated
-from gsjax.viz.viewer.drawing import Drawer
-from tests.cli.conftest import LABELS, first_picture, write_made_field
+from tests.cli.conftest import LABELS, write_made_field
+from tests.cli.distill.conftest import CAN, NAMES, found_of, told_of
 
-CAN, CARTON, BALL = 3, 2, 4
-NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation counts them
+CARTON = 2
 
 
 @pytest.fixture(scope="module")
-def scene(pristine, tmp_path_factory):
-    """A PLY file with labels, and these."""
-    path = tmp_path_factory.mktemp("scene") / "scene.ply"
-    gaussians, labels = first_picture(pristine)
-    write_ply(path, gaussians, labels=labels)
-    return path, labels
-
-
-@pytest.fixture(scope="module")
-def made(pristine, scene, tmp_path_factory):
-    """The field of the classes."""
-    book = ClassCodebook(NAMES)
-    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
-    return write_made_field(
-        tmp_path_factory.mktemp("fields") / "field",
-        scene[0],
-        pristine,
-        Source("classes", NAMES),
-        scene[1],
-        vectors,
-    )
-
-
-@pytest.fixture
-def field(made, tmp_path):
-    """A copy of it to ask and to corrupt."""
-    return shutil.copytree(made, tmp_path / "field")
+def scene(labelled):
+    return labelled
 
 
 @pytest.fixture(scope="module")
@@ -73,23 +42,6 @@ def closed(pristine, scene, tmp_path_factory):
         scene[1],
         vectors,
     )
-
-
-def told_of(field):
-    return json.loads((field / "query" / "query.json").read_text())
-
-
-def change(field, how):
-    """What field.npz says about itself."""
-    told = dict(np.load(field / "field.npz"))
-    about = json.loads(str(told["about"]))
-    how(about)
-    np.savez(field / "field.npz", **{**told, "about": np.array(json.dumps(about))})
-
-
-def found_of(field):
-    with np.load(field / "query" / "selection.npz") as found:
-        return dict(found)
 
 
 def panels(folder):
@@ -157,19 +109,6 @@ def test_the_scene_is_read_once_and_drawn_by_one_program(gsjax, field, scene, mo
     assert read == [scene[0]]
 
 
-def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
-    random = np.random.default_rng(0)
-    means, quats = random.uniform(-1, 1, (20, 3)), random.normal(size=(20, 4))
-    shN = random.normal(size=(20, 3, 3)) * 0.3
-    shiny = gaussians_from_activated(means, quats, np.full((20, 3), 0.2), np.full(20, 0.8), means**2, shN=shN)
-    pose, K = np.eye(4), np.array([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
-    pose[2, 3] = 4
-    camera = Camera(jnp.asarray(pose[None], float), jnp.asarray(K[None], float), 24, 18)
-    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_pictures._seen_from(shiny, camera)))
-    assert drawn.max() > 0.2
-    np.testing.assert_allclose(painted, drawn, atol=1e-5)
-
-
 def test_a_point_means_the_thing_that_it_shows(gsjax, field, scene, pristine):
     truth = cv2.imread(str(pristine / "seg" / "1" / "000000.png"), cv2.IMREAD_UNCHANGED)
     inside = cv2.erode((truth == CARTON).astype(np.uint8), np.ones((3, 3)))
@@ -223,6 +162,25 @@ def test_everything_is_an_answer_with_a_warning(gsjax, field):
     assert len(panels(field / "query")) == 4  # nor is there a picture of it
 
 
+def test_rows_that_cannot_be_drawn_are_counted_and_rows_are_the_files(gsjax, pristine, scene, tmp_path):
+    gaussians, _ = read_ply(scene[0])
+    means = np.array(gaussians.means)
+    lost = np.flatnonzero(scene[1] == CAN)[:2]
+    means[lost, 0] = np.nan
+    file, book = tmp_path / "scene.ply", ClassCodebook(NAMES)
+    write_ply(file, eqx.tree_at(lambda g: g.means, gaussians, means), labels=scene[1])
+    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
+    left = np.delete(scene[1], lost)
+    field = write_made_field(tmp_path / "field", file, pristine, Source("classes", NAMES), left, vectors)
+    code, said = gsjax("query", field, "can", "--camera", 0)
+    assert code == 0, said
+    assert f"2 of {len(means)} Gaussians cannot be drawn" in said
+    found = found_of(field)
+    np.testing.assert_array_equal(found["indices"], np.flatnonzero(scene[1] == CAN)[2:])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["all_scores"])), lost)
+    assert read_ply(field / "query" / "without.ply")[0].num == (left != CAN).sum()
+
+
 # what it refuses
 
 
@@ -259,158 +217,3 @@ def test_a_question_that_cannot_be_answered_leaves_the_last_answer(gsjax, field,
         assert word in said, said
     assert said.endswith(f"({field / 'query'} still has an earlier answer)")
     assert (field / "query" / "query.json").read_text() == "{}"
-
-
-def test_a_field_that_is_damaged_is_refused(gsjax, field):
-    with np.load(field / "field.npz") as stored:
-        arrays = dict(stored)
-    for name, wrong in {"vectors": np.nan, "lift": np.inf}.items():
-        np.savez(field / "field.npz", **{**arrays, name: np.full_like(arrays[name], wrong)})
-        code, said = gsjax("query", field, "can")
-        assert code == 2
-        assert name in said
-    np.savez(field / "field.npz", **{**arrays, "vectors": arrays["vectors"][1:]})
-    code, said = gsjax("query", field, "can")
-    assert code == 2
-    assert "Gaussians" in said
-    (field / "field.npz").write_bytes(b"no archive")
-    code, said = gsjax("query", field, "can")
-    assert code == 2
-    assert "field.npz" in said
-
-
-def test_a_run_without_a_field_is_told_how_to_get_one(gsjax, tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "config.yml").write_text("# gsjax run\nfit: {}\ntest_every: 8\n")
-    code, said = gsjax("query", run, "can")
-    assert code == 2
-    assert f"expected a field, found none; gsjax distill {run} makes one" in said
-    (run / "field").mkdir()
-    (run / "field" / "config.yml").write_text("# gsjax run\nscene: x\nfeatures: auto\nfield: {}\n")
-    for path in (run, run / "field"):
-        code, said = gsjax("query", path, "can")
-        assert code == 2
-        assert f"{run / 'field'}: expected field.npz, found none yet: it is still being distilled" in said
-
-
-# what it leaves as it was
-
-
-def test_a_folder_of_somebody_else_is_left_alone(gsjax, field, tmp_path):
-    mine = tmp_path / "mine"
-    (mine / "query").mkdir(parents=True)
-    shutil.copy(field / "field.npz", mine)
-    (mine / "query" / "precious.txt").write_text("mine")
-    code, said = gsjax("query", mine, "can")
-    assert code == 2
-    assert "query: expected what gsjax writes there or nothing" in said
-    assert "found precious.txt" in said
-    assert (mine / "query" / "precious.txt").read_text() == "mine"
-    (mine / "query" / "precious.txt").rename(mine / "precious.txt")
-    code, said = gsjax("query", mine, "can")
-    assert code == 0, said
-    assert told_of(mine)["pixels"].keys() == {"0", "1", "2"}  # the file says which photographs there were
-    assert sorted(path.name for path in mine.iterdir()) == ["field.npz", "precious.txt", "query"]
-
-
-@pytest.mark.parametrize("problem", [KeyboardInterrupt, OSError("no space")])
-def test_an_answer_that_is_not_whole_leaves_the_one_before(gsjax, field, monkeypatch, problem):
-    assert gsjax("query", field, "can", "--camera", 0)[0] == 0
-    before = told_of(field)
-
-    def stopped(*args, **options):
-        raise problem
-
-    monkeypatch.setattr("gsjax.cli.distill.pictures.in_rows", stopped)
-    code, _ = gsjax("query", field, "carton", "--camera", 0)
-    assert code == (130 if problem is KeyboardInterrupt else 2)
-    assert told_of(field) == before
-    assert (field / "query" / "overview.png").is_file()
-    assert sorted(path.name for path in field.iterdir()) == ["config.yml", "field.npz", "query"]
-
-
-def test_a_photograph_that_cannot_be_read_is_done_without(gsjax, field, pristine, tmp_path):
-    images = shutil.copytree(pristine, tmp_path / "images")
-    for picture in (images / "ims").rglob("000000.*"):
-        picture.write_bytes(b"no picture")
-    code, said = gsjax("query", field, "can", "--images", images)
-    assert code == 0, said
-    assert "overview.png shows a render in place of a photograph" in said
-    assert (field / "query" / "overview.png").is_file()
-
-
-# where it looks
-
-
-def test_a_scene_is_found_by_what_is_in_it(gsjax, field, scene, tmp_path):
-    """Where it was there is another one now; the run that was moved whole has it in canonical/."""
-    run = tmp_path / "run"
-    (run / "canonical").mkdir(parents=True)
-    moved = shutil.move(field, run / "field")
-    change(moved, lambda about: about["scene"].update(file=str(run / "scene.ply")))
-    gaussians, _ = read_ply(scene[0])
-    write_ply(run / "scene.ply", gaussians)
-    shutil.copy(scene[0], run / "canonical" / "scene.ply")
-    code, said = gsjax("query", moved, "can", "--camera", 0)
-    assert code == 0, said
-    assert "is not as it was" not in said
-    assert told_of(moved)["scene"] == str(run / "canonical" / "scene.ply")
-    np.testing.assert_array_equal(read_ply(moved / "query" / "object.ply")[1].labels, CAN)
-    # Without it the other one is better than nothing, and that is said.
-    (run / "canonical" / "scene.ply").unlink()
-    code, said = gsjax("query", moved, "can", "--camera", 0)
-    assert code == 0, said
-    assert f"{run / 'scene.ply'} is not as it was when the field in {moved} was distilled" in said
-    (run / "scene.ply").unlink()
-    code, said = gsjax("query", moved, "can")
-    assert code == 2
-    assert "--scene names it" in said
-    code, said = gsjax("query", moved, "can", "--camera", 0, "--scene", scene[0])
-    assert code == 0, said
-    assert "is not as it was" not in said
-
-
-def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene, tmp_path):
-    change(field, lambda about: about["scene"]["photographs"].update(images=str(tmp_path / "gone")))
-    code, said = gsjax("query", field, "can")
-    assert code == 0, said
-    assert "its photographs cannot be read, so nothing is drawn" in said
-    assert "--images says where they are now" in said
-    assert not (field / "query" / "masks").exists()
-    for options in (("can",), ("--point", "1,1")):
-        code, said = gsjax("query", field, *options, "--camera", 0)
-        assert code == 2
-        assert "--camera: expected photographs, found none" in said
-    code, said = gsjax("query", field, "can", "--images", pristine, "--camera", 2)
-    assert code == 0, said
-    assert [path.name for path in (field / "query" / "masks").iterdir()] == ["2.png"]
-    change(field, lambda about: about["scene"].pop("photographs"))
-    code, said = gsjax("query", field, "can")
-    assert code == 0, said
-    assert "field.npz: expected which photographs it learned from, found others" in said
-
-
-def test_rows_that_cannot_be_drawn_are_counted_and_rows_are_the_files(gsjax, pristine, scene, tmp_path):
-    gaussians, _ = read_ply(scene[0])
-    means = np.array(gaussians.means)
-    lost = np.flatnonzero(scene[1] == CAN)[:2]
-    means[lost, 0] = np.nan
-    file, book = tmp_path / "scene.ply", ClassCodebook(NAMES)
-    write_ply(file, eqx.tree_at(lambda g: g.means, gaussians, means), labels=scene[1])
-    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
-    left = np.delete(scene[1], lost)
-    field = write_made_field(tmp_path / "field", file, pristine, Source("classes", NAMES), left, vectors)
-    code, said = gsjax("query", field, "can", "--camera", 0)
-    assert code == 0, said
-    assert f"2 of {len(means)} Gaussians cannot be drawn" in said
-    found = found_of(field)
-    np.testing.assert_array_equal(found["indices"], np.flatnonzero(scene[1] == CAN)[2:])
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["all_scores"])), lost)
-    assert read_ply(field / "query" / "without.ply")[0].num == (left != CAN).sum()
-
-
-def test_photographs_have_short_names():
-    assert short_names(["3/000000", "12/000000"]) == ("3", "12")
-    assert short_names(["images/a.jpg", "images/b.jpg"]) == ("images_a", "images_b")
-    assert short_names(["a.png", "a.jpg"]) == ("a.png", "a.jpg")

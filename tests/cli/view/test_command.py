@@ -8,108 +8,21 @@ import subprocess
 import sys
 import urllib.request
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from rich.console import Console
 
-from gsjax.cli import main
 from gsjax.cli.distill.saved import Whereabouts
-from gsjax.cli.distill.source import Source
-from gsjax.cli.fit.command import Options as FitOptions
-from gsjax.cli.messages import Notes
-from gsjax.cli.run.folder import RunFolder
-from gsjax.cli.track.command import Options as TrackOptions
-from gsjax.cli.track.loop import Tracking
-from gsjax.cli.track.outputs import write_tracking
-from gsjax.cli.view.command import screenshots
 from gsjax.cli.view.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.motion_parts import gaussians_at, moment
-from gsjax.methods.object_tracker import Pose, TrackedScene
-from gsjax.methods.reconstruction import FitConfig
-from gsjax.perception.codebook import ClassCodebook
-from gsjax.scene.gaussians import gaussians_from_activated
-from tests.cli.conftest import write_made_field
 from tests.cli.parts.test_edit import scene_and_trajectory
 from tests.cli.parts.test_edit import write_run as write_parts_run
+from tests.cli.view.conftest import some
 
 pytest.importorskip("viser", reason="viser is not installed")
-
-
-def some(count=30):
-    rng = np.random.default_rng(0)
-    return gaussians_from_activated(
-        rng.normal(size=(count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.uniform(0.05, 0.1, (count, 3)),
-        rng.uniform(0.2, 0.9, count),
-        rng.uniform(size=(count, 3)),
-    )
-
-
-@pytest.fixture
-def ply(tmp_path) -> Path:
-    write_ply(tmp_path / "things.ply", some(), labels=np.arange(30) % 2)
-    return tmp_path / "things.ply"
-
-
-@pytest.fixture
-def fitted(photographs, tmp_path) -> Path:
-    """What a fit of the photographs leaves, but for its pictures."""
-    folder = RunFolder(tmp_path / "fitted")
-    folder.write_config(FitOptions(str(photographs), folder.path, fit=FitConfig(antialiased=True)))
-    folder.write_metrics({"kind": "fit", "complete": True})
-    write_ply(folder.scene, some())
-    return folder.path
-
-
-@pytest.fixture
-def tracked(recording, tmp_path) -> Path:
-    """What tracking leaves, but for its pictures: 12 of 30 Gaussians, of two objects, shift by 1 cm a frame.
-    Camera 2 was held out."""
-    gaussians, labels = some(), np.where(np.arange(30) < 12, 1 + np.arange(30) % 2, 0)
-    scene = TrackedScene(gaussians, jnp.zeros((12, 3)), jnp.asarray(labels), (0, 2, 3), 12)
-    means, quats = gaussians.means[:12], gaussians.quats[:12]
-    poses = jax.device_get([Pose(means + 0.01 * t, quats) for t in range(4)])
-    seen = [np.ones(2, bool)] * 3
-    tracking = Tracking(scene, poses, update_s=[0.0] * 4, lost=[~known for known in seen], turn_known=seen)
-    folder = RunFolder(tmp_path / "tracked")
-    folder.write_config(TrackOptions(str(recording), folder.path, cameras=(0, 1), eval_cameras=(2,)))
-    write_tracking(folder, tracking, np.arange(4) / 10)
-    objects = {"carton": {"label": 2}, "can": {"label": 3}}
-    folder.write_metrics({"mask": {"camera": 0, "source": "files"}, "objects": objects, "complete": True})
-    return folder.path
-
-
-@pytest.fixture
-def notes():
-    with Notes(Console(stderr=True)) as notes:
-        yield notes
-
-
-@pytest.fixture
-def view(capfd, monkeypatch):
-    """Runs the command as if Ctrl-C came at once; returns the exit code and what was said, spaces as one."""
-
-    def interrupted(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("gsjax.viz.viewer.Viewer.wait", interrupted)
-
-    def call(*arguments) -> tuple[int, str]:
-        capfd.readouterr()
-        code = main(["view", *map(str, arguments)])
-        said = "".join(capfd.readouterr())
-        assert "Traceback" not in said
-        return code, " ".join(said.split())
-
-    return call
 
 
 # what it opens
@@ -136,6 +49,13 @@ def test_a_fit_whose_photographs_are_gone_is_shown_without(fitted, notes):
     assert scene.shots is None
     assert scene.antialiased
     assert any("its photographs are not shown: /nowhere/at/all" in note for note in notes.all)
+
+
+def test_photographs_of_a_fit_that_moved(fitted, photographs, notes):
+    config = fitted / "config.yml"
+    config.write_text(config.read_text().replace(str(photographs), "/nowhere/at/all"))
+    scene, _ = open_viewable(fitted, notes, Whereabouts(images=str(photographs)))
+    assert len(scene.shots.names) == 9
 
 
 def test_a_tracked_scene_over_time(tracked, notes):
@@ -221,144 +141,6 @@ def replace_first_mean(gaussians, value):
     return replace(gaussians, means=gaussians.means.at[0, 0].set(value))
 
 
-# what can be asked
-
-
-NAMES = {1: "table", 2: "can"}
-CODES = np.stack([ClassCodebook(NAMES).embed_text(name) for name in NAMES.values()])
-
-
-@pytest.fixture
-def asked(fitted) -> Path:
-    """The field of a fit, whose odd Gaussians are a can."""
-    labels, source = np.arange(30) % 2, Source("classes", NAMES)
-    return write_made_field(fitted / "field", fitted / "scene.ply", None, source, labels, CODES)
-
-
-def test_a_fit_is_asked_by_its_field(fitted, asked, notes):
-    scene, _ = open_viewable(fitted, notes)
-    assert scene.asking is not None
-    assert scene.shots is not None
-    assert scene.asking.hint == "One of: can, table"
-    found = scene.asking.ask("can", 0)
-    np.testing.assert_array_equal(found.scores > found.threshold, np.arange(30) % 2 == 1)
-    found = scene.asking.like(4, 0)
-    np.testing.assert_array_equal(found.scores > found.threshold, np.arange(30) % 2 == 0)
-    with pytest.raises(ValueError, match="no class 'spoon'"):
-        scene.asking.ask("spoon", 0)
-    assert not any("field" in note for note in notes.all)
-
-
-def test_a_scene_is_read_once(fitted, asked, notes, monkeypatch):
-    read = []
-    monkeypatch.setattr("gsjax.cli.run.files.read_ply", lambda file: read.append(file) or read_ply(file))
-    open_viewable(fitted, notes)
-    assert read == [fitted / "scene.ply"]
-
-
-def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_path, notes, view):
-    write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3)  # not as it was
-    scene, _ = open_viewable(fitted, notes)
-    assert any("is not as it was when the field in" in note for note in notes.all)
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    shutil.copy(asked / "field.npz", mine)
-    shutil.move(fitted / "scene.ply", tmp_path / "moved.ply")
-    code, said = view(mine, "--port", 0)
-    assert code == 2
-    assert "--scene names it" in said
-    code, said = view(mine, "--port", 0, "--scene", tmp_path / "moved.ply")
-    assert code == 130, said
-    assert "can be asked" in said
-    scene, folder = open_viewable(mine, notes, Whereabouts(tmp_path / "moved.ply"))
-    assert folder == mine
-    np.testing.assert_array_equal(scene.labels, np.arange(30) % 3)
-
-
-def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, monkeypatch):
-    write_ply(fitted / "scene.ply", some(), labels=np.arange(30) % 3)
-    asking, selected = open_viewable(fitted, notes)[0].asking, np.arange(30) < 4
-    paths = [asking.save(selected, "The Can, object", 0) for _ in range(2)]
-    assert [path.name for path in paths] == ["the_can_object.ply", "the_can_object_2.ply"]
-    gaussians, report = read_ply(paths[1])
-    np.testing.assert_array_equal(gaussians.means, some().means[:4])
-    np.testing.assert_array_equal(report.labels, [0, 1, 2, 0])
-
-    def full(*args, **options):
-        raise OSError("no space")
-
-    monkeypatch.setattr("gsjax.cli.query.selected.write_ply", full)
-    with pytest.raises(OSError, match="no space"):
-        asking.save(selected, "x", 0)
-    assert sorted(asked.joinpath("extracted").iterdir()) == paths
-
-
-def test_who_reads_texts_is_loaded_once(fitted, asked, notes, monkeypatch):
-    encoder, loaded = Source.encoder, []
-    monkeypatch.setattr(
-        Source, "encoder", lambda self, weights: loaded.append(weights) or encoder(self, weights)
-    )
-    asking = open_viewable(fitted, notes)[0].asking
-    assert not loaded
-    for text in ("can", "table", "can"):
-        asking.ask(text, 0)
-    assert len(loaded) == 1
-
-
-@pytest.mark.parametrize(
-    ("source", "hint"),
-    [
-        (Source("closed", {1: "table"}), "Colours and outlines: black"),
-        (Source("files"), "No words (--weights"),
-        (Source("clip", weights="x"), "Any words"),
-    ],
-)
-def test_what_can_be_asked_for_is_said(fitted, notes, source, hint):
-    labels, vectors = np.arange(30) % 2, np.eye(2)
-    write_made_field(fitted / "field", fitted / "scene.ply", None, source, labels, vectors)
-    asking = open_viewable(fitted, notes)[0].asking
-    assert asking.hint.startswith(hint)
-    if source.kind == "files":
-        with pytest.raises(ValueError, match="--weights names its folder"):
-            asking.ask("can", 0)
-        assert open_viewable(fitted, notes, Whereabouts(weights=Path("x")))[0].asking.hint == "Any words"
-
-
-def test_a_field_of_another_scene_is_not_asked(fitted, asked, tmp_path, notes):
-    shutil.move(fitted / "scene.ply", tmp_path / "first.ply")
-    write_ply(fitted / "scene.ply", some(20))
-    told = dict(np.load(asked / "field.npz"))
-    np.savez(asked / "field.npz", **{**told, "vectors": told["vectors"][:7]})
-    scene, _ = open_viewable(fitted, notes)
-    assert (scene.gaussians.num, scene.asking) == (20, None)
-    assert any("its field cannot be asked" in note for note in notes.all)
-
-
-def test_what_moves_says_where_its_field_is_asked(tracked, notes):
-    source = Source("classes", NAMES)
-    labels = np.arange(30) % 2
-    field = write_made_field(tracked / "field", tracked / "scene.ply", None, source, labels, CODES)
-    scene, _ = open_viewable(tracked, notes)
-    assert scene.asking is None
-    assert any(f"gsjax view {field} shows what its field is of" in note for note in notes.all)
-    assert open_viewable(field, notes)[0].asking is not None
-
-
-def test_photographs_of_a_fit_that_moved(fitted, photographs, notes):
-    config = fitted / "config.yml"
-    config.write_text(config.read_text().replace(str(photographs), "/nowhere/at/all"))
-    scene, _ = open_viewable(fitted, notes, Whereabouts(images=str(photographs)))
-    assert len(scene.shots.names) == 9
-
-
-@pytest.mark.parametrize("option", ["--scene", "--images", "--weights"])
-def test_what_nobody_looks_for_is_refused(view, ply, tracked, option):
-    for path in (ply, tracked):
-        code, said = view(path, option, "x")
-        assert code == 2
-        assert f"{option}: {path} is" in said
-
-
 # what it refuses
 
 
@@ -403,6 +185,14 @@ def test_files_without_gaussians(view, tmp_path):
     code, said = view(tmp_path / "empty.ply")
     assert code == 2
     assert "empty.ply: expected Gaussians, found none that can be drawn" in said
+
+
+@pytest.mark.parametrize("option", ["--scene", "--images", "--weights"])
+def test_what_nobody_looks_for_is_refused(view, ply, tracked, option):
+    for path in (ply, tracked):
+        code, said = view(path, option, "x")
+        assert code == 2
+        assert f"{option}: {path} is" in said
 
 
 def test_without_viser_it_says_what_to_install(view, ply, monkeypatch):
@@ -479,44 +269,3 @@ def test_a_page_is_served_until_ctrl_c(ply):
     assert process.returncode == 130
     assert "Traceback" not in out + err
     assert "stopped: nobody can look any more" in err
-
-
-# screenshots
-
-
-def test_screenshots_are_numbered_and_none_is_written_over(tmp_path):
-    folder = tmp_path / "screenshots"
-    save = screenshots(folder)
-    red = np.zeros((4, 6, 3), np.uint8)
-    red[..., 0] = 200
-    assert save("render", red).name == "0001_render.png"
-    (folder / "0007_view.png").write_bytes(b"mine")
-    (folder / "notes.txt").touch()
-    assert save("view", red).name == "0008_view.png"
-    assert screenshots(folder)("render", 0 * red).name == "0009_render.png"
-    np.testing.assert_array_equal(cv2.imread(str(folder / "0001_render.png"))[..., ::-1], red)
-    assert (folder / "0007_view.png").read_bytes() == b"mine"
-
-
-def test_a_number_that_another_took_meanwhile_is_left_to_it(tmp_path, monkeypatch):
-    save = screenshots(tmp_path)
-    listed = Path.iterdir
-
-    def too_early(self):
-        names = [*listed(self)]
-        (self / "0001_render.png").write_bytes(b"theirs")
-        return iter(names)
-
-    monkeypatch.setattr(Path, "iterdir", too_early)
-    assert save("render", np.zeros((4, 6, 3), np.uint8)).name == "0002_render.png"
-    assert (tmp_path / "0001_render.png").read_bytes() == b"theirs"
-
-
-def test_a_screenshot_that_fails_leaves_nothing(tmp_path, monkeypatch):
-    def full(path, picture):
-        raise OSError("no space")
-
-    monkeypatch.setattr("gsjax.cli.view.command.write_png", full)
-    with pytest.raises(OSError, match="no space"):
-        screenshots(tmp_path)("render", np.zeros((4, 6, 3), np.uint8))
-    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,73 @@
+"""A scene to distil into, a made-up field to ask, an empty cache of features, and what a command wrote."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from gsjax.cli.distill.source import Source
+from gsjax.io.ply import write_ply
+from gsjax.perception.codebook import ClassCodebook
+from tests.cli.conftest import LABELS, first_picture, write_made_field
+
+CAN = 3
+NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation counts them
+SMALL = ("--field.encoding", "table", "--field.channels", 8, "--field.contrast-patch", 4)
+
+
+@pytest.fixture(scope="session")
+def scene(pristine, tmp_path_factory):
+    """A Gaussian for every other pixel of all cameras' first pictures, in a PLY file."""
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    write_ply(path, first_picture(pristine)[0])
+    return path
+
+
+@pytest.fixture(scope="session")
+def labelled(pristine, tmp_path_factory):
+    """A PLY file of those Gaussians with labels, and these."""
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    gaussians, labels = first_picture(pristine)
+    write_ply(path, gaussians, labels=labels)
+    return path, labels
+
+
+@pytest.fixture(scope="session")
+def made(pristine, labelled, tmp_path_factory):
+    """The field of the classes, which nobody had to distil."""
+    book = ClassCodebook(NAMES)
+    vectors = np.stack([book.embed_text(name) for name in LABELS.values()])
+    return write_made_field(
+        tmp_path_factory.mktemp("fields") / "field",
+        labelled[0],
+        pristine,
+        Source("classes", NAMES),
+        labelled[1],
+        vectors,
+    )
+
+
+@pytest.fixture
+def field(made, tmp_path):
+    """A copy of it to ask and to corrupt."""
+    return shutil.copytree(made, tmp_path / "field")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """No test finds what another one encoded."""
+    monkeypatch.setattr("gsjax.cli.distill.cache.user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
+
+
+def metrics(out):
+    return json.loads((out / "metrics.json").read_text())
+
+
+def told_of(field):
+    return json.loads((field / "query" / "query.json").read_text())
+
+
+def found_of(field):
+    with np.load(field / "query" / "selection.npz") as found:
+        return dict(found)

@@ -1,0 +1,99 @@
+"""Pictures of a field: its features, its classes, its scene in one colour a Gaussian, and their names."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.cli.distill import pictures as field_pictures
+from gsjax.cli.distill import scores as field_scores
+from gsjax.cli.distill.results import draw_features, feature_colors
+from gsjax.cli.distill.saved import short_names
+from gsjax.cli.distill.scores import class_maps, classes_of, one_by_one
+from gsjax.geometry.cameras import Camera
+from gsjax.io.ply import read_ply
+from gsjax.methods.feature_field import (
+    FieldConfig,
+    carried,
+    frozen_views,
+    init_field,
+    pixel_cosines,
+)
+from gsjax.rasterize.frozen import paint, strip_of
+from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.gaussians import gaussians_from_activated
+from gsjax.viz.colors import colorize_features, fit_pca_colors
+from gsjax.viz.viewer.drawing import Drawer
+
+
+@pytest.mark.parametrize("encoding", ["grid", "table"])
+def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
+    gaussians = read_ply(scene)[0]
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a[::40]), gaussians)
+    grid = FeatureGridConfig(levels=2, most_resolution=16, log2_entries=8, hidden=8)
+    field, located = init_field(
+        jax.random.key(0), FieldConfig(channels=6, encoding=encoding, grid=grid), gaussians.means, 4
+    )
+    K = jnp.array([[40.0, 0, 20], [0, 40.0, 16], [0, 0, 1]])
+    back = jnp.eye(4).at[2, 3].set(3.0)
+    cameras = [Camera(back, K, 40, 32), Camera(back.at[2, 3].set(2.0), K, 40, 32)]
+    colors, pca = feature_colors(field, located)
+    parts = carried(field, located)
+    ones = jnp.ones(len(parts.values))
+    known = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(parts.values, ones))))
+    wanted = frozen_views(gaussians, cameras)
+    kinds = set()
+    for frozen, (view, plan) in zip(one_by_one(gaussians, cameras, "classic"), wanted, strict=True):
+        image, alphas = paint(view, parts.values, plan)
+        channels = np.asarray(parts.channels_of(parts.joined(image, alphas)))
+        alphas = np.asarray(alphas)[..., None]
+        assert (alphas > 0.5).any()
+        mean = np.where(alphas > 0.5, channels / np.maximum(alphas, 0.5), np.nan)
+        found = draw_features(colors, frozen, pca).astype(int)
+        assert np.abs(found - colorize_features(mean, known)).max() <= 1
+        kinds.add((frozen[1], *(len(a) for a in frozen[0])))
+    assert len(kinds) == 1  # one program for both
+
+
+def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a[::20]), read_ply(scene)[0])
+    grid = FeatureGridConfig(levels=2, most_resolution=32, log2_entries=8, hidden=8)
+    field, located = init_field(jax.random.key(0), FieldConfig(channels=6, grid=grid), gaussians.means, 4)
+    field = eqx.tree_at(lambda f: f.encoding.table, field, 1e5 * field.encoding.table)
+    codes, rows = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32), []
+    K = jnp.array([[40.0, 0, 20], [0, 40.0, 30], [0, 0, 1]])
+    frozen = frozen_views(gaussians, [Camera(jnp.eye(4).at[2, 3].set(3.0), K, 40, 60)])[0]
+
+    def told(view, plan, first, count):
+        rows.append(count)
+        return strip_of(view, plan, first, count)
+
+    monkeypatch.setattr(field_scores, "strip_of", told)
+    asked = (field, located, frozen, codes, classes_of(field, located, codes))
+    whole, strips = class_maps(*asked), class_maps(*asked, strip_megabytes=0.1)
+    assert rows == [frozen[1].tiles_y, 3] == [8, 3]
+    cosines, alphas = jax.jit(lambda: pixel_cosines(field, located, *frozen, jnp.asarray(codes)))()
+    np.testing.assert_array_equal(whole[0], np.where(alphas > 0.5, cosines.argmax(-1), -1))
+    for one, other in zip(whole, strips, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert len(np.unique(one)) > 3
+
+
+def test_a_scene_has_one_colour_a_gaussian_from_one_camera():
+    random = np.random.default_rng(0)
+    means, quats = random.uniform(-1, 1, (20, 3)), random.normal(size=(20, 4))
+    shN = random.normal(size=(20, 3, 3)) * 0.3
+    shiny = gaussians_from_activated(means, quats, np.full((20, 3), 0.2), np.full(20, 0.8), means**2, shN=shN)
+    pose, K = np.eye(4), np.array([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]])
+    pose[2, 3] = 4
+    camera = Camera(jnp.asarray(pose[None], float), jnp.asarray(K[None], float), 24, 18)
+    drawn, painted = (Drawer()(g, camera).colors for g in (shiny, field_pictures._seen_from(shiny, camera)))
+    assert drawn.max() > 0.2
+    np.testing.assert_allclose(painted, drawn, atol=1e-5)
+
+
+def test_photographs_have_short_names():
+    assert short_names(["3/000000", "12/000000"]) == ("3", "12")
+    assert short_names(["images/a.jpg", "images/b.jpg"]) == ("images_a", "images_b")
+    assert short_names(["a.png", "a.jpg"]) == ("a.png", "a.jpg")

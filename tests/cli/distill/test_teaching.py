@@ -1,0 +1,142 @@
+"""What photographs teach: the names of their labels, outlines, features of files, and who teaches nothing."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gsjax.cli.distill import teacher as field_teacher
+from gsjax.cli.distill.cache import FeatureCache
+from gsjax.cli.distill.choice import TeacherChoice
+from gsjax.cli.distill.teacher import Teaching
+from gsjax.data.errors import DataWarning
+from gsjax.data.photographs import Photographs
+
+QUIET = Console(quiet=True)
+
+
+def photographs(labels, names=None):
+    """Pictures of noise, with these labels; None where there are none."""
+    random, count = np.random.default_rng(0), len(labels)
+    pictures = random.integers(0, 256, (count, 12, 16, 3), dtype=np.uint8)
+    K = np.array([[16.0, 0, 8], [0, 16.0, 6], [0, 0, 1]])
+    return Photographs(
+        "noise",
+        tuple(f"cam{i}/a.png" for i in range(count)),
+        np.tile([16, 12], (count, 1)),
+        np.tile(K, (count, 1, 1)),
+        np.tile(np.eye(4), (count, 1, 1)),
+        load_image=lambda i: pictures[i],
+        load_labels=lambda i: None if labels[i] is None else np.repeat(np.repeat(labels[i], 4, 0), 4, 1),
+        label_names=names or {},
+    )
+
+
+def taught(shown, indices, asked, folder):
+    asked.check()
+    return Teaching(shown, indices, asked, FeatureCache(folder / "cache"), QUIET)
+
+
+THREE, TWO, OTHER = np.array([[0, 0, 1, 2]] * 3), np.array([[0, 0, 1, 1]] * 3), np.array([[0, 5, 1, 1]] * 3)
+
+
+@pytest.mark.parametrize("features", ["classes", "closed"])
+def test_held_out_views_are_asked_about_in_the_terms_of_those_that_taught(tmp_path, features):
+    shown = photographs([THREE, TWO, OTHER, None])
+    said = taught(shown, [0], TeacherChoice(features), tmp_path)
+    assert said.source.names == {1: "background", 2: "object 1", 3: "object 2"}
+    alone, others, nobody = (said.of(i) for i in (1, 2, 3))
+    assert alone.dimension == others.dimension == said.teacher.dimension
+    assert nobody is None
+    if features == "classes":
+        code = said.source.encoder().embed_text("object 1")
+        np.testing.assert_array_equal(others.codebook[others.ids[0][0, 8]], code / np.linalg.norm(code))
+        assert others.ids[0][0, 4] == -1  # nobody taught what 5 is
+    one_more = taught(photographs([TWO, THREE]), [0], TeacherChoice(features), tmp_path)
+    assert one_more.source.names == {1: "background", 2: "foreground"}
+    assert one_more.of(1).dimension == one_more.teacher.dimension
+
+
+def test_outlines_can_be_put_on_edges(tmp_path):
+    true = np.zeros((12, 16), int)
+    true[3:9, 4:12] = 1
+    off = np.roll(true, 1, axis=1)  # by a pixel
+    shown = replace(
+        photographs([TWO]),
+        load_image=lambda i: np.uint8(200 * true[..., None] + 30).repeat(3, 2),
+        load_labels=lambda i: off,
+    )
+    choices = [TeacherChoice("classes", snap=pixels) for pixels in (0, 2)]
+    as_they_are, snapped = (taught(shown, [0], choice, tmp_path).teacher for choice in choices)
+    thing = {k: t.ids[0] == t.ids[0][6, 8] for k, t in (("off", as_they_are), ("on", snapped))}
+    np.testing.assert_array_equal(thing["off"], off == 1)
+    assert (
+        ((thing["on"] & true).sum() / (thing["on"] | true).sum())
+        > 0.9
+        > (off & true).sum() / (off | true).sum()
+    )
+    with pytest.raises(ValueError, match="--snap: expected 0 or more pixels, found -1"):
+        TeacherChoice(snap=-1).check()
+
+
+def test_numbers_of_labels_cost_nothing(tmp_path, monkeypatch):
+    from gsjax.perception.codebook import ClassCodebook
+
+    counts, embed = [], ClassCodebook.embed_objects
+
+    def counted(self, image, labels, count):
+        counts.append(count)
+        return embed(self, image, labels, count)
+
+    monkeypatch.setattr(ClassCodebook, "embed_objects", counted)
+    large = np.array([[0, 26003, 7, 7]] * 3, np.int32)
+    said = taught(photographs([large, THREE], {26003: "car", 7: "road"}), [0], TeacherChoice(), tmp_path)
+    assert said.source.names == {1: "background", 8: "road", 26004: "car"}
+    code = ClassCodebook({1: "car"}).embed_text("car")
+    np.testing.assert_allclose(said.teacher.codebook[said.teacher.ids[0][0, 4]], code, atol=1e-6)
+    assert (said.of(1).ids[0] >= 0).sum() == 96  # the background, which alone has a name
+    assert counts == [3, 5]
+
+
+def test_weights_are_read_once_however_many_pictures_there_are(tmp_path, monkeypatch):
+    weights, digested = tmp_path / "sam", []
+    weights.mkdir()
+    monkeypatch.setattr(
+        "gsjax.perception.sam.load_sam", lambda path: lambda image, depth, K: image[..., 0] // 64
+    )
+    monkeypatch.setattr(field_teacher, "folder_digest", lambda path: digested.append(path) or "digest")
+    said = taught(photographs([None] * 3), [0, 1, 2], TeacherChoice("closed", sam=weights), tmp_path)
+    assert (said.masks, digested) == ("sam", [weights])
+
+
+def test_features_of_files_are_found_by_all_photographs(tmp_path):
+    shown, maps = photographs([None] * 3), np.random.default_rng(0).normal(size=(3, 3, 4, 5))
+    np.save(tmp_path / "level_0.npy", maps)  # LERF's: those of all pictures, in order
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
+    cosines = np.einsum("hwd,hwd->hw", said.teacher.maps[1], maps[2]) / np.linalg.norm(maps[2], axis=-1)
+    np.testing.assert_allclose(cosines, np.linalg.norm(said.teacher.maps[1], axis=-1), rtol=1e-5)
+    assert said.of(1).maps[0].shape == (3, 4, 5)
+    (tmp_path / "level_0.npy").unlink()
+    for i in (0, 2):
+        (tmp_path / f"cam{i}").mkdir()
+        np.save(tmp_path / f"cam{i}/a.npy", maps[i])
+    said = taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)  # held-out ones need not be there
+    with pytest.raises(FileNotFoundError, match=r"cam1/a\.png"):
+        said.of(1)
+    (tmp_path / "cam1").mkdir()
+    np.save(tmp_path / "cam1/a.npy", maps[1, ..., :2])
+    with pytest.raises(ValueError, match=r"cam1/a\.npy: expected features of 5 numbers .* found 2"):
+        said.of(1)
+    np.save(tmp_path / "cam2/a.npy", maps[2, :, :1])
+    with pytest.raises(ValueError, match=r"cam2/a\.npy: expected features .* cam2/a\.png, 16x12, found 1x3"):
+        taught(shown, [0, 2], TeacherChoice(str(tmp_path)), tmp_path)
+
+
+def test_photographs_without_masks_are_named(tmp_path):
+    with pytest.warns(DataWarning, match=r"teach nothing: cam1/a\.png, cam3/a\.png$"):
+        said = taught(photographs([THREE, None, TWO, None]), [0, 1, 2, 3], TeacherChoice(), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert said.of(1) is None

@@ -1,0 +1,31 @@
+"""The carton of the simulated table as alignment sees it, and how well points that stand for it fit."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.methods.object_tracker.align import disagreement
+from gsjax.methods.object_tracker.config import AlignConfig
+from gsjax.methods.object_tracker.points import sight_of
+
+CONFIG = AlignConfig(iterations=12)
+CARTON = 2
+SIZE = {"width": 160, "height": 120}
+
+
+def see(frame):
+    return sight_of(frame, CONFIG.shading)
+
+
+def middle(points):
+    """The mean of the points that count."""
+    return (points.means * (points.seen[:, None] > 0)).sum((0, 2)) / (points.seen > 0).sum()
+
+
+def gap(points, sight, config=CONFIG):
+    """How badly points agree where they are."""
+    return float(disagreement(jnp.zeros(6), points, jnp.zeros(3), sight, config))
+
+
+def error(points, means, then):
+    seen = np.asarray(points.seen) > 0
+    return np.linalg.norm(means - then, axis=1)[seen].mean()

@@ -1,0 +1,171 @@
+"""What has jumped is found by looking everywhere, first of all where it is most urgent."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from gsjax.methods.object_tracker.lost import Confidence
+from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, tones
+from gsjax.methods.object_tracker.recover import Elsewhere
+from gsjax.methods.object_tracker.search import (
+    TELLS_TURN,
+    Sought,
+    first_watch,
+    least,
+    principal_axes,
+    search,
+)
+from tests.methods.carton import CONFIG, SIZE, error, gap, middle, see
+
+# Compiled once for calls that differ in values alone.
+search = jax.jit(search, static_argnums=(4, 9))
+
+
+def look(points, center, sight, config=CONFIG, everywhere=1):
+    """The twist that a search of one group finds from standing still."""
+    points = jax.tree.map(lambda a: a[None], points)
+    how = (config, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(everywhere))
+    return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how).found.twists[0]
+
+
+@pytest.fixture(scope="module")
+def jumped(moved, table):
+    """(points of the carton before it was carried 40 mm, their middle, what is seen then, that shift)."""
+    points = moved[0]
+    shift = jnp.array([0.03, -0.025, 0.01])
+    behind = points._replace(means=points.means - shift[:, None])
+    return behind, middle(behind), see(table(8, 2, **SIZE)[1][6]), shift
+
+
+def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
+    """Nothing overlaps where it starts, and nobody tells how far it went."""
+    *given, shift = jumped
+    brief = replace(CONFIG, iterations=3)
+    miss = [float(jnp.linalg.norm(look(*given, brief, n)[:3] - shift)) for n in (0, 1)]
+    assert miss[0] > 5e-3
+    assert miss[1] < 1e-3
+
+
+def test_search_finds_what_is_pushed_while_it_turns(moved):
+    """It goes on turning as before, but 36 mm further than expected: only a shift from there finds it."""
+    points, center, sight, then, _ = moved
+    points = points._replace(means=jnp.asarray(then, jnp.float32))
+    middle_then = center + (points.means - moved[0].means).mean((0, 2))
+    expected = jnp.array([0.02, 0.02, 0.02, 0.0, 0.0, 0.6])
+    push = jnp.array([0.03, -0.02, 0.0])
+    true = expected.at[:3].add(push)
+    turn = jaxlie.SO3.exp(true[3:])
+    away = jnp.moveaxis(points.means, 1, -1) - middle_then
+    before = points._replace(means=jnp.moveaxis(turn.inverse().apply(away) + middle_then - true[:3], -1, 1))
+    brief = replace(CONFIG, iterations=3, turns=())
+
+    def searched(everywhere: int) -> jax.Array:
+        group = jax.tree.map(lambda a: a[None], before)
+        starts = jnp.stack([jnp.zeros(6), expected])[:, None]
+        how = (brief, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(everywhere))
+        return search(starts, group, (middle_then - true[:3])[None], sight, *how).found.twists[0]
+
+    assert jnp.linalg.norm(searched(0)[:3] - true[:3]) > 0.01
+    np.testing.assert_allclose(searched(1)[:3], true[:3], atol=2e-3)
+    np.testing.assert_allclose(searched(1)[3:], true[3:], atol=0.02)
+
+
+def test_something_in_front_does_not_pull(moved):
+    points, center, sight, then, _ = moved
+    row, column = np.argwhere(np.asarray(moved[4][0]) == 1).mean(0).astype(int)
+    patch = (0, slice(row, row + 6), slice(column - 20, column + 20))
+    green = jnp.append(tones(jnp.array([0.1, 0.9, 0.1]), CONFIG.shading), 0.4)
+    hidden = sight._replace(pixels=sight.pixels.at[patch].set(green))
+    found = look(points, center, hidden)
+    assert error(points, np.asarray(carry(points, found, center).means), then) < 2e-3
+
+
+def test_without_turns_only_translation_is_sought_and_found(moved):
+    points, center, sight, _, _ = moved
+    config = replace(CONFIG, max_turn=0.0)
+    shift = jnp.array([0.006, -0.004, 0.003])
+    behind, start = points._replace(means=points.means - shift[:, None]), center - shift
+    twist = look(behind, start, sight, config)
+    np.testing.assert_array_equal(twist[3:], 0)
+    assert gap(carry(behind, twist, start), sight, config) < gap(behind, sight, config)
+
+
+def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
+    """It may be where it was believed to be. What is lost is not, and what agrees as ever has not jumped."""
+    *given, shift = jumped
+    points, centers = jax.tree.map(lambda a: a[None], given[:2])
+    sure, yes = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True)), jnp.array([True])
+
+    def searched(**changes) -> Sought:
+        watch = first_watch(jnp.ones(1))._replace(**changes)
+        how = (replace(CONFIG, iterations=3), watch, yes, jnp.int32(1), yes)
+        nowhere = Elsewhere(jnp.ones(6), sure, sure)
+        return search(jnp.zeros((1, 1, 6)), points, centers, given[2], *how, lambda _: nowhere)
+
+    followed = searched(usual=jnp.array([0.05]))
+    np.testing.assert_allclose(followed.found.twists[0, :3], shift, atol=1e-3)
+    assert not followed.recovered[0]
+    for changes in ({"usual": jnp.array([0.9])}, {"usual": jnp.array([0.05]), "lost": yes}):
+        elsewhere = searched(**changes)
+        np.testing.assert_allclose(elsewhere.again.twists[0], 1.0)
+        assert elsewhere.recovered[0]
+
+
+def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jumped):
+    """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
+    *given, shift = jumped
+    points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
+    visible, first = jnp.array([True, True, True]), first_watch(jnp.ones(3))
+    watches = [
+        (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), visible, [1]),
+        (first._replace(waited=jnp.array([0.0, 5.0, 100.0])), visible, [2]),
+        (first._replace(usual=jnp.array([0.3, 0.1, 0.3])), ~visible.at[0].set(False), [0]),
+        (
+            first._replace(usual=jnp.array([0.3, 0.1, 0.3]), glimpsed=jnp.array([False, False, True])),
+            visible,
+            [2],
+        ),
+    ]
+    for watch, there, expected in watches:
+        one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
+        sought = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
+        np.testing.assert_array_equal(np.flatnonzero(sought.looked_for), expected)
+        np.testing.assert_array_equal(np.flatnonzero(jnp.isfinite(sought.leads)), expected)
+        right = jnp.linalg.norm(sought.found.twists[:, :3] - shift, axis=1) < 1e-3
+        np.testing.assert_array_equal(np.flatnonzero(right), expected)
+
+
+@pytest.mark.parametrize("printed", [True, False])
+def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
+    """A can that stands still: its print tells how it is turned, and without it nothing does."""
+    sequence, (frame, *_), _ = table(8, 2, **SIZE)
+    can = sequence.truth.label_ids[sequence.truth.names.index("can")]
+    mine = jnp.stack([sequence.mask(0, c) == can for c in range(2)])
+    if not printed:
+        plain = jnp.where(mine[..., None], frame.images[mine].mean(0), frame.images)
+        frame = replace(frame, images=plain)
+    seen = see(frame)
+    points = pixels_of_groups(seen, mine.astype(jnp.int32), frame.depths, 1, CONFIG)
+    center = middle(jax.tree.map(lambda a: a[0], points))
+    how = (CONFIG, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(1))
+    sought = search(jnp.zeros((1, 1, 6)), points, center[None], seen, *how)
+    assert (float(sought.leads[0]) > TELLS_TURN) == printed
+    assert float(jnp.linalg.norm(sought.found.twists[0, :3])) < 1e-3
+
+
+def test_principal_axes_are_those_of_a_rod():
+    along = jnp.array([0.6, 0.8, 0.0])[:, None] * jnp.linspace(-1, 1, 50)
+    points = Points(along[None], jnp.zeros((1, 3, 50)), jnp.ones((1, 50)))
+    np.testing.assert_allclose(jnp.abs(principal_axes(points, jnp.zeros(3))[2]), [0.6, 0.8, 0.0], atol=1e-4)
+
+
+def test_the_least_is_taken_of_each_group_and_nothing_that_is_not_finite():
+    residuals = jnp.array([[0.3, jnp.nan, 0.5], [0.2, 0.9, 0.5]])
+    twists = jnp.arange(36.0).reshape(2, 3, 6)
+    found = least(residuals, twists)
+    np.testing.assert_allclose(found.residuals, [0.2, 0.9, 0.5])
+    np.testing.assert_allclose(found.twists, jnp.stack([twists[1, 0], twists[1, 1], twists[0, 2]]))
