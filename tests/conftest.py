@@ -17,9 +17,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 # Compiled without optimising, in a third of the time, which is what tests of small scenes wait for.
 # `make test-all` has XLA's own settings.
-flags = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+flags = "--xla_backend_optimization_level=0"
 if version("jaxlib").startswith("0.10."):  # XLA ends a process that names a flag it has not
-    flags += " --xla_cpu_use_fusion_emitters=false"
+    flags += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 os.environ.setdefault("XLA_FLAGS", flags)
 
 # JAX's traces are many objects that live on; to look through all of them again and again takes a tenth.
