@@ -153,6 +153,7 @@ def config(quick):
     return replace(quick, align=align, matching=False, headroom=1.52)
 
 
+@pytest.mark.slow
 def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     _, frames, _ = table()
     *_, plain = track(started, frames[0], frames[1:], config)

@@ -267,7 +267,8 @@ def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
     np.testing.assert_array_equal(turns[:, 2], turns[:, 0])
 
 
-@pytest.mark.parametrize("redraw", ["moving", pytest.param("all", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("redraw", ["moving", "all"])
+@pytest.mark.slow
 def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick, redraw):
     """The scene has the carton 12 cm beside where it is, too far to be looked for from there."""
     _, frames, _ = table()

@@ -126,6 +126,7 @@ def test_two_boxes_in_one_piece_are_divided(boxes):
 
 
 @pytest.mark.parametrize("kind", ["table", "simplex"])
+@pytest.mark.slow
 def test_weights_in_a_table_are_followed_too(boxes, kind):
     """Once, the table itself was given away in the first step."""
     stream = replace(CONFIG.stream, iterations=3, field_rate=0.02, past=2)

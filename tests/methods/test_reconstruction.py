@@ -63,9 +63,8 @@ def psnr(gaussians, view: View) -> float:
     return -10 * np.log10(np.mean((picture(gaussians, view) - view.image / 255) ** 2))
 
 
-@pytest.mark.parametrize(
-    ("source", "steps"), [pytest.param("depth", 60, marks=pytest.mark.slow), ("random", 400)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("source", "steps"), [("depth", 60), ("random", 400)])
 def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps):
     config = replace(QUICK, steps=steps, start=replace(QUICK.start, source=source))
     problem, state = begin(views[1:], config)

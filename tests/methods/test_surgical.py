@@ -202,6 +202,7 @@ class TestLearning:
         fall = 0.5 * (1 + np.cos(np.pi * 3 / 6))
         np.testing.assert_allclose(steps[3] / steps[0], fall, rtol=0.02)
 
+    @pytest.mark.slow
     def test_those_that_moved_farthest_go_on_deforming(self, looks, tmp_path):
         told = replace(CONFIG, nodes=0, warmup=2, iterations=12, moving_share=0.25)
         problem, first = begin_surgical(looks, told)

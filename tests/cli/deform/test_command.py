@@ -94,6 +94,7 @@ def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
             np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_recipe_by_its_name(gsjax, tmp_path):
     """GaussianClin's turns are differences of quaternions; with tools left out there is one class."""
     run = tmp_path / "run"

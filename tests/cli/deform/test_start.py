@@ -36,6 +36,7 @@ def clip(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_two_eyes_without_depth_are_matched_and_poses_refined(gsjax, tmp_path):
     run = tmp_path / "run"
     code, said = gsjax("deform", EYES, "--out", run, "--depth", "stereo", "--deform.refine-poses", *SMALL)

@@ -141,6 +141,7 @@ def test_a_field_is_found_within_the_run_of_its_scene(gsjax, pristine, scene, tm
     assert "--frames" in said
 
 
+@pytest.mark.slow
 def test_colours_need_no_names_and_answer_to_pictures(gsjax, pristine, scene, tmp_path):
     out = tmp_path / "closed"
     told = ("--features", "closed", "--masks", "segment", *SMALL, *TABLE, "--field.iterations", STEPS)

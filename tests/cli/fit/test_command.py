@@ -177,7 +177,9 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     assert "Colours are of degree 0: a degree is added every 100 steps (--fit.sh-every)." in found["notes"]
 
 
-@pytest.mark.parametrize("what", ["judge", "parts", "write_orbit"])
+@pytest.mark.parametrize(
+    "what", ["parts", *(pytest.param(w, marks=pytest.mark.slow) for w in ("judge", "write_orbit"))]
+)
 def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
     gsjax_fit, tmp_path, monkeypatch, what
 ):

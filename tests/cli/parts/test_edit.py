@@ -191,6 +191,7 @@ def test_films_of_ops_alone_are_numbered_on(gsjax, run):
     assert sorted(folder.name for folder in (run / "edit").iterdir()) == ["ops", "ops_2"]
 
 
+@pytest.mark.slow
 def test_the_camera_films_to_which_the_edits_change_most(gsjax, run):
     """Each of the cameras sees each of two parts by another size; what is moved away counts."""
     saved, films_of = open_parts_run(run), {}
