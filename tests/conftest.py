@@ -35,6 +35,7 @@ install_import_hook("gsjax", "beartype.beartype(conf=beartype.BeartypeConf(is_pe
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 
 hypothesis.settings.register_profile("gsjax", deadline=None, max_examples=25, derandomize=True, database=None)
@@ -53,6 +54,14 @@ def x64():
     """The test runs with 64-bit types. Ask for it by `@pytest.mark.usefixtures("x64")`."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def as_users_run():
+    """Annotations unchecked, as in use."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

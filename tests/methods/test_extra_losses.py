@@ -256,6 +256,22 @@ class TestMistakes:
         with pytest.raises(ValueError, match=f"extra_losses: .*{said}"):
             extra_terms(losses, None, None, None)
 
+    @pytest.mark.usefixtures("as_users_run")
+    def test_a_list_is_refused_by_loops(self, table, started, config, photographs):
+        _, frames, _ = table()
+        problem, state = begin(photographs, FIT)
+        surgical = SurgicalConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
+        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
+        given = {"extra_losses": [nothing]}
+        loops = (
+            track(started, frames[0], frames[1:], config, **given),
+            fit(problem, state, **given),
+            reconstruct(*begin_surgical(looks, surgical), **given),
+        )
+        for loop in loops:
+            with pytest.raises(ValueError, match="extra_losses: expected a tuple of functions"):
+                next(loop)
+
     def test_a_tracker_that_refines_nothing_has_no_use_for_one(self, table, started, config):
         _, frames, _ = table()
         without = replace(config, refine=replace(config.refine, iterations=0))

@@ -2,20 +2,11 @@
 
 import dataclasses
 
-import jaxtyping
 import numpy as np
 import pytest
 
 from benchmarks.scenes import ARRAYS, Case, case, cast, make_scene
 from gsjax.rasterize.plan import DEFAULT_LIMITS
-
-
-@pytest.fixture
-def as_users_run():
-    """Annotations unchecked, as in use."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

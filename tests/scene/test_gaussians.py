@@ -3,20 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.scene.gaussians import Gaussians, Tags, concatenate, cull_invalid, gaussians_from_activated, take
-
-
-@pytest.fixture
-def as_users_run():
-    """Annotations unchecked, as in use, where the classes' own checks must speak."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def activated(count=5, seed=0):

@@ -43,6 +43,7 @@ def run_on_cluster(
     scheduler: str,
     workers: int | None,
     say: Callable[[str], Any],
+    connected: Callable[[], Any],
     debug: bool = False,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells on workers and give each with its record, which is on disk by then, as they finish.
@@ -55,6 +56,7 @@ def run_on_cluster(
         scheduler: `processes`, `slurm`, or the address of one, such as tcp://HOST:8786.
         workers: how many processes or jobs to start. As many processes as there are cores, unless given.
         say: is told how many workers there are.
+        connected: is called when there is a scheduler, before any cell is asked for.
         debug: let through what a cell raises.
 
     Raises:
@@ -66,6 +68,7 @@ def run_on_cluster(
         workers = workers or usable_cores()
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
     with _client(scheduler, workers) as client, _said_if_gone(scheduler):
+        connected()
         sharing = workers if scheduler == PROCESSES else None
         under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
         suspects, alone = [], False

@@ -105,10 +105,7 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
     script_run, figure = experiment.load()
     check_executor(options)
     experiment.committed()  # if it cannot be read, that is said now and not after hours
-    if options.fresh:  # forgotten at once, so that after Ctrl-C the rest goes on without --fresh
-        for cell in chosen:
-            experiment.path(cell).unlink(missing_ok=True)
-    left = [cell for cell in chosen if not experiment.is_done(experiment.own(cell))]
+    left = [cell for cell in chosen if options.fresh or not experiment.is_done(experiment.own(cell))]
     if len(left) < len(chosen):
         console.print(f"{len(chosen) - len(left)} of {len(chosen)} cells are done; --fresh runs them again")
     words = TextColumn("{task.description}", markup=False)
@@ -121,10 +118,15 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
             def say(what: str) -> None:
                 progress.update(task, description=what)
 
+            def forget() -> None:  # all at once, so that after Ctrl-C the rest goes on without --fresh
+                for cell in left:
+                    experiment.path(cell).unlink(missing_ok=True)
+
             if options.executor == "dask" and left:
                 how = (options.scheduler, options.workers)
-                finished = run_on_cluster(experiment, left, *how, say, options.debug)
+                finished = run_on_cluster(experiment, left, *how, say, forget, options.debug)
             else:
+                forget()
                 finished = run_here(experiment, left, script_run, say, options.debug)
             with contextlib.closing(finished):  # at once, also after Ctrl-C
                 for cell, record in finished:

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from gsjax.cli.experiment.config import expect
+from gsjax.cli.experiment.config import CONFIG, expect
 
 
 def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:
@@ -44,20 +44,21 @@ def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Call
 
 
 def forget_scripts(root: Path) -> None:
-    """Have this process load modules below `root` anew when they are imported next."""
-    root = root.resolve()
+    """Have this process load scripts of experiments at `root`, and what stands beside them, anew when they
+    are imported next. What else is below `root`, as an environment, stays."""
+    folders = {config.parent.resolve() for config in root.resolve().glob(f"*/{CONFIG}")}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if file is not None and Path(file).resolve().is_relative_to(root):
+        if file is not None and Path(file).resolve().parent in folders:
             del sys.modules[name]
-    sys.path[:] = [path for path in sys.path if not Path(path).resolve().is_relative_to(root)]
+    sys.path[:] = [path for path in sys.path if Path(path).resolve() not in folders]
 
 
 def fingerprint_of(path: Path, text: str, version: int) -> str:
     """Changes with a script, with what stands beside it and with the config's version.
 
-    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax, which
-    change where a module moved. Rows say themselves which gsjax made them.
+    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax,
+    without `as`, which change where a module moved. Rows say themselves which gsjax made them.
 
     Args:
         path: of the script.
@@ -75,7 +76,10 @@ def _is_figure(node: ast.AST) -> bool:
 
 
 def _imports_gsjax(node: ast.AST) -> bool:
-    """Whether it is an import of nothing but gsjax and its modules."""
+    """Whether it is an import of nothing but gsjax and its modules, under names that are their own: under
+    another name, one thing may stand for another without a change of what uses it."""
+    if isinstance(node, ast.Import | ast.ImportFrom) and any(alias.asname for alias in node.names):
+        return False
     if isinstance(node, ast.ImportFrom):
         modules = [node.module or ""] if node.level == 0 else [""]
     else:

@@ -16,7 +16,8 @@ import yaml
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
 _FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
-_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "parts.npz", "field.npz", "deformation.npz")
+_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "poses.npz", "parts.npz")
+_FILES += ("field.npz", "deformation.npz")
 _FOLDERS = (
     "canonical",
     "renders",
@@ -34,6 +35,8 @@ _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
 _OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
 _OF_WORTH += ("deformation.npz",)
+# What it can go on from; `gsjax parts` has a fit within, which may be all that there is.
+_RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
 """What `gsjax query` writes into its folder."""
@@ -94,6 +97,7 @@ class RunFolder:
           scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
           canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
+          poses.npz               of `gsjax deform --deform.refine-poses`: viewmats [T,4,4] as refined
           renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
           video_CAM.mp4           input, render, error and labels side by side; of a fit video_orbit.mp4
           plots/NAME.svg|png      update time, error over frames, ...
@@ -153,7 +157,7 @@ class RunFolder:
                 f"{self.path}: holds a finished run{nothing}; name another folder, or replace it with "
                 "--overwrite"
             )
-        resumable = self.resume.is_dir() and any(self.resume.iterdir())
+        resumable = any(any(self.path.glob(pattern)) for pattern in _RESUMED)
         worth = resumable or any((self.path / name).exists() for name in _OF_WORTH)
         if worth and not (resume or overwrite):
             advice = "go on with it by --resume, or " if resumable and resume is not None else ""

@@ -89,8 +89,8 @@ def run(options: Options) -> int:
         )
         if options.resume:
             folder.check_config(settings, but=OF_NO_BEARING)
-        folder.write_config(settings)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        folder.write_config(settings)  # from here on an earlier run is gone
         draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)

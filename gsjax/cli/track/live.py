@@ -88,8 +88,8 @@ def run(options: Options) -> int:
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=None)
-        folder.write_config(options)
         source = _open(options, console)
+        folder.write_config(options)  # from here on an earlier run is gone
         log = Log(source.scene.label_ids, source.names)
         stopped = follow(options, source, log, console)
         found = {

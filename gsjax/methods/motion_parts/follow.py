@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import normalize_quats, quats_to_matrices
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
 from gsjax.methods.motion_parts.discover import Start, Views, radii_of
 from gsjax.methods.motion_parts.stream import (
@@ -152,6 +152,7 @@ def follow(
         extra_losses: functions `loss(scene, rendered, frame)` (`gsjax.losses.extra`) of one's own, whose
             scene is a `PosedScene`; give `refine` the same.
     """
+    named_losses(extra_losses)  # before it is a key, which a list cannot be
     run = _Frames(views, config, extra_losses)
     order = order_of_frames(views.num_frames, start.anchor.frame)
     for count, t in enumerate(order, 1):

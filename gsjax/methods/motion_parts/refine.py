@@ -153,6 +153,7 @@ def refine(
         config: how.
         extra_losses: as for `follow`.
     """
+    named_losses(extra_losses)  # before it is a key, which a list cannot be
     advance, rng = _compiled(config, extra_losses), np.random.default_rng((config.seed, 1))
     canonical, weights, frames = parts.canonical, parts.weights, np.flatnonzero(parts.done)
     anchor = jnp.asarray(int(np.flatnonzero(parts.found == 0)[0]))

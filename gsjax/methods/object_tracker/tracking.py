@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.object_tracker.budget import Chosen, Costs, Governor, choose, ladder
 from gsjax.methods.object_tracker.config import TrackerConfig
 from gsjax.methods.object_tracker.fit import fit_scene
@@ -167,6 +167,7 @@ def track(
     config = TrackerConfig() if config is None else config
     if budget_ms is not None and not budget_ms > 0:
         raise ValueError(f"budget_ms: expected milliseconds above 0, found {budget_ms}")
+    named_losses(extra_losses)  # before it is a key, which a list cannot be
     if budget_ms is not None and extra_losses:
         raise ValueError(
             "extra_losses: expected none under budget_ms, whose settings have no refinement to add them to; "

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.reconstruction.config import FitConfig
 from gsjax.methods.reconstruction.model import Model, carried_over, model_of, refined, with_degree, with_slots
 from gsjax.methods.reconstruction.start import Extent, View, extent_of, in_slots, start_points
@@ -152,6 +152,7 @@ def fit(
     config, views = problem.config, problem.views
     key = jax.random.key(config.seed)
     plans = {tuple(row[:3].tolist()): int(row[3]) for row in state.capacity}
+    named_losses(extra_losses)  # before it is a key, which a list cannot be
     advance, densify = _compiled(config, problem.extent.radius, extra_losses)
     seen: dict[tuple[int, int], Observation] = {}
     model, optimizer = state.model, state.optimizer

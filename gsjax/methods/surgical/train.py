@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.losses.extra import ExtraLosses
+from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.surgical.config import SurgicalConfig
 from gsjax.methods.surgical.graph import FrameGraph, frame_graphs, graph_nodes
 from gsjax.methods.surgical.nodes import nodes_of
@@ -174,6 +174,7 @@ def reconstruct(
             scene is a `DeformingScene`. `info["extra"]` has their values.
     """
     config = problem.config
+    named_losses(extra_losses)  # before it is a key, which a list cannot be
     advance = compiled_step(config, problem.radius, extra_losses)
     key = jax.random.key(config.seed)
     scene, optimizer, moving, graphs = state.scene, state.optimizer, state.moving, state.graphs

@@ -241,6 +241,18 @@ def test_who_cannot_run_cells(toy, gsjax, options, says, monkeypatch):
     assert says in err
 
 
+def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch):
+    toy()
+    gsjax("run", "toy")
+    before = cell_files()
+    monkeypatch.setattr("gsjax.cli.experiment.cluster.CONNECT_S", 1)
+    elsewhere = ("--executor", "dask", "--scheduler", "tcp://127.0.0.1:1")
+    code, _, err = gsjax("run", "toy", "--fresh", *elsewhere)
+    assert code == 2
+    assert "found none that answers in 1 s" in err
+    assert cell_files() == before
+
+
 def test_without_the_extra_it_is_named(toy, gsjax, monkeypatch):
     toy()
 

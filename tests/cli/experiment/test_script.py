@@ -1,9 +1,12 @@
 """What makes a row stale, and scripts that are shared."""
 
+import importlib
+import sys
 from pathlib import Path
 
 import pytest
 
+from gsjax.cli.experiment.script import forget_scripts
 from gsjax.cli.experiment.sweep import experiment_names, read_experiment
 from tests.cli.experiment.toys import SCRIPT, calls, results
 
@@ -69,6 +72,7 @@ def test_where_a_module_of_gsjax_stands_changes_no_fingerprint(toy, where):
     for other in (
         "import gsjax, os",  # not gsjax alone
         "import gsjaxlike",
+        "from gsjax.metrics.image import psnr as score",  # `as score` of another would run alike
         "from .gsjax import x",
         "import gsjax; SIZE = 3",
         "SIZE = 3; import gsjax",
@@ -76,6 +80,26 @@ def test_where_a_module_of_gsjax_stands_changes_no_fingerprint(toy, where):
         "# import gsjax",
     ):
         assert fingerprint(f"{other}\n{text}") != plain
+
+
+def test_what_stands_beside_experiments_is_not_forgotten(toy):
+    folder = toy("import factor\n" + SCRIPT)
+    (folder / "factor.py").write_text("FACTOR = 1\n")
+    read_experiment(Path("experiments"), "toy", Path("runs")).load()
+    elsewhere = Path("experiments/.venv/lib")
+    elsewhere.mkdir(parents=True)
+    (elsewhere / "installed.py").touch()
+    sys.path.append(str(elsewhere.resolve()))
+    try:
+        importlib.import_module("installed")
+        forget_scripts(Path("experiments"))
+        assert "installed" in sys.modules
+        assert str(elsewhere.resolve()) in sys.path
+        assert "factor" not in sys.modules
+        assert str(folder.resolve()) not in sys.path
+    finally:
+        sys.modules.pop("installed", None)
+        sys.path.remove(str(elsewhere.resolve()))
 
 
 def test_two_experiments_share_a_script(toy, gsjax):

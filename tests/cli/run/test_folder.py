@@ -85,6 +85,7 @@ def test_finished_run_is_not_overwritten(finished):
 
 
 def test_overwriting_clears_the_run_and_nothing_else(finished):
+    (finished.path / "poses.npz").touch()
     for name in ("query", "grasp"):  # what was asked of the old run is no answer for the new one
         (finished.path / name).mkdir()
         (finished.path / name / "video.mp4").touch()
@@ -122,6 +123,17 @@ def test_unfinished_run_is_resumed_or_replaced_only_when_told(finished):
         RunFolder(finished.path)  # a stream cannot be followed again
     RunFolder(finished.path, overwrite=True).write_config(Config())
     assert contents(finished) == ["config.yml", "my notes.txt"]
+
+
+@pytest.mark.parametrize("left", ["canonical/resume/step-00000100.npz", "canonical/scene.ply"])
+def test_a_fit_within_an_unfinished_run_can_be_gone_on_with(tmp_path, left):
+    run = RunFolder(tmp_path / "run")
+    run.write_config(Config())
+    (run.path / left).parent.mkdir(parents=True)
+    (run.path / left).touch()
+    with pytest.raises(FileExistsError, match="an unfinished run; go on with it by --resume"):
+        RunFolder(run.path)
+    assert (run.path / left).exists()
 
 
 def test_a_folder_is_made_when_there_is_something_to_keep(tmp_path):
