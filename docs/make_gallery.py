@@ -2,8 +2,9 @@
 
     .venv/bin/python docs/make_gallery.py            # `make gallery`
 
-Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet: some 20 minutes
-on two busy cores. Figures of experiments are shown from where they are committed; nothing is measured here.
+Small runs on built-in scenes are made first, into runs/gallery, where they are not there yet or were
+stopped: some 20 minutes on two busy cores. Figures of experiments are shown from where they are committed;
+nothing is measured here.
 """
 
 import json
@@ -20,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from gsjax.cli.run.folder import RunFolder
 from gsjax.io.video import read_video_frames
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,12 +49,27 @@ COMMANDS = {
 def main() -> None:
     """Run what is missing, and write pictures and page."""
     for folder, command in COMMANDS.items():
-        if not (RUNS / folder).exists():
-            subprocess.run([sys.executable, "-m", "gsjax.cli", *command.split()], check=True, cwd=ROOT)
+        if not made(RUNS / folder, command):
+            subprocess.run([sys.executable, "-m", "gsjax.cli", *anew(command)], check=True, cwd=ROOT)
     PICTURES.mkdir(exist_ok=True)
     draw_trades(PICTURES / "trades.png")
     shown = {name: _write(name, picture) for name, picture in pictures().items()}
     PAGE.write_text(page(shown), encoding="utf-8")
+
+
+def anew(command: str) -> list[str]:
+    """Its words, by which it takes the place of what was stopped."""
+    return [*command.split(), *([] if command.startswith("query") else ["--overwrite"])]
+
+
+def made(folder: Path, command: str) -> bool:
+    """Whether what a command leaves is there, and whole: it may have been stopped."""
+    if command.startswith("query"):  # whose answer is put in place whole
+        return folder.exists()
+    if command.startswith("edit"):
+        file = folder / "metrics.json"
+        return file.is_file() and json.loads(file.read_text(encoding="utf-8"))["complete"]
+    return RunFolder(folder, overwrite=True).finished
 
 
 def pictures() -> dict[str, np.ndarray]:

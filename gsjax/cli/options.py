@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -101,12 +101,55 @@ class HeldOutFrames(HeldOut):
     """Hold out every N-th photograph or frame, to judge by, where the data has no split; 0 holds out none."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FirstMasks:
+    """What those have that follow what a first mask names."""
+
+    mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
+    """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
+    masks: Literal["auto", "files", "segment"] = "auto"
+    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamWeights:
+    """What those have that may let SAM segment."""
+
+    sam: Path | None = None
+    """Folder of SAM's weights (as of facebook/sam-vit-base): let it segment, and not the segmenter that needs
+    none. Takes the extra `foundation`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipWeights:
+    """What those have that may ask CLIP."""
+
+    weights: Path | None = None
+    """Folder of CLIP's weights, in the layout of Hugging Face."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectText:
+    """How a text is understood that means an object of a tracked run."""
+
+    encoder: Literal["closed", "clip"] = "closed"
+    """Who understands the text: a closed vocabulary without weights, or CLIP."""
+    min_score: float | None = None
+    """Cosine below which the text means none of the objects. The encoder's own unless given."""
+
+
 @dataclass(frozen=True)
-class DatasetAndOut:
-    """From what, to where."""
+class OneDataset:
+    """From what."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
+
+
+@dataclass(frozen=True)
+class DatasetAndOut(OneDataset):
+    """From what, to where."""
+
     out: Path
     """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
 
@@ -134,6 +177,8 @@ def checked(options: Told) -> Told:
         raise ValueError(f"--scale: expected above 0 and at most 1, found {scale}")
     if test_every < 0 or test_every == 1:
         raise ValueError(f"--test-every: expected 0 (none) or 2 and more, found {test_every}")
+    if getattr(options, "sam", None) is not None and getattr(options, "masks", None) == "files":
+        raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
     if (seed := getattr(options, "seed", None)) is None:
         return options
     nested = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}

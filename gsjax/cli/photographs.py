@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping
 from collections.abc import Sequence as Indices
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from rich.progress import track
 
 from gsjax.cli.machine import available_mb
 from gsjax.cli.recording import expect_enough_left, open_recording, parse_frames
+from gsjax.cli.run.files import read_options
 from gsjax.cli.run.folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
@@ -97,12 +98,10 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
         DataError: they cannot be read.
         KeyError, TypeError, ValueError: the settings are not those of a fit.
     """
-    stored = {k: tuple(v) if isinstance(v, list) else v for k, v in (settings.get("read") or {}).items()}
-    known = {field.name for field in fields(ReadOptions)}
     more = {name: settings[name] for name in ("frames", "cameras", "eval_cameras") if name in settings}
     return choose_photographs(
         dataset or str(settings["dataset"]),
-        ReadOptions(**{name: value for name, value in stored.items() if name in known}),
+        read_options(settings.get("read") or {}),
         scale=float(settings.get("scale", 1.0)),
         **more,
     )

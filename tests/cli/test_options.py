@@ -4,18 +4,36 @@ import dataclasses
 import inspect
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import get_args, get_origin
+from itertools import product
+from pathlib import Path
+from typing import get_args, get_origin, get_type_hints
 
 import pytest
+import tyro
 
 from gsjax.cli import COMMANDS
-from gsjax.cli.options import Common, HeldOutFrames, Seeded, Selection, Timed, checked, preset_options
+from gsjax.cli.options import (
+    Common,
+    HeldOutFrames,
+    SamWeights,
+    Seeded,
+    Selection,
+    Timed,
+    checked,
+    preset_options,
+)
 
 SHARED = ("frames", "cameras", "eval_cameras", "test_every", "scale", "seed", "minutes", "read")
+SHARED += ("dataset", "mask_camera", "masks", "sam", "weights", "encoder", "min_score")
 SHARED += ("resume", "overwrite", "cores", "debug")
 OWN = {
     ("query", "frames"),  # those of which pictures are made; a run has chosen its own
     ("live", "minutes"),  # of a stream, which has no other end
+    ("parts", "masks"),  # of the anchor, in all cameras
+    ("distill", "masks"),  # of every photograph
+    ("deform", "masks"),  # of every frame
+    ("query", "weights"),  # also where they are now, of what CLIP taught
+    ("view", "weights"),  # only that
 }
 
 
@@ -24,6 +42,12 @@ def options_of(command: str) -> list[type]:
     kinds = import_module(COMMANDS[command][0]).Options
     members = [kinds] if isinstance(kinds, type) else get_args(kinds)
     return [get_args(m)[0] if get_origin(m) else m for m in members]
+
+
+def groups_of(kind: type) -> list[type]:
+    """The dataclass, and those within it whose options stand beside its own."""
+    hints = get_type_hints(kind, include_extras=True).values()
+    return [kind, *(get_args(h)[0] for h in hints if tyro.conf.OmitArgPrefixes in get_args(h))]
 
 
 def home_of(kind: type, name: str) -> type:
@@ -35,9 +59,9 @@ def home_of(kind: type, name: str) -> type:
 def test_what_commands_share_is_declared_once(command):
     for kind in options_of(command):
         assert issubclass(kind, Common)
-        for name in SHARED:
-            if (command, name) not in OWN and name in {f.name for f in dataclasses.fields(kind)}:
-                assert home_of(kind, name).__module__ == "gsjax.cli.options", f"gsjax {command}: {name}"
+        for group, name in product(groups_of(kind), SHARED):
+            if (command, name) not in OWN and name in {f.name for f in dataclasses.fields(group)}:
+                assert home_of(group, name).__module__ == "gsjax.cli.options", f"gsjax {command}: {name}"
 
 
 @dataclass(frozen=True)
@@ -50,6 +74,11 @@ class Config:
 class Options(Common, Timed, Seeded, HeldOutFrames, Selection):
     first: Config = field(default_factory=Config)
     second: Config = Config(2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taught(SamWeights):
+    masks: str = "auto"
 
 
 def test_a_seed_is_that_of_every_configuration():
@@ -70,6 +99,12 @@ def test_a_seed_is_that_of_every_configuration():
 def test_what_cannot_be_is_said(given, said):
     with pytest.raises(ValueError, match=said):
         checked(Options(**given))
+
+
+def test_sam_does_not_read_files():
+    with pytest.raises(ValueError, match="--sam: expected --masks segment"):
+        checked(Taught(sam=Path("sam"), masks="files"))
+    assert checked(Taught(masks="files")).masks == "files"
 
 
 @pytest.mark.parametrize("words", [["--preset", "large"], ["x", "--preset=large"]])

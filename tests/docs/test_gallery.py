@@ -20,6 +20,20 @@ def gallery():
 def test_what_it_runs_has_options_that_exist(gallery):
     for command in gallery.COMMANDS.values():
         check_command(["gsjax", *shlex.split(command)])
+        check_command(["gsjax", *gallery.anew(command)])
+
+
+def test_what_was_stopped_is_made_anew(gallery, tmp_path):
+    assert not gallery.made(tmp_path / "none", "track DATASET")
+    (tmp_path / "config.yml").write_text("# gsjax run\n")
+    for command in ("track DATASET", "edit RUN"):
+        assert not gallery.made(tmp_path, command)
+        (tmp_path / "metrics.json").write_text('{"complete": false, "report": true}')
+        (tmp_path / "report.html").touch()
+        assert not gallery.made(tmp_path, command)
+        (tmp_path / "metrics.json").write_text('{"complete": true, "report": true}')
+        assert gallery.made(tmp_path, command)
+        (tmp_path / "metrics.json").unlink()
 
 
 def test_the_page_is_as_the_script_has_it_and_its_pictures_are_small(gallery):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsjax.cli.distill.source import KINDS
+from gsjax.cli.options import ClipWeights, SamWeights
 from gsjax.cli.recording import located
 
 Masks = Literal["auto", "files", "segment"]
@@ -14,7 +15,7 @@ OF_CLIP = ("clip", "maskclip")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeacherOptions:
+class TeacherOptions(SamWeights, ClipWeights):
     """Who teaches."""
 
     features: str = "auto"
@@ -25,10 +26,6 @@ class TeacherOptions:
     have fewer than two classes among the pixels that count."""
     masks: Masks = "auto"
     """Whose masks: the recording's own, or a segmenter's that needs no weights. auto: files if there are."""
-    sam: Path | None = None
-    """Folder of SAM's weights: let it segment."""
-    weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
     level: Level = "default"
     """Of LangSplat's files, which size of objects."""
 
@@ -91,8 +88,6 @@ class TeacherChoice:
                 f"--weights: expected --features {' or '.join(OF_CLIP)}, which have them, found "
                 f"{self.features}"
             )
-        if self.sam is not None and self.masks == "files":
-            raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
         if self.snap < 0:
             raise ValueError(f"--snap: expected 0 or more pixels, found {self.snap}")
         if self.level != "default" and not self.of_files:

@@ -1,7 +1,7 @@
 """The folder of `gsjax distill` read back: the field, its scene, and the photographs of it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,9 @@ from jaxtyping import Int
 from gsjax.cli.distill.file import FOLDER, NAME, StoredField, read_field
 from gsjax.cli.distill.scene import SceneOptions, open_scene
 from gsjax.cli.messages import Notes, describe
-from gsjax.cli.run.files import read_drawable
+from gsjax.cli.run.files import read_drawable, read_options
 from gsjax.cli.run.folder import is_run
 from gsjax.cli.run.records import digest
-from gsjax.data.open import ReadOptions
 from gsjax.data.photographs import Photographs
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.scene.gaussians import Gaussians
@@ -187,14 +186,12 @@ def _photographs(
 def _options(settings: Mapping[str, Any], folder: Path, file: Path, images: str | None) -> SceneOptions:
     """What was told `gsjax distill`, as far as it says which photographs."""
     chosen = {name: _tuple(settings[name]) for name in _OF_IMAGES}
-    known = {field.name for field in fields(ReadOptions)}
-    read = ReadOptions(**{n: _tuple(v) for n, v in settings["read"].items() if n in known})
     if images is not None:
         chosen["images"] = images
     run, parent = Path(settings["scene"]), folder.absolute().parent
     if run.suffix.lower() != ".ply" and not run.exists() and folder.name == FOLDER and is_run(parent):
         run = parent  # that was moved whole
-    return SceneOptions(run if run.is_dir() else file, read=read, **chosen)
+    return SceneOptions(run if run.is_dir() else file, read=read_options(settings["read"]), **chosen)
 
 
 def _tuple(value: Any) -> Any:

@@ -59,7 +59,7 @@ class Options(Common):
     """Folder of a run of `gsjax fit`, finished or stopped."""
     views: Literal["held-out", "train", "all"] = "held-out"
     """Which photographs to score: those that the fit never saw, those that it was fitted to, or both."""
-    dataset: str | None = None
+    images: str | None = None
     """Where the photographs are now; where they were for the fit, unless given."""
     lpips_weights: Path | None = None
     """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without, there is no LPIPS."""
@@ -166,11 +166,11 @@ def _choose(options: Options, record: Record) -> Chosen:
     Raises:
         ValueError: they cannot be read, are others than those of the fit, or none is held out.
     """
-    config, dataset = record.config, options.dataset or str(record.config.get("dataset"))
+    config, dataset = record.config, options.images or str(record.config.get("dataset"))
     try:
         photographs = photographs_of_run(config, dataset)
     except DataError as error:
-        raise ValueError(f"{error} It was read for the fit; --dataset says where it is now") from error
+        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
     train, held_out = split(photographs, config["test_every"])
     names = [photographs.names[i] for i in held_out]
     known = (record.metrics or {}).get("views")
@@ -178,7 +178,7 @@ def _choose(options: Options, record: Record) -> Chosen:
         raise ValueError(
             f"{dataset}: expected the photographs of the fit, which held out "
             f"{_listed(row['view'] for row in known)}, found others ({_listed(names)} would be held out); "
-            "--dataset says where they are"
+            "--images says where they are"
         )
     if options.views == "held-out" and not len(held_out):
         raise ValueError(

@@ -3,16 +3,14 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from gsjax.cli.info.picture import by_camera, by_split, write_picture
 from gsjax.cli.messages import Notes
-from gsjax.cli.options import Common, Reading
+from gsjax.cli.options import Common, OneDataset, Reading
 from gsjax.cli.run.folder import expect_dataset
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.open import is_of_photographs, is_recording
@@ -23,11 +21,9 @@ MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows
 
 
 @dataclass(frozen=True)
-class Options(Common, Reading):
+class Options(Common, Reading, OneDataset):
     """What `gsjax info` is told."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
-    """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
     picture: Path | None = None
     """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
 

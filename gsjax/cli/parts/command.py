@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gsjax.cli.fit import command as fit_command
 from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import OF_NO_BEARING, OfRecording, Seeded, checked
+from gsjax.cli.options import OF_NO_BEARING, OfRecording, SamWeights, Seeded, checked
 from gsjax.cli.parts.loop import Following, follow_parts, refine_parts
 from gsjax.cli.parts.results import finished, print_results, write_results
 from gsjax.cli.parts.resume import Saver, load
@@ -45,7 +45,7 @@ _EVERYTHING = 0.6  # share of pixels that change
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Seeded, OfRecording):
+class Options(Seeded, SamWeights, OfRecording):
     """What `gsjax parts` is told."""
 
     anchor: int | None = None
@@ -53,9 +53,6 @@ class Options(Seeded, OfRecording):
     masks: Literal["segment", "files"] = "segment"
     """Who says what belongs together in the anchor's pictures: a segmenter, or the recording's own masks,
     whose labels must mean the same in all cameras."""
-    sam: Path | None = None
-    """Folder of SAM's weights (as of facebook/sam-vit-base): let it segment, and not the segmenter that needs
-    none. Takes the extra `foundation`."""
     scene: Path | None = None
     """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Fitted unless
     given, into RUN/canonical."""
@@ -151,8 +148,6 @@ def _check(options: Options, recording: Recording) -> None:
             f"--anchor: expected one of {sequence.num_frames} frames, 0 to {sequence.num_frames - 1}, found "
             f"{options.anchor}"
         )
-    if options.sam is not None and options.masks == "files":
-        raise ValueError("--sam: expected --masks segment, for SAM is a segmenter; found --masks files")
     inside = options.scene is not None and options.out.resolve() in options.scene.resolve().parents
     if inside and options.overwrite:
         raise ValueError(

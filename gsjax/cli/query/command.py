@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -16,7 +16,7 @@ from gsjax.cli.deform.query import DeformQuestion, answer_deformation
 from gsjax.cli.distill.query import Question, answer
 from gsjax.cli.distill.saved import Whereabouts, field_of, open_field_run, unfinished_field_of
 from gsjax.cli.messages import USER_ERRORS, Notes, describe, stage
-from gsjax.cli.options import Common
+from gsjax.cli.options import Common, ObjectText
 from gsjax.cli.query.selected import Changes
 from gsjax.cli.run.folder import expect_folder, is_run
 from gsjax.cli.run.records import read_config, read_record
@@ -78,13 +78,8 @@ class DeformOptions:
 
 
 @dataclass(frozen=True)
-class TrackOptions:
+class TrackOptions(ObjectText):
     """What only a run of `gsjax track` has a use for."""
-
-    encoder: Literal["closed", "clip"] = "closed"
-    """Who understands the text, a closed vocabulary without weights, or CLIP."""
-    min_score: float | None = None
-    """Cosine below which the text means none of the objects. The encoder's own unless given."""
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def reopen(
     try:
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
         wanted = also(settings)
-        read = _read_options(settings.get("read") or {})
+        read = read_options(settings.get("read") or {})
         scale = float(settings.get("scale", 1.0))
         dataset, cameras, frames = (settings[name] for name in _SETTINGS)
         held_out = settings.get("eval_cameras") or ()  # which not all commands have
@@ -152,7 +152,8 @@ def reopen(
         ) from error
 
 
-def _read_options(stored: Mapping[str, Any]) -> ReadOptions:
+def read_options(stored: Mapping[str, Any]) -> ReadOptions:
+    """What a config.yml tells of how the dataset was read; what this version does not know is left out."""
     known = {field.name for field in fields(ReadOptions)}
     plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
     return ReadOptions(**{name: value for name, value in plain.items() if name in known})

@@ -4,15 +4,14 @@ import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 from rich.console import Console
 
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.messages import FITTING, Notes, reason, say_error, stage
-from gsjax.cli.options import OF_NO_BEARING, OfRecording, checked, expect_positive, preset_options
+from gsjax.cli.options import OF_NO_BEARING, FirstMasks, OfRecording, checked, expect_positive, preset_options
 from gsjax.cli.recording import (
     FirstMask,
     Recording,
@@ -46,13 +45,9 @@ from gsjax.scene.frame import Frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(OfRecording):
+class Options(FirstMasks, OfRecording):
     """What `gsjax track` is told."""
 
-    mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
-    masks: Literal["auto", "files", "segment"] = "auto"
-    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     budget_ms: float | None = None
     """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given, only
     how the scene starts and how much may join it count."""

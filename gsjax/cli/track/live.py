@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.cli.machine import describe as describe_machine
 from gsjax.cli.machine import resident_mb
 from gsjax.cli.messages import FITTING, MEASURING, Notes, stage
-from gsjax.cli.options import Common, Overwriting, Selection, checked, expect_positive
+from gsjax.cli.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
 from gsjax.cli.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder
@@ -44,7 +44,7 @@ class SourceAndOut:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common, Overwriting, Selection, SourceAndOut):
+class Options(Common, Overwriting, FirstMasks, Selection, SourceAndOut):
     """What `gsjax live` is told."""
 
     minutes: float = 1.0
@@ -53,10 +53,6 @@ class Options(Common, Overwriting, Selection, SourceAndOut):
     """Frames a second: of the replay, and what the budget comes from."""
     budget_ms: float | None = None
     """What an update may take; the time between two frames unless given."""
-    mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera whose first mask names the objects. The first that has masks, unless given."""
-    masks: Literal["auto", "files", "segment"] = "auto"
-    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
 

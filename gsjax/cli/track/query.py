@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from rich.progress import track
 from rich.table import Table
 
 from gsjax.cli.messages import Notes
-from gsjax.cli.options import Common
+from gsjax.cli.options import ClipWeights, Common, ObjectText
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
 from gsjax.cli.run.pictures import frame_rate
 from gsjax.cli.run.views import View
@@ -34,7 +34,7 @@ _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 
 @dataclass(frozen=True)
-class ObjectQuery(Common):
+class ObjectQuery(Common, ClipWeights, ObjectText):
     """What is asked of a run, and how it is understood."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -43,12 +43,6 @@ class ObjectQuery(Common):
     """Which object: "red can"."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
     """Id of the camera to show it from. The first held out one, else the first tracked, unless given."""
-    encoder: Literal["closed", "clip"] = "closed"
-    """Who understands the text: a closed vocabulary without weights, or CLIP."""
-    weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face."""
-    min_score: float | None = None
-    """Cosine below which the text means none of the objects. The encoder's own unless given."""
 
 
 class Answer(NamedTuple):

@@ -163,13 +163,13 @@ def test_photographs_that_moved(gsjax_eval, photographs, run, tmp_path):
     code, said, _ = gsjax_eval()
     assert code == 2
     assert "gone" in said
-    assert "--dataset says where it is now" in said
-    code, said, found = gsjax_eval("--dataset", str(moved))
+    assert "--images says where it is now" in said
+    code, said, found = gsjax_eval("--images", str(moved))
     assert code == 0, said
     assert found["mean"]["held out"]["psnr"] == pytest.approx(
         json.loads((run / "metrics.json").read_text())["test"]["psnr"], abs=1e-9
     )
-    code, said, _ = gsjax_eval("--dataset", "simulated:tabletop?width=32&height=32&frames=3")
+    code, said, _ = gsjax_eval("--images", "simulated:tabletop?width=32&height=32&frames=3")
     assert code == 2
     assert "expected the photographs of the fit, which held out images/00.png" in said
 
