@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 # Those of extras, which need not be there, and those that only some commands need.
 OPTIONAL = {"viser", "torch", "transformers", "mujoco", "pycolmap", "tensorboardX", "distributed", "dask"}
-LATE = {"matplotlib", "skimage", "jaxopt", "trimesh", "imageio_ffmpeg", "rich", "tyro", "PIL"}
+LATE = {"matplotlib", "skimage", "jaxopt", "imageio_ffmpeg", "rich", "tyro", "PIL"}
 
 
 def loaded(program: str) -> set[str]:

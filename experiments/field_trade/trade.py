@@ -58,7 +58,7 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
             continue
         axes.plot([r["minutes"] for r in some], [r["miou_3d"] for r in some], "o-", ms=4, label=words)
         for row in some:
-            if row["iterations"] == MIDDLE["iterations"] and name != "iterations":
+            if row.get("iterations") == MIDDLE["iterations"] and name != "iterations":
                 continue  # one word for the middle
             axes.annotate(f"{row[name]:g}", (row["minutes"], row["miou_3d"]), fontsize=7, va="bottom")
     axes.set(xscale="log", xlabel="minutes of steps", ylabel="mIoU of held-out views, 3D query")

@@ -36,7 +36,7 @@ class Overwriting:
     """What those have that write a folder of their own."""
 
     overwrite: bool = False
-    """Replace what an earlier run of this command left in the same folder."""
+    """Replace what an earlier run left in the same folder, and what was made of it since: a field, films."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from gsjax.cli.options import OF_NO_BEARING, OfDataset, checked, preset_options
 from gsjax.cli.recording import located, open_recording
 from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset
-from gsjax.cli.run.learning import Course, Learning, learn, load
+from gsjax.cli.run.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.data import Photographs
 from gsjax.data.open import is_of_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_in_time
@@ -114,8 +114,7 @@ def run(options: Options) -> int:
         write_scene(folder, learning.state, data, deep.metric)
         with stage(console, "looking at held-out frames"):
             judged = judge(folder, problem, learning.state, data, options.tools)
-        if learning.state.step < course.total and learning.stopped is None:
-            notes.add(f"Stopped by --minutes after {learning.state.step:,} of {course.total:,} steps.")
+        say_if_cut_short(learning, course, notes)
         if learning.skipped:
             notes.warn(f"{learning.skipped} steps met numbers that are not finite and changed nothing")
         tracks = judged["tracks"]

@@ -22,7 +22,7 @@ from gsjax.cli.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, ch
 from gsjax.cli.recording import located
 from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, plain
-from gsjax.cli.run.learning import Course, Learning, learn, load
+from gsjax.cli.run.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.cli.run.records import digest
 from gsjax.methods.feature_field import FieldConfig, begin_field, distill
 
@@ -113,6 +113,7 @@ def run(options: Options) -> int:
         write_field(folder.path / NAME, stored)
         with stage(console, "asking it about views"):
             judged = judge(folder, scene, teaching, stored, options.field, notes)
+        say_if_cut_short(learning, course, notes)
         _say_what_was_odd(scene, learning, notes)
         found = {
             "kind": "distill",

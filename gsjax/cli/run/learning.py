@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.cli.interrupts import hear, undisturbed
+from gsjax.cli.messages import Notes
 from gsjax.cli.run.ending import ended
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.saving import Saver
@@ -181,6 +182,12 @@ def learn(
             learning.stopped = stopped
         save(last=True)
     return learning
+
+
+def say_if_cut_short(learning: Learning, course: Course, notes: Notes) -> None:
+    """Note where `--minutes` ended it before all steps were made."""
+    if learning.state.step < course.total and learning.stopped is None:
+        notes.add(f"Stopped by --minutes after {learning.state.step:,} of {course.total:,} steps.")
 
 
 def _save(path: Path, learning: Learning) -> None:

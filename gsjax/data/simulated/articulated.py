@@ -16,7 +16,6 @@ from gsjax.geometry.joints import Joint
 
 RATE_HZ = 15.0
 PARTS = ("drawer", "door", "lid", "box", "shut door")
-BASES = ("cabinet", "chest")
 
 _WORLD, _DRAWER, _DOOR, _LID, _BOX, _SHUT, _CABINET, _CHEST = range(8)  # bodies; labels are the same numbers
 _UP, _FORWARD, _LEFT = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
