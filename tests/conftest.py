@@ -47,6 +47,7 @@ def forget_compiled():
     """A compiled program holds memory maps, of which Linux grants a process 65,530: too few for all tests."""
     yield
     jax.clear_caches()
+    gc.collect()  # programs are in cycles
 
 
 @pytest.fixture

@@ -1,8 +1,10 @@
 """Pinhole cameras. World to camera, OpenCV axes (+x right, +y down, +z forward), pixel centres at +0.5."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -85,11 +87,13 @@ def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
     return Camera(camera.viewmat, K, width, height, camera.near)
 
 
+@partial(jax.jit, inline=True)
 def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) -> Float[Array, "*n 3"]:
     """Points in the frame of one camera."""
     return jnp.matmul(points, viewmat[:3, :3].T, precision="highest") + viewmat[:3, 3]
 
 
+@partial(jax.jit, inline=True)
 def project(
     points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
@@ -144,6 +148,7 @@ def pixels_of(
     return PixelsOf(columns, rows, depths, inside)
 
 
+@partial(jax.jit, inline=True)
 def unproject(
     pixels: Float[Array, "*n 2"],
     depths: Float[Array, "*n"],

@@ -3,6 +3,9 @@
 Rigid motions themselves are `jaxlie.SE3`; what stands here is the little that jaxlie leaves out.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,6 +13,7 @@ MIN_SQUARED_NORM = 1e-12
 """Below this |q|^2 a quaternion names no rotation; the rasterizer culls a Gaussian that has it."""
 
 
+@partial(jax.jit, inline=True)
 def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Unit quaternions. One that is too short to name a rotation becomes the identity, with zero gradient."""
     squared = jnp.sum(quats * quats, axis=-1, keepdims=True)
@@ -19,6 +23,7 @@ def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]
     return safe / jnp.sqrt(jnp.where(usable, squared, 1.0))
 
 
+@partial(jax.jit, inline=True)
 def quats_to_matrices(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:
     """Rotation matrices of (not necessarily unit) quaternions [w, x, y, z]."""
     w, x, y, z = jnp.moveaxis(normalize_quats(quats), -1, 0)
@@ -30,6 +35,7 @@ def quats_to_matrices(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+@partial(jax.jit, inline=True)
 def multiply_quats(a: Float[Array, "*#batch 4"], b: Float[Array, "*#batch 4"]) -> Float[Array, "*batch 4"]:
     """Hamilton product: the rotation `b` followed by `a`."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)

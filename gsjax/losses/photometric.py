@@ -1,5 +1,6 @@
 """Image losses: L1, D-SSIM (Kerbl et al. 2023, eq. 7) and truncated depth differences."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -89,6 +90,7 @@ def _planes(images: Float[Array, "c h w k"]) -> Float[Array, "n h w"]:
     return jnp.moveaxis(images, -1, 1).reshape(-1, *images.shape[1:3])
 
 
+@partial(jax.jit, inline=True)
 def _blurred(planes: Float[Array, "n h w"]) -> Float[Array, "n h w"]:
     half = len(_WINDOW) // 2
     for axis in (1, 2):

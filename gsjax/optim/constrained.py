@@ -8,6 +8,7 @@ and again, where ours looks at another view each time. `simplex_descent` is an o
     gradient_step(loss, per_field_adam(rates, others={"weights": simplex_descent(0.01)}))     and other fields
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 _DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as of Adam elsewhere
 
 
+@partial(jax.jit, inline=True)
 def project_simplex(values: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
     """The nearest point on the simplex of each row: max(v - tau, 0), with tau such that it sums to 1.
 

@@ -1,6 +1,7 @@
 """The scene: Gaussians as one pytree of raw (unconstrained) parameters, and the integers beside them."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -174,8 +175,12 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     if len(sizes) > 1:
         raise ValueError(f"concatenate: features must have one size in all parts or be None, got {sizes}")
     degree = max(part.sh_degree for part in parts)
-    padded = [_with_sh_degree(part, degree) for part in parts]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=0), *padded)
+    return _joined([_with_sh_degree(part, degree) for part in parts])
+
+
+@partial(jax.jit, inline=True)
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=0), *parts)
 
 
 def _with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
@@ -193,6 +198,11 @@ Tree = TypeVar("Tree", Gaussians, Tags)
 def take(tree: Tree, indices: Integer[ArrayLike, "M"] | Bool[ArrayLike, "N"]) -> Tree:
     """The rows `indices` (or, outside a trace, those where a boolean mask is True) of Gaussians or Tags."""
     indices = jnp.asarray(indices)
+    return _rows(tree, jnp.flatnonzero(indices) if indices.dtype == bool else indices)
+
+
+@partial(jax.jit, inline=True)
+def _rows(tree: Tree, indices: Integer[Array, "M"]) -> Tree:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[indices], tree)
 
 

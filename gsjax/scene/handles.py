@@ -9,6 +9,7 @@ Its printed orientation, quat(sum_p w_p R_p^T R(q)), turns the wrong way, and a 
 blends them instead is chosen by `Blend`.
 """
 
+from functools import partial
 from typing import Literal
 
 import equinox as eqx
@@ -96,6 +97,7 @@ def skin_means(
     return jnp.einsum("nij,nj->ni", blended, means) + weights @ offsets
 
 
+@partial(jax.jit, inline=True)
 def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
     """Unit quaternions of the blended rotations. The sign of a quaternion means nothing, so each is aligned
     with that of the largest weight; where the sum vanishes all the same, the latter stands alone."""
