@@ -4,7 +4,7 @@ train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c],
                        ours adds time[t] in seconds and depth_unit_m
 test_meta.json         the same for held-out cameras, optional; both are merged
 ims/CAM/FRAME.jpg      named by fn
-seg/CAM/FRAME.png      labels, optional, possibly for some cameras only
+seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or of the first frame alone
 depth/CAM/FRAME.png    uint16 in steps of depth_unit_m, 0 and 65535 = invalid, optional
 truth.npz, meta.json   simulated scenes: T_wo [T,K,4,4] with meta's objects (labels 2.., robot 1), or
                        T_wp [T,K,4,4] with meta's parts (labels 1..) and joints, whose values are q [T,joints]
@@ -58,6 +58,8 @@ def read_panoptic(path: str | Path) -> Sequence:
         )
     unit = float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
 
+    first_alone = [_has_first_alone(root, name) for name in names[0]]
+
     def locate(kind: str, t: int, c: int) -> str:
         return str(_FINDERS.get(kind, _image_path)(root, names[t][c]))
 
@@ -67,7 +69,8 @@ def read_panoptic(path: str | Path) -> Sequence:
 
     def load_mask(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        return read_mask(_mask_path(root, name), width, height) if _has(root, "seg", name) else None
+        absent = not _has(root, "seg", name) or (first_alone[c] and name != names[0][c])
+        return None if absent else read_mask(_mask_path(root, name), width, height)
 
     return Sequence(
         name=root.resolve().name,
@@ -300,6 +303,12 @@ _FINDERS = {"image": _image_path, "mask": _mask_path, "depth": _depth_path}
 def _has(root: Path, kind: str, name: str) -> bool:
     """Whether the camera of image `name` has a folder of that kind."""
     return (root / kind / name).parent.is_dir()
+
+
+def _has_first_alone(root: Path, first: str) -> bool:
+    """Whether the camera of image `first` has its mask and no other, which is all that the tracker needs."""
+    mask = _mask_path(root, first)
+    return _has(root, "seg", first) and [*mask.parent.iterdir()] == [mask]
 
 
 def _frame_number(name: str, fallback: int) -> int:

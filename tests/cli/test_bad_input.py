@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 
 import cv2
 import numpy as np
@@ -72,6 +73,17 @@ def test_folder_of_several_sequences(refused, tmp_path):
 def test_missing_image(refused, recording):
     (recording / "ims" / "1" / "000002.png").unlink()
     assert "000002.png: expected an image of all 3 cameras in frame 2" in refused(recording)
+
+
+def test_one_mask_is_enough(sound, recording):
+    for file in (recording / "seg").rglob("*.png"):
+        if file.parent.name != "1" or file.stem != "000000":
+            file.unlink()
+    for camera in ("0", "2"):
+        shutil.rmtree(recording / "seg" / camera, ignore_errors=True)
+    said, found = sound(recording, "--mask-camera", "1")
+    assert found["complete"]
+    assert "no such file" not in said
 
 
 def test_missing_first_mask(refused, recording):

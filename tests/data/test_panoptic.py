@@ -192,6 +192,17 @@ def test_a_bad_image_is_named(folder, spoil, says):
         sequence.image(2, 1)
 
 
+def test_the_first_mask_may_be_the_only_one(folder):
+    folder.add("seg", 0, np.uint8)
+    folder.add("seg", 1, np.uint8)
+    for file in sorted((folder.root / "seg/0").iterdir())[1:]:
+        file.unlink()
+    sequence = folder.read()
+    assert sequence.mask(0, 0) is not None
+    assert sequence.mask(1, 0) is None
+    assert sequence.mask(1, 1) is not None
+
+
 def test_files_of_a_kind_that_are_missing_or_bad(folder):
     folder.add("depth", 0, np.uint8, 15)
     folder.add("seg", 0, np.uint8)

@@ -139,6 +139,17 @@ class TestInRefinement:
         assert told["extra"].keys() == {"upwards", "nothing"}
         assert "extra" not in info
 
+    def test_a_gradient_that_is_no_number_is_culled_and_counted(self, batch):
+        def root(scene, rendered, frame):
+            return jnp.mean(jnp.sqrt(0.0 * scene.gaussians.means))
+
+        config = RefineConfig(iterations=2)
+        found, _, told = refine(still(batch), batch, config, (root,))
+        assert np.isfinite(found.twists).all()
+        assert told["culled"] > 0
+        _, _, told = refine(still(batch), batch, config, (nothing,))
+        assert told["culled"] == 0
+
     def test_one_of_zero_leaves_every_bit(self, batch):
         config = RefineConfig(iterations=2)
         plain, _, info = refine(still(batch), batch, config)

@@ -141,7 +141,8 @@ def refine(
         extra_losses: beside that of pictures; see `refine_loss`.
 
     Returns:
-        the motion, how far each Gaussian of the batch's background moved (None if that is frozen), info.
+        the motion, how far each Gaussian of the batch's background moved (None if that is frozen), info. Its
+        `culled` counts numbers of gradients that were not finite, and were taken as 0.
     """
     rates = jnp.array([config.translation_rate] * 3 + [config.rotation_rate] * 3)
     still = batch.scene.num_moving
@@ -166,9 +167,10 @@ def refine(
     def iterate(carry, _):
         trained, state = carry
         (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
+        culled = sum(jnp.sum(~jnp.isfinite(g)) for g in jax.tree.leaves(gradient))
         gradient = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), gradient)
         updates, state = optimizer.update(gradient, state, trained)
-        return (optax.apply_updates(trained, updates), state), {**info, "loss": value}
+        return (optax.apply_updates(trained, updates), state), {**info, "loss": value, "culled": culled}
 
     trained = (motion, shifts)
     end: Any  # optax says less of what it returns than it is given
@@ -176,4 +178,5 @@ def refine(
     motion, shifts = end[0]
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()
     info = jax.tree.map(lambda values: values[-1], infos)
-    return motion, shifts, {**info, "first_loss": infos["loss"][0], "overflow": overflow, "needed": needed}
+    info |= {"first_loss": infos["loss"][0], "culled": infos["culled"].sum()}
+    return motion, shifts, {**info, "overflow": overflow, "needed": needed}
