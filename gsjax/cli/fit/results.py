@@ -261,6 +261,7 @@ def write_results(folder: RunFolder, found: dict[str, Any]) -> None:
             cards["SSIM, held out"] = f"{test['ssim']:.3f}"
     cards["Gaussians"] = found["num_gaussians"]
     photographs = found["photographs"]
+    cards["Steps"] = found["steps"]
     cards["Fitted for"] = (f"{_minutes(found):.1f}", "minutes")
     columns = [c for c in _COLUMNS if c[0] == "view" or any(row[c[0]] is not None for row in found["views"])]
     keys, heads, units, decimals = zip(*columns, strict=True)
@@ -312,7 +313,8 @@ def print_results(folder: RunFolder, found: dict[str, Any]) -> None:
         words += "" if test["depth_mm"] is None else f", depth {test['depth_mm']:.0f} mm off"
         grid.add_row("[bold]held out[/]", f"{words} (mean of {photographs['held_out']} views)")
     grid.add_row("[bold]scene[/]", f"{found['num_gaussians']:,} Gaussians, SH degree {found['sh_degree']}")
-    rate = found["steps"] / seconds["fit"] if seconds["fit"] else 0
-    words = f"{found['steps']:,} steps in {_minutes(found):.1f} min ({rate:.1f} a second), "
-    grid.add_row("[bold]fit[/]", f"{words}{seconds['compile']:.0f} s of it compiling")
+    words = f"{found['steps']:,} steps in {_minutes(found):.1f} min"
+    if seconds["fit"] > 1:  # the steps that compiled are not in it, and may be all there are
+        words += f" ({found['steps'] / seconds['fit']:.1f} a second)"
+    grid.add_row("[bold]fit[/]", f"{words}, {seconds['compile']:.0f} s of it compiling")
     print_grid(folder, found, grid)
