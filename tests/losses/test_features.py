@@ -80,7 +80,7 @@ def test_the_contrast_is_that_of_all_pairs(seed, gamma):
 def test_the_contrast_knows_no_anchors_where_nothing_is_twice_and_no_pixels_without_a_kind():
     features = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)), jnp.float32)
     for ids in ([0, 1, 2, 3], [-1, -1, -1, -1], [0, -1, -1, 1]):
-        value, slope = jax.value_and_grad(contrastive_loss)(features, jnp.array(ids))
+        value, slope = jax.jit(jax.value_and_grad(contrastive_loss))(features, jnp.array(ids))
         assert value == 0
         np.testing.assert_array_equal(slope, 0)
     # One kind alone is as together as it can be, wherever it lies.
@@ -90,10 +90,10 @@ def test_the_contrast_knows_no_anchors_where_nothing_is_twice_and_no_pixels_with
 def test_the_contrast_stays_finite_where_its_kernel_underflows_and_where_features_are_equal():
     far = 500.0 + 30 * jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     ids = jnp.array([0, 1, 0, 1])
-    value, slope = jax.value_and_grad(contrastive_loss)(far, ids)
+    value, slope = jax.jit(jax.value_and_grad(contrastive_loss))(far, ids)
     np.testing.assert_allclose(value, np.log(2), rtol=1e-3)  # two others are equally near, one of its kind
     assert np.isfinite(slope).all()
-    value, slope = jax.value_and_grad(contrastive_loss)(jnp.ones((4, 2)), ids)
+    value, slope = jax.jit(jax.value_and_grad(contrastive_loss))(jnp.ones((4, 2)), ids)
     np.testing.assert_allclose(value, np.log(3), rtol=1e-6)
     assert np.isfinite(slope).all()
 
@@ -106,7 +106,7 @@ def test_features_without_a_length_have_no_slope_and_no_nan():
     def value(rendered):
         return cosine_error(likeness(rendered, told["weights"], told["codebook"], told["ids"])).sum()
 
-    slope = jax.grad(value)(told["rendered"])
+    slope = jax.jit(jax.grad(value))(told["rendered"])
     assert np.isfinite(slope).all()
     np.testing.assert_array_equal(slope[0], 0)
     np.testing.assert_array_equal(slope[np.asarray(told["ids"]) == 2], 0)
@@ -129,7 +129,7 @@ def test_slopes_are_those_of_central_differences_and_jvp_agrees_with_vjp():
     def value(floats):
         return whole(told | floats)
 
-    slopes = jax.grad(value)(floats)
+    slopes = jax.jit(jax.grad(value))(floats)
     random = np.random.default_rng(2)
     for name, slope in slopes.items():
         along = {k: jnp.zeros_like(a) for k, a in floats.items()}
@@ -192,4 +192,6 @@ def test_the_cycle_is_both_ways_and_nothing_for_an_inverse(seed):
 
     step = 1e-7 * along
     numeric = (loss(given_[3] + step) - loss(given_[3] - step)) / 2e-7
-    np.testing.assert_allclose((jax.grad(loss)(given_[3]) * along).sum(), numeric, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        (jax.jit(jax.grad(loss))(given_[3]) * along).sum(), numeric, rtol=1e-4, atol=1e-6
+    )

@@ -39,14 +39,14 @@ def test_l1_averages_over_channels_and_pixels_and_follows_the_weights():
 def test_truncated_l1_counts_what_is_far_off_as_the_limit_and_does_not_pull_on_it():
     values, targets = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.02, 2.5, 3.0])
     weights = jnp.array([1.0, 1.0, 0.0])
-    loss, gradient = jax.value_and_grad(truncated_l1)(values, targets, weights, 0.05)
+    loss, gradient = jax.jit(jax.value_and_grad(truncated_l1))(values, targets, weights, 0.05)
     np.testing.assert_allclose(loss, (0.02 + 0.05) / 2, rtol=1e-4)
     np.testing.assert_allclose(gradient, [-0.5, 0.0, 0.0], atol=1e-6)
 
 
 def test_zero_weights_leave_zero_gradients():
     values = jnp.array([0.2, 0.7])
-    gradient = jax.grad(lambda v: truncated_l1(v, jnp.zeros(2), jnp.zeros(2), 0.5))(values)
+    gradient = jax.jit(jax.grad(lambda v: truncated_l1(v, jnp.zeros(2), jnp.zeros(2), 0.5)))(values)
     np.testing.assert_array_equal(gradient, 0)
 
 
@@ -96,7 +96,7 @@ def test_gradients_are_those_of_central_differences(loss):
         ahead = loss(*(a + step * d for a, d in zip(both, change, strict=True)))
         behind = loss(*(a - step * d for a, d in zip(both, change, strict=True)))
         expected = (ahead - behind) / (2 * step)
-        slopes = jax.grad(loss, argnums=(0, 1))(*both)
+        slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(*both)
         slope = sum(jnp.vdot(a, d) for a, d in zip(slopes, change, strict=True))
         np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-9)
         np.testing.assert_allclose(jax.jvp(loss, both, tuple(change))[1], slope, rtol=1e-9, atol=1e-12)
@@ -108,4 +108,4 @@ def test_ssim_is_the_same_under_jit_and_vmap():
     alone = [ssim(image[i : i + 1], target[i : i + 1]) for i in range(3)]
     np.testing.assert_allclose(together, alone, rtol=1e-5)
     slopes = jax.vmap(jax.grad(ssim))(image[:, None], target[:, None])
-    np.testing.assert_allclose(slopes[1], jax.grad(ssim)(image[1:2], target[1:2]), atol=1e-6)
+    np.testing.assert_allclose(slopes[1], jax.jit(jax.grad(ssim))(image[1:2], target[1:2]), atol=1e-6)

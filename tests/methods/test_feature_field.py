@@ -146,7 +146,7 @@ def test_the_slope_of_the_whole_loss_is_that_of_central_differences(two_balls):
         lambda a: a + 0.1 * jnp.asarray(np.random.default_rng(1).normal(size=a.shape)), field
     )
     loss = jax.jit(lambda f: field_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
-    slope, random = jax.grad(loss)(field), np.random.default_rng(5)
+    slope, random = jax.jit(jax.grad(loss))(field), np.random.default_rng(5)
     for pick in ("table", "layers", "lift"):
         along = jax.tree_util.tree_map_with_path(
             lambda path, a, pick=pick: jnp.asarray(random.normal(size=a.shape)) * (pick in str(path)), field

@@ -83,7 +83,9 @@ class TestEveryEdit:
 
     def test_gradients_are_finite_also_where_nothing_moves(self, edit):
         for start in (trajectory(6), still(4, jnp.asarray(TIMES))):
-            slopes = jax.grad(lambda one: sum(x.sum() for x in jax.tree.leaves(edit(one, [1]))))(start)
+            slopes = jax.jit(jax.grad(lambda one: sum(x.sum() for x in jax.tree.leaves(edit(one, [1])))))(
+                start
+            )
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
     def test_names_a_part_that_is_not_there(self, edit):

@@ -53,7 +53,7 @@ def test_derivatives_are_those_of_finite_differences(boxes, of):
         return stream_loss(config)(params._replace(**{of: one}), batch, step=0.0, key=None)[0]
 
     here, step, rng = getattr(params, of), 1e-6, np.random.default_rng(0)
-    slope = jax.grad(loss)(here)
+    slope = jax.jit(jax.grad(loss))(here)
     for _ in range(3):
         way = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), here)
         ahead, behind = (loss(jax.tree.map(lambda a, b, s=s: a + s * b, here, way)) for s in (step, -step))
@@ -71,7 +71,7 @@ def test_the_past_teaches_the_field_alone(boxes):
         )[1]
         return told["past"]
 
-    slope = jax.grad(of_past)(params)
+    slope = jax.jit(jax.grad(of_past))(params)
     assert all((leaf == 0).all() for leaf in jax.tree.leaves(slope.pose))
     assert jnp.abs(slope.field).max() > 0
 

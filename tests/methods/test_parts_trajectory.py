@@ -132,7 +132,7 @@ def test_gradients_are_finite_where_parts_are_hidden_or_wholly_shown(factor):
         found = gaussians_at(scene, moment)
         return sum(leaf.sum() for leaf in (found.means, found.quats, found.log_scales, found.opacities))
 
-    slopes = jax.grad(total, argnums=(0, 1))(now._replace(opacities=jnp.full(3, factor)), scene)
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1)))(now._replace(opacities=jnp.full(3, factor)), scene)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 

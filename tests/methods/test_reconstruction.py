@@ -216,7 +216,7 @@ def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
     def of(image):
         seen = Observation(jnp.asarray(image)[None], jnp.asarray(mask)[None], None, camera, jnp.int32(0))
         batch = Batch(seen, jnp.zeros((1, 3)), plan)
-        return jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0])(state.model)
+        return jax.jit(jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0]))(state.model)
 
     garbled = view.image.copy()
     garbled[:, WIDTH // 2 + 12 :] = (

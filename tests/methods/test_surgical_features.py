@@ -51,7 +51,7 @@ class TestFeatureLoss:
 
     def test_every_pixel_learns_from_a_coarse_teacher(self):
         codes, ids = jnp.asarray(CODES, jnp.float32), jnp.zeros((3, 4), jnp.int32)
-        slope = jax.grad(feature_loss)(jnp.full((24, 32, 4), 2.0), codes, ids)
+        slope = jax.jit(jax.grad(feature_loss))(jnp.full((24, 32, 4), 2.0), codes, ids)
         assert (jnp.abs(slope) > 0).all()
 
     def test_a_teacher_that_says_nothing(self):
@@ -97,7 +97,9 @@ class TestGraph:
     def test_slopes_reach_nodes_alone(self, graphs):
         nodes, found = graphs
         features = jnp.asarray(np.random.default_rng(0).normal(size=(nodes.max() + 5, 4)), jnp.float32)
-        slope = jax.grad(lambda f: sum(graph_loss(f, found["matching"][2], CONFIG.graph).values()))(features)
+        slope = jax.jit(jax.grad(lambda f: sum(graph_loss(f, found["matching"][2], CONFIG.graph).values())))(
+            features
+        )
         assert jnp.isfinite(slope).all()
         others = np.setdiff1d(np.arange(len(features)), nodes)
         assert (np.asarray(slope)[others] == 0).all()
@@ -144,5 +146,5 @@ class TestPrompts:
         found = prompt_probabilities(features, jnp.asarray(CODES))
         np.testing.assert_allclose(found[0], 0.5)
         assert found[1, 0] > 0.99
-        slope = jax.grad(lambda f: prompt_probabilities(f, jnp.asarray(CODES))[:, 0].sum())(features)
+        slope = jax.jit(jax.grad(lambda f: prompt_probabilities(f, jnp.asarray(CODES))[:, 0].sum()))(features)
         assert jnp.isfinite(slope).all()

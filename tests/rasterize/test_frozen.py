@@ -75,7 +75,7 @@ def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else
             jnp.asarray(random.normal(size=shape), jnp.float32)
             for shape in ((len(scene["means"]), channels), (17, 33, channels))
         )
-        slope = jax.grad(lambda v, w=weights: (paint(view, v, plan)[0] * w).sum())(values)
+        slope = jax.jit(jax.grad(lambda v, w=weights: (paint(view, v, plan)[0] * w).sum()))(values)
 
         def whole(scene, values, w=weights):
             shapes = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
@@ -83,10 +83,10 @@ def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else
             return (rasterization(**shapes, colors=values, width=33, height=17, plan=of_plan)[0][0] * w).sum()
 
         # By everything, which takes another way back; and by the values alone.
-        both = jax.grad(whole, argnums=(0, 1), allow_int=True)(scene, values)[1]
+        both = jax.jit(jax.grad(whole, argnums=(0, 1), allow_int=True))(scene, values)[1]
         np.testing.assert_allclose(slope, both, atol=2e-4)
-        np.testing.assert_allclose(jax.grad(whole, argnums=1)(scene, values), both, atol=2e-4)
-        still = jax.grad(lambda view, v=values: paint(view, v, plan)[0].sum(), allow_int=True)(view)
+        np.testing.assert_allclose(jax.jit(jax.grad(whole, argnums=1))(scene, values), both, atol=2e-4)
+        still = jax.jit(jax.grad(lambda view, v=values: paint(view, v, plan)[0].sum(), allow_int=True))(view)
         np.testing.assert_array_equal(still.means2d, 0)
 
 
@@ -100,7 +100,9 @@ def test_a_batch_of_values_is_a_loop_and_its_slopes_too(frozen):
 
     np.testing.assert_allclose(jax.vmap(value)(values), [value(v) for v in values], rtol=1e-5)
     slopes = jax.vmap(jax.grad(value))(values)
-    np.testing.assert_allclose(slopes, np.stack([jax.grad(value)(v) for v in values]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        slopes, np.stack([jax.jit(jax.grad(value))(v) for v in values]), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_what_cannot_be_drawn_is_in_no_list(small, geometry):
