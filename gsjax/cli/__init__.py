@@ -6,6 +6,7 @@ Commands are imported when they are called, so that `gsjax --help` answers at on
 import os
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 
 from rich.console import Console
@@ -47,8 +48,16 @@ options where defaults depend on what is given, and the arguments that are left 
 
 def entry() -> None:
     """The program. After Ctrl-C it leaves without waiting for XLA, which may still be compiling in a thread
-    and would crash while Python takes it down."""
-    code = main()
+    and would crash while Python takes it down. Where nobody reads on (`gsjax track --help | head`) it ends
+    quietly, with the code of a program that SIGPIPE ended."""
+    try:
+        try:
+            code = main()
+        finally:
+            sys.stdout.flush()  # later nobody could catch it
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes there
+        code = 141
     if code == 130:
         sys.stdout.flush()
         sys.stderr.flush()
@@ -71,8 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("gsjax", import_module("gsjax").__version__)
         return 0
     if command not in COMMANDS:
-        known = ", ".join(COMMANDS)
-        Console(stderr=True).print(f"[bold red]error:[/] no command {command!r}; there are: {known}")
+        known, meant = ", ".join(COMMANDS), get_close_matches(command, COMMANDS, 1)
+        told = f"no command {command!r}; " + (f"did you mean {meant[0]}? There are" if meant else "there are")
+        Console(stderr=True).print(f"[bold red]error:[/] {told}: {known}")
         return 2
     from gsjax.cli.interrupts import heard_interrupts
 

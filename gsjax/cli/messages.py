@@ -1,6 +1,7 @@
 """What goes wrong is said in a sentence: errors of the user's making, and warnings, each kind once."""
 
 import re
+import select
 import sys
 import warnings
 from collections import Counter
@@ -44,7 +45,7 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
             compiler.keep_programs()
         return import_module(entry[0]).run(options)
     except Exception as error:
-        if "--debug" in arguments:
+        if "--debug" in arguments or (isinstance(error, BrokenPipeError) and is_unread()):
             raise
         if isinstance(error, USER_ERRORS):
             say_error(describe(error))
@@ -52,6 +53,15 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
         say_error(f"{told}. Please report it with what --debug shows")
         return 1
+
+
+def is_unread() -> bool:
+    """Whether what is printed goes into a pipe that nobody reads any more, as after `| head`."""
+    if not hasattr(select, "poll"):
+        return False
+    output = select.poll()
+    output.register(sys.__stdout__, select.POLLOUT)
+    return any(events & select.POLLERR for _, events in output.poll(0))
 
 
 def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) -> Any:

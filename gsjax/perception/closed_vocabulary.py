@@ -27,6 +27,7 @@ _SYNONYMS = {
     **{"biggest": "largest", "big": "largest", "large": "largest"},
     **{"tiniest": "smallest", "tiny": "smallest", "small": "smallest", "little": "smallest"},
 }
+_NUMBERED = re.compile(r"object \d+")  # what is called so has no name
 _SILENT = frozenset(
     [
         *("a", "an", "the", "this", "that", "it", "one", "object", "thing", "item", "of", "my", "me"),
@@ -116,7 +117,9 @@ class ClosedVocabulary:
                 f"no word {unknown[0]!r}" if unknown else f"no word in {text!r} that tells objects apart"
             )
             listed = "; ".join(f"{aspect}s: {', '.join(words)}" for aspect, words in self._aspects.items())
-            raise ValueError(f"the closed vocabulary has {problem}. It has {listed}")
+            named_by_number = all(_NUMBERED.fullmatch(name) for name in self._names.values())
+            advice = '. Nothing has a name here: ask by colour or outline, "the blue one"' * named_by_number
+            raise ValueError(f"the closed vocabulary has {problem}. It has {listed}{advice}")
         parts = []
         for aspect, words in self._aspects.items():
             part = np.array([float((aspect, word) in named) for word in words] + [0.0, 0.0])

@@ -72,7 +72,9 @@ class ClassCodebook:
         name = _plain(text)
         if name not in self.names:
             raise ValueError(
-                f"no class {text!r}; these features know names alone, and there are: {', '.join(self.names)}"
+                f"no class {text!r}; these features know names alone, and there are: "
+                f"{', '.join(self.names)}. For colours: gsjax distill RUN --features closed --out NEW, then "
+                "gsjax query NEW; or gsjax query RUN, where RUN is of gsjax track"
             )
         return self._vector(name)
 

@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import shlex
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -111,5 +112,5 @@ def foundation_modules(model: str) -> tuple[ModuleType, ModuleType]:
     except ImportError as error:
         raise ImportError(
             f"{model} needs torch and transformers, and {error.name} is not installed: "
-            "pip install 'gsjax[foundation]'"
+            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[foundation]'"
         ) from error

@@ -1,6 +1,9 @@
 """The front door: help, unknown words, info, and how errors and warnings are said."""
 
+import os
 import re
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 
@@ -36,7 +39,19 @@ def test_version(say):
 def test_unknown_command(say):
     code, _, err = say("trakc")
     assert code == 2
-    assert "no command 'trakc'; there are: info, poses, track, live, " in err
+    assert "no command 'trakc'; did you mean track? There are: info, poses, " in err
+    assert "no command 'xyz'; there are: info, poses, " in say("xyz")[2]
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["track", "--help"]])
+def test_it_ends_quietly_where_nobody_reads(arguments):
+    reads, writes = os.pipe()
+    os.close(reads)
+    ended = subprocess.run(
+        [sys.executable, "-m", "gsjax.cli", *arguments], stdout=writes, stderr=subprocess.PIPE
+    )
+    os.close(writes)
+    assert (ended.returncode, ended.stderr) == (141, b"")
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
@@ -63,6 +78,13 @@ def test_missing_option_is_named(say, capfd):
 def test_debug_shows_where_it_failed(tmp_path):
     with pytest.raises(ValueError, match="expected a folder"):
         main(["info", str(tmp_path / "nowhere"), "--debug"])
+
+
+def test_info_of_a_ply_file_points_to_view(say, tmp_path):
+    (tmp_path / "scene.ply").write_bytes(b"ply")
+    code, _, err = say("info", str(tmp_path / "scene.ply"))
+    assert code == 2
+    assert f"expected a dataset, found a PLY file; look at it by gsjax view {tmp_path}" in err
 
 
 def test_info_says_what_is_there(say):

@@ -115,3 +115,9 @@ def test_without_sizes_a_thing_is_the_same_in_any_company():
     assert "size" not in ClosedVocabulary(sizes=False).words
     with pytest.raises(ValueError, match="largest"):
         ClosedVocabulary(sizes=False).embed_text("the largest")
+
+
+@pytest.mark.parametrize("names", [None, {1: "object 1", 2: "object 2"}])
+def test_where_nothing_has_a_name_colours_are_advised(names):
+    with pytest.raises(ValueError, match=r"no word 'mug'.*Nothing has a name here.*\"the blue one\""):
+        ClosedVocabulary(names).embed_text("mug")

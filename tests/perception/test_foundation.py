@@ -362,5 +362,7 @@ def test_transformers_is_told_to_unpickle_nothing_and_to_run_nothing(load, tmp_p
 def test_without_the_extra_it_is_named(load, tmp_path, monkeypatch):
     save_placeholders(tmp_path, "model.safetensors")
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
-    with pytest.raises(ImportError, match=r"torch is not installed: pip install 'gsjax\[foundation\]'"):
+    with pytest.raises(
+        ImportError, match=r"torch is not installed: \S+ -m pip install 'gsjax\[foundation\]'"
+    ):
         load(tmp_path)

@@ -8,7 +8,9 @@ experiment's folder afterwards is what a run here would have left.
 import io
 import logging
 import os
+import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
@@ -339,5 +341,5 @@ def _package(name: str) -> Any:
     except ImportError as error:
         raise ValueError(
             f"--executor dask: expected {name.split('.')[0]}, which is not installed: "
-            "pip install 'gsjax[cluster]'"
+            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[cluster]'"
         ) from error

@@ -13,8 +13,9 @@ from gsjax.cli.messages import Notes, stage
 from gsjax.cli.options import Common, Overwriting
 from gsjax.cli.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
 from gsjax.cli.parts.saved import open_parts_run
-from gsjax.methods.motion_parts.operations import OPERATIONS
-from gsjax.methods.motion_parts.timeline import Script, parse_op, parse_script
+from gsjax.methods.motion_parts.operation import Edit
+from gsjax.methods.motion_parts.operations import OPERATIONS, Composite
+from gsjax.methods.motion_parts.timeline import Names, Script, parse_op, parse_script
 
 HELP = (
     f" Operations: {', '.join(OPERATIONS)}. A script is a YAML file, `edits: [{{op: speed, parts: [door], "
@@ -69,8 +70,19 @@ def run(options: Options) -> int:
     part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
     pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
     print(f"{found['seconds']:.2f} s, {found['frames']} frames{part}, seen by camera {camera}{pace}")
+    print(f"edits   {'; '.join(_said(edit, saved.names) for edit in script.edits)}")
     print(f"film    {folder / VIDEO}")
     return 130 if stopped else 0
+
+
+def _said(edit: Edit, names: Names) -> str:
+    """An edit in short, "freeze: drawer (2)"; parts of another run as the script has them."""
+    if isinstance(edit, Composite):
+        return f"{edit.operation()}: {', '.join(map(str, edit.parts))} of {edit.from_run}"
+    called = {number: name for name, number in names.items()}
+    each = [names.get(part, part) if isinstance(part, str) else part for part in edit.parts]
+    parts = [f"{called[part]} ({part})" if part in called else str(part) for part in each]
+    return f"{edit.operation()}: {', '.join(parts)}"
 
 
 def read_script(options: Options) -> Script:

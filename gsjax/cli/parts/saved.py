@@ -99,6 +99,11 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     expect_run(path, made_by="`gsjax parts`")
     missing = [name for name in _FILES if not (path / name).is_file()]
     if missing:
+        kind = _kind(path / "metrics.json")
+        if kind not in (None, "parts"):
+            raise ValueError(
+                f"{path}: expected a run of `gsjax parts`, found one of `gsjax {kind}`; name another folder"
+            )
         raise FileNotFoundError(
             f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
         )
@@ -115,6 +120,14 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     names = {name: part for name, part in names.items() if part < parts}
     layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
     return layer, names, len(done) == frames
+
+
+def _kind(file: Path) -> str | None:
+    """The command that made a run; None where its scores do not say."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8")).get("kind")
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def _arrays(file: Path) -> dict[str, np.ndarray]:

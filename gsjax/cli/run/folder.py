@@ -73,12 +73,14 @@ def _wanted(path: Path, made_by: str) -> str:
 
 
 def expect_dataset(path: str) -> None:
-    """Raises ValueError where a run's folder stands in place of a dataset."""
+    """Raises ValueError where a run's folder, or a PLY file, stands in place of a dataset."""
     if is_run(Path(path)):
         raise ValueError(
             f"{path}: expected a dataset, found the folder of a run; open its report.html, or look at it by "
             f"gsjax view {path}"
         )
+    if path.lower().endswith(".ply") and Path(path).is_file():
+        raise ValueError(f"{path}: expected a dataset, found a PLY file; look at it by gsjax view {path}")
 
 
 class RunFolder:

@@ -4,7 +4,9 @@ import contextlib
 import importlib
 import io
 import ipaddress
+import shlex
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -133,7 +135,8 @@ def load_viser() -> Any:
         return importlib.import_module("viser")
     except ImportError as error:
         raise ImportError(
-            f'the viewer needs viser, and {error.name} is not installed: pip install "gsjax[viewer]"'
+            f"the viewer needs viser, and {error.name} is not installed: "
+            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[viewer]'"
         ) from error
 
 

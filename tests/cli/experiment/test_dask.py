@@ -264,4 +264,4 @@ def test_without_the_extra_it_is_named(toy, gsjax, monkeypatch):
     monkeypatch.setattr("gsjax.cli.experiment.cluster.import_module", missing)
     code, _, err = gsjax("run", "toy", "--executor", "dask")
     assert (code, calls()) == (2, [])
-    assert "expected distributed, which is not installed: pip install 'gsjax[cluster]'" in err
+    assert f"which is not installed: {sys.executable} -m pip install 'gsjax[cluster]'" in err

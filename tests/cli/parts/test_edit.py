@@ -105,6 +105,7 @@ def test_a_script_is_filmed_and_can_be_given_again(gsjax, run, tmp_path):
     folder = run / "edit" / "slow"
     assert "warning: shut_door goes up to 100 mm" in said
     assert str(folder) in said
+    assert "fade: drawer (1)" in said
     found = json.loads((folder / "metrics.json").read_text())
     # The drawer is done after twice its 0.2 s; so many frames are before that, and it itself.
     assert (found["frames"], found["fps"], found["camera"], found["complete"]) == (7, 15.0, 2, True)
@@ -343,6 +344,7 @@ def test_a_script_that_is_none(gsjax, run, tmp_path, text, says):
             lambda run: (run / "parts.npz").unlink(),
             "expected a whole run of `gsjax parts`, found no parts.npz",
         ),
+        (lambda run: _of_track(run), "expected a run of `gsjax parts`, found one of `gsjax track`; name"),
         (lambda run: (run / "parts.npz").write_bytes(b"x"), "parts.npz: expected plain arrays"),
         (lambda run: np.savez(run / "parts.npz", anchor=0), "expected an array weights, found anchor"),
         (lambda run: (run / "metrics.json").write_text("[]"), "metrics.json: expected a run's scores"),
@@ -371,6 +373,11 @@ def test_what_is_no_film_is_left_alone(gsjax, run, tmp_path, file):
     assert code == 2
     assert ("found a file" if file else "found other files") in said
     assert mine.read_text() == "mine"
+
+
+def _of_track(run):
+    (run / "parts.npz").unlink()
+    (run / "metrics.json").write_text('{"kind": "track"}')
 
 
 def _with_fewer(run):
