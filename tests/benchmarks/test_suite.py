@@ -174,6 +174,7 @@ def measured():
     return measure(workload, 2, floors=lambda: next(told))
 
 
+@pytest.mark.slow
 def test_a_noisy_workload_is_measured_again(measured):
     assert measured.attempts == 2
     assert not any(row.noisy for row in measured.rows)

@@ -206,6 +206,7 @@ class TestOtherMethods:
         np.testing.assert_allclose(added.pose.translations[:, 2], HEIGHT_WEIGHT * share, atol=1e-4)
         assert np.any(added.field)
 
+    @pytest.mark.slow
     def test_of_all_frames_of_parts(self, pictures):
         batch, _ = batch_of(pictures)
         scene, config = batch.canonical, PartsConfig()
@@ -223,6 +224,7 @@ class TestOtherMethods:
         assert np.any(pulled.movable.means[:, 2] < plain.movable.means[:, 2])
         np.testing.assert_allclose(info["extra"]["height"], mean_height(scene), rtol=1e-4)
 
+    @pytest.mark.slow
     def test_of_a_deforming_scene(self, photographs):
         looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
         config = SurgicalConfig(start_pixels=2.0, deformation=TINY)

@@ -77,6 +77,7 @@ def test_some_of_the_chosen_are_taken_and_all_get_their_turn(size, num_chosen):
     assert taken == set(np.flatnonzero(chosen)) if num_chosen <= count else len(taken) > 0.9 * num_chosen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("none_taken", [False, True])
 def test_the_nearest_is_that_of_all_distances(started, none_taken):
     """The count of Gaussians fills no row of lanes; empty slots are nobody's neighbour."""

@@ -94,11 +94,12 @@ SPLITTING = replace(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [
         pytest.param(QUICK, id="relocate"),
-        pytest.param(SPLITTING, id="split, exposure, poses", marks=pytest.mark.slow),
+        pytest.param(SPLITTING, id="split, exposure, poses"),
     ],
 )
 def test_a_resumed_fit_is_equal_to_the_bit(views, config):
@@ -368,6 +369,7 @@ def test_photographs_with_and_without_masks_and_depth_share_one_program(views):
     assert sum(compiling) == 1
 
 
+@pytest.mark.slow
 def test_few_grow_too(views):
     growth = replace(QUICK.growth, every=5, begin=5, opacity_cost=0.0)
     config = replace(

@@ -151,6 +151,7 @@ class TestLearning:
         # The warm-up, the deformation without a graph, and with it.
         assert compiled_step(problem.config, problem.radius)._cache_size() <= 3
 
+    @pytest.mark.slow
     def test_goes_on_to_the_same_bits(self, learned, looks, tmp_path):
         problem, whole, *_ = learned
         _, state = begin_surgical(looks, CONFIG, CODES)
@@ -264,6 +265,7 @@ def test_what_does_not_count_is_not_taught(looks, smaller):
     np.testing.assert_array_equal(problem.batches[0].ids == -1, ~counts[::smaller, ::smaller])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_learn(name, looks):
     config = replace(

@@ -190,18 +190,18 @@ def compare_forward(mesh) -> float:
     )
 
 
-def four_devices() -> dict:
+def four_devices(*names: str) -> dict:
     jax.config.update("jax_num_cpu_devices", 4)
     row = jax.make_mesh((4,), ("cameras",))  # explicit axes
     square = jax.make_mesh((2, 2), ("scenes", "cameras"), axis_types=(AxisType.Auto,) * 2)
-    return {
-        "cameras": compare_training(row, a_scene((), 4, extras=True), cameras="cameras"),
-        "scenes": compare_training(
-            square, a_scene((2,), 2, extras=False), cameras="cameras", scenes="scenes"
-        ),
-        "overflow": compare_overflow(row),
-        "forward": compare_forward(row),
+    both = {"cameras": "cameras", "scenes": "scenes"}
+    comparisons = {
+        "cameras": lambda: compare_training(row, a_scene((), 4, extras=True), cameras="cameras"),
+        "scenes": lambda: compare_training(square, a_scene((2,), 2, extras=False), **both),
+        "overflow": lambda: compare_overflow(row),
+        "forward": lambda: compare_forward(row),
     }
+    return {name: comparisons[name]() for name in names}
 
 
 def two_processes(process: int, port: int) -> dict:
@@ -237,7 +237,13 @@ def run_program(*argument_lists: tuple) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def on_four():
-    return run_program(("four",))[0]
+    return run_program(("four", "scenes", "overflow"))[0]
+
+
+@pytest.fixture(scope="module")
+def more_on_four():
+    """What takes another half a minute."""
+    return run_program(("four", "cameras", "forward"))[0]
 
 
 def assert_same(result: dict) -> None:
@@ -250,9 +256,10 @@ def assert_same(result: dict) -> None:
     assert result["params"] <= 1e-6
 
 
-def test_cameras_over_four_devices(on_four):
-    assert_same(on_four["cameras"])
-    assert on_four["cameras"]["part"] == [[1, HEIGHT, WIDTH, 4]] * 4
+@pytest.mark.slow
+def test_cameras_over_four_devices(more_on_four):
+    assert_same(more_on_four["cameras"])
+    assert more_on_four["cameras"]["part"] == [[1, HEIGHT, WIDTH, 4]] * 4
 
 
 def test_scenes_and_cameras_over_two_by_two_devices(on_four):
@@ -264,8 +271,9 @@ def test_every_device_says_when_its_plan_is_too_small(on_four):
     assert on_four["overflow"] == {"flags": [True, False, True, False], "counts": 0}
 
 
-def test_forward_derivatives_over_four_devices(on_four):
-    assert on_four["forward"] <= 1e-5
+@pytest.mark.slow
+def test_forward_derivatives_over_four_devices(more_on_four):
+    assert more_on_four["forward"] <= 1e-5
 
 
 @pytest.mark.slow
@@ -369,5 +377,5 @@ class TestErrors:
 
 
 if __name__ == "__main__":
-    which = sys.argv[1:]
-    print(json.dumps(four_devices() if which == ["four"] else two_processes(*map(int, which))))
+    which, *rest = sys.argv[1:]
+    print(json.dumps(four_devices(*rest) if which == "four" else two_processes(int(which), *map(int, rest))))

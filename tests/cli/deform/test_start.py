@@ -55,6 +55,7 @@ def test_two_eyes_without_depth_are_matched_and_poses_refined(gsjax, tmp_path):
     assert 0 < found["poses"]["moved"]["max"] < 0.02
 
 
+@pytest.mark.slow
 def test_a_clip_begins_on_a_plane(gsjax, clip, tmp_path):
     run = tmp_path / "run"
     code, said = gsjax("deform", clip, "--out", run, *SMALL)

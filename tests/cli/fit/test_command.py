@@ -136,6 +136,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_what_can_be_resumed(photographs, 
     assert newest.name == f"step-{found['steps']:08d}.npz"
 
 
+@pytest.mark.slow
 def test_a_preset_is_named_and_what_is_given_counts_more(photographs, tmp_path, capfd):
     run = tmp_path / "run"
     code = main(
@@ -177,9 +178,8 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     assert "Colours are of degree 0: a degree is added every 100 steps (--fit.sh-every)." in found["notes"]
 
 
-@pytest.mark.parametrize(
-    "what", ["parts", *(pytest.param(w, marks=pytest.mark.slow) for w in ("judge", "write_orbit"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["judge", "parts", "write_orbit"])
 def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
     gsjax_fit, tmp_path, monkeypatch, what
 ):
