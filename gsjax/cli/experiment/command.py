@@ -119,7 +119,7 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
                 progress.update(task, description=what)
 
             def forget() -> None:  # all at once, so that after Ctrl-C the rest goes on without --fresh
-                for cell in left:
+                for cell in left if options.fresh else ():
                     experiment.path(cell).unlink(missing_ok=True)
 
             if options.executor == "dask" and left:

@@ -84,6 +84,16 @@ def test_ctrl_c_in_a_fresh_run_does_not_bring_back_what_it_forgot(toy, gsjax):
     assert calls() == ["640 fast 0", "640 exact 0"]
 
 
+def test_ctrl_c_leaves_stale_rows_that_were_not_run_again(toy, gsjax):
+    toy(stopping("raise KeyboardInterrupt"))
+    gsjax("run", "toy")
+    before = cell_files()
+    toy(stopping("raise KeyboardInterrupt") + "# another\n")
+    Path("stop").touch()
+    assert gsjax("run", "toy")[0] == 130
+    assert cell_files() == before
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_kill_keeps_what_is_done(toy, gsjax):
     toy(stopping("os.kill(os.getpid(), signal.SIGKILL)"))
