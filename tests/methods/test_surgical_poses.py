@@ -13,7 +13,6 @@ from gsjax.geometry.cameras import project
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.surgical import (
     DeformingScene,
-    Look,
     SurgicalConfig,
     SurgicalRatesConfig,
     begin_surgical,
@@ -24,6 +23,7 @@ from gsjax.methods.surgical import (
 )
 from gsjax.methods.twisted import twisted
 from gsjax.scene.deformation import DeformationConfig
+from tests.methods.tissue import looks_of
 
 TINY = DeformationConfig(resolution=16, time_resolution=4, levels=1, channels=4, hidden=16)
 CONFIG = SurgicalConfig(
@@ -58,17 +58,7 @@ def turned(one, other):
 def looks():
     """Built-in tissue that stands still, tools left out."""
     seen = gsjax.open_sequence("simulated:tissue?width=40&height=32&frames=4&still=true").select(cameras=(0,))
-    return [
-        Look(
-            seen.image(t, 0),
-            seen.mask(t, 0) == 0,
-            seen.depth(t, 0),
-            seen.viewmats[t, 0],
-            seen.Ks[t, 0],
-            t / (seen.num_frames - 1),
-        )
-        for t in range(seen.num_frames)
-    ]
+    return looks_of(seen)
 
 
 @pytest.fixture(scope="module")

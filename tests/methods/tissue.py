@@ -26,6 +26,11 @@ CONFIG = SurgicalConfig(
 def tissue_looks():
     """Every other frame of built-in tissue, tools left out, and what each pixel shows."""
     seen = gsjax.open_sequence("simulated:tissue?width=64&height=52&frames=10").select(range(0, 10, 2), (0,))
+    return [look._replace(ids=seen.mask(t, 0)) for t, look in enumerate(looks_of(seen))]
+
+
+def looks_of(seen):
+    """The first camera's, tools left out."""
     return [
         Look(
             seen.image(t, 0),
@@ -34,7 +39,6 @@ def tissue_looks():
             seen.viewmats[t, 0],
             seen.Ks[t, 0],
             t / (seen.num_frames - 1),
-            ids=seen.mask(t, 0),
         )
         for t in range(seen.num_frames)
     ]
