@@ -10,6 +10,7 @@ import logging
 import os
 import shlex
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -336,6 +337,7 @@ def _package(name: str) -> Any:
     Raises:
         ValueError: it is not installed.
     """
+    heard_by = signal.getsignal(signal.SIGINT)
     try:
         return import_module(name)
     except ImportError as error:
@@ -343,3 +345,8 @@ def _package(name: str) -> Any:
             f"--executor dask: expected {name.split('.')[0]}, which is not installed: "
             f"{shlex.quote(sys.executable)} -m pip install 'gsjax[cluster]'"
         ) from error
+    finally:
+        if (
+            signal.getsignal(signal.SIGINT) is not heard_by
+        ):  # dask-jobqueue takes Ctrl-C for itself as it is imported
+            signal.signal(signal.SIGINT, heard_by)

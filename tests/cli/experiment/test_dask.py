@@ -194,10 +194,30 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     assert len(cell_files()) == 1
 
 
-def test_a_job_of_slurm_is_one_worker_with_all_its_cores():
+@pytest.fixture
+def defaults():
+    """What dask-jobqueue takes a job of SLURM to be. It takes Ctrl-C for itself as it is imported."""
+    heard_by = signal.getsignal(signal.SIGINT)
     pytest.importorskip("dask_jobqueue")
+    signal.signal(signal.SIGINT, heard_by)
+    return config.get("jobqueue.slurm")
+
+
+def test_ctrl_c_is_heard_as_before_once_dask_jobqueue_is_imported(defaults, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "dask_jobqueue"]:
+        monkeypatch.delitem(sys.modules, name)
+    heard_by = signal.getsignal(signal.SIGINT)
+    with (
+        config.set({"jobqueue.slurm": {**defaults, "memory": None}}),
+        pytest.raises(ValueError, match="found no"),
+    ):
+        slurm_cluster()
+    assert signal.getsignal(signal.SIGINT) is heard_by
+
+
+def test_a_job_of_slurm_is_one_worker_with_all_its_cores(defaults):
     asked = {"cores": 12, "memory": "48GB", "queue": "long", "walltime": "08:00:00", "interface": "lo"}
-    settings = {"jobqueue.slurm": {**config.get("jobqueue.slurm", {}), **asked}}
+    settings = {"jobqueue.slurm": {**defaults, **asked}}
     with config.set(settings), slurm_cluster() as cluster:
         script = cluster.job_script()
     for line in ("-p long", "--cpus-per-task=12", "--mem=45G", "-t 08:00:00", "-n 1"):
