@@ -1,8 +1,10 @@
 """What an import loads. How long it takes is measured by `python -m benchmarks.imports`."""
 
+import ast
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,19 @@ def test_help_does_not_wait_for_jax():
 def test_help_of_a_command_needs_no_extra(command):
     asked = f"from gsjax.cli import main\ntry: main([{command!r}, '--help'])\nexcept SystemExit: pass"
     assert not loaded(asked) & OPTIONAL
+
+
+def test_what_is_told_to_install_is_there():
+    """Each `extras.load(module, extra, ...)` names an extra that asks for the module's package."""
+    asked = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    calls = [
+        (node.args[0], node.args[1].value)
+        for file in (ROOT / "gsjax").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "extras.load"
+    ]
+    assert {extra for _, extra in calls} == {"cluster", "foundation", "poses", "tensorboard", "viewer"}
+    for module, extra in calls:
+        if isinstance(module, ast.Constant):
+            package = module.value.partition(".")[0].replace("_", "-")
+            assert any(requirement.startswith(package) for requirement in asked[extra]), (package, extra)

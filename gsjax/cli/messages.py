@@ -17,13 +17,14 @@ from rich.text import Text
 
 from gsjax.cli.machine import keep_to_cores
 from gsjax.data.errors import DataWarning
+from gsjax.extras import MissingExtra
 
 FITTING = "fitting the scene to the first frame, which takes half a minute to two"
 COMPILING = "compiling the update, which takes a minute or two the first time"
 MEASURING = "measuring what updates cost; each setting takes a minute or two to compile the first time"
 
 # ValueError covers DataError and PlyError, and whatever an argument is checked for.
-USER_ERRORS = (ValueError, OSError)
+USER_ERRORS = (ValueError, OSError, MissingExtra)
 _COMPILE_ANEW = ("bench", "experiment")  # they measure how long that takes
 _PACKAGE = Path(__file__).parents[1]
 

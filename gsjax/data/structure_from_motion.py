@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gsjax import extras
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image
 
@@ -148,7 +149,8 @@ def place_photographs(
 
     Raises:
         DataError: no photographs could be placed.
-        ValueError: pycolmap is not installed, or too old.
+        MissingExtra: pycolmap is not installed.
+        ValueError: it is too old.
     """
     pycolmap = _pycolmap()
     database, seconds = work / "database.db", {}
@@ -208,12 +210,7 @@ def few_of(names: Sequence[str]) -> str:
 def _pycolmap() -> Any:
     from PIL import Image  # noqa: F401  (before pycolmap: after it, PIL's PNG writer corrupts the heap)
 
-    try:
-        import pycolmap
-    except ImportError:
-        raise ValueError(
-            'gsjax poses needs pycolmap, which is not installed: pip install "gsjax[poses]"'
-        ) from None
+    pycolmap = extras.load("pycolmap", "poses", "gsjax poses")
     if not hasattr(pycolmap, "FeatureExtractionOptions"):
         raise ValueError("gsjax poses needs pycolmap 4: pip install --upgrade pycolmap")
     # It logs every photograph. What goes wrong is said here.

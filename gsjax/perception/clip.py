@@ -79,7 +79,7 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+        MissingExtra: torch or transformers is not installed.
     """
     files = (weights.PROCESSOR, "tokenizer.json|vocab.json")
     folder = weights.model_folder(path, "CLIP's weights", files, "openai/clip-vit-large-patch14")

@@ -57,7 +57,7 @@ def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+        MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "DINOv2's weights", (weights.PROCESSOR,), "facebook/dinov2-base")
     torch, transformers = weights.foundation_modules("DINOv2")

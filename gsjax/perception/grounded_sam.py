@@ -112,7 +112,7 @@ def load_grounded_sam(
     Raises:
         FileNotFoundError: a folder or a file of it is missing.
         ValueError: a folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+        MissingExtra: torch or transformers is not installed.
     """
     files = (weights.PROCESSOR, "tokenizer.json|vocab.txt")
     boxes = weights.model_folder(

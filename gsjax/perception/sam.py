@@ -135,7 +135,7 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+        MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
     torch, transformers = weights.foundation_modules("SAM")

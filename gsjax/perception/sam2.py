@@ -95,7 +95,7 @@ def load_sam2(path: str | os.PathLike, device: str = "cpu") -> Sam2Propagator:
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
         ValueError: the folder leads to weights that are a pickle.
-        ImportError: torch or transformers is not installed.
+        MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "SAM2's weights", (weights.PROCESSOR,), "facebook/sam2.1-hiera-tiny")
     torch, transformers = weights.foundation_modules("SAM2")

@@ -2,14 +2,14 @@
 files that cannot run anything when they are read.
 """
 
-import importlib
 import json
 import os
 import shlex
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from gsjax import extras
 
 _CONFIG = "config.json"
 _WHOLE, _INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -105,12 +105,6 @@ def foundation_modules(model: str) -> tuple[ModuleType, ModuleType]:
     """(torch, transformers), imported now.
 
     Raises:
-        ImportError: one is not installed.
+        MissingExtra: one is not installed.
     """
-    try:
-        return importlib.import_module("torch"), importlib.import_module("transformers")
-    except ImportError as error:
-        raise ImportError(
-            f"{model} needs torch and transformers, and {error.name} is not installed: "
-            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[foundation]'"
-        ) from error
+    return extras.load("torch", "foundation", model), extras.load("transformers", "foundation", model)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -178,7 +179,8 @@ def test_settings_without_a_meaning(say, photographs, tmp_path, option, value, s
 
 
 def test_without_pycolmap(say, tmp_path, photographs, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
     code, said = say(photographs, "--out", tmp_path / "out")
     assert code == 2
-    assert 'needs pycolmap, which is not installed: pip install "gsjax[poses]"' in said
+    assert "gsjax poses needs pycolmap, which is not installed: " in said
+    assert f"{sys.executable} -m pip install 'gsjax[poses]'" in said

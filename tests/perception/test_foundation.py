@@ -8,6 +8,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from gsjax.extras import MissingExtra
 from gsjax.methods.protocols import DenseEncoder, LanguageEncoder, Segmenter
 from gsjax.perception.clip import load_clip
 from gsjax.perception.dinov2 import load_dinov2
@@ -363,6 +364,6 @@ def test_without_the_extra_it_is_named(load, tmp_path, monkeypatch):
     save_placeholders(tmp_path, "model.safetensors")
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     with pytest.raises(
-        ImportError, match=r"torch is not installed: \S+ -m pip install 'gsjax\[foundation\]'"
+        MissingExtra, match=r"torch, which is not installed: \S+ -m pip install 'gsjax\[foundation\]'"
     ):
         load(tmp_path)

@@ -77,8 +77,6 @@ class Source:
 
         try:
             return load_clip(weights or str(self.weights))
-        except ImportError as error:
-            raise ValueError(f"{self.kind}: {error}") from error
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}; --weights says where they are now") from error
 

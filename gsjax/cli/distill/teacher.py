@@ -262,7 +262,7 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
 
     try:
         return load_clip(weights), folder_digest(weights)
-    except (ImportError, OSError) as error:
+    except OSError as error:
         raise ValueError(f"--weights: {error}") from error
 
 
@@ -277,7 +277,7 @@ def _segmenter(asked: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]
 
     try:
         return load_sam(asked.sam), f"sam {folder_digest(asked.sam)}"
-    except (ImportError, OSError) as error:
+    except OSError as error:
         raise ValueError(f"--sam: {error}") from error
 
 

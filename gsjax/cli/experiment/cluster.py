@@ -8,10 +8,8 @@ experiment's folder afterwards is what a run here would have left.
 import io
 import logging
 import os
-import shlex
 import shutil
 import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,9 +18,11 @@ from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import sleep
+from types import ModuleType
 from typing import Any
 from zipfile import ZipFile
 
+from gsjax import extras
 from gsjax.cli.experiment.local import run_cell
 from gsjax.cli.experiment.records import now
 from gsjax.cli.experiment.script import forget_scripts
@@ -299,7 +299,8 @@ def slurm_cluster() -> Any:
     What a job is stands in Dask's own configuration: `jobqueue.slurm` of ~/.config/dask/*.yaml.
 
     Raises:
-        ValueError: dask-jobqueue is not installed, or the configuration lacks what a job must have.
+        MissingExtra: dask-jobqueue is not installed.
+        ValueError: the configuration lacks what a job must have.
     """
     jobqueue, config = _package("dask_jobqueue"), _package("dask.config")
     cores = config.get("jobqueue.slurm.job-cpu") or config.get("jobqueue.slurm.cores")
@@ -314,7 +315,7 @@ def slurm_cluster() -> Any:
 
 
 def check_scheduler(scheduler: str, workers: int | None) -> None:
-    """Raises a ValueError where these cannot be, or what they need is not installed."""
+    """Raises a ValueError where these cannot be, and MissingExtra where what they need is not installed."""
     _package("distributed")
     if workers is not None and workers < 1:
         raise ValueError(f"--workers: expected 1 or more, found {workers}")
@@ -331,22 +332,14 @@ def check_scheduler(scheduler: str, workers: int | None) -> None:
         raise ValueError(f"--scheduler: expected {known}, found {scheduler!r}")
 
 
-def _package(name: str) -> Any:
-    """A package of the extra `cluster`, or a module of one.
+def _package(name: str) -> ModuleType:
+    """A package of the extra `cluster`, or a module of one; Ctrl-C stays with who heard it.
 
     Raises:
-        ValueError: it is not installed.
+        MissingExtra: it is not installed.
     """
     heard_by = signal.getsignal(signal.SIGINT)
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"--executor dask: expected {name.split('.')[0]}, which is not installed: "
-            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[cluster]'"
-        ) from error
-    finally:
-        if (
-            signal.getsignal(signal.SIGINT) is not heard_by
-        ):  # dask-jobqueue takes Ctrl-C for itself as it is imported
-            signal.signal(signal.SIGINT, heard_by)
+    module = extras.load(name, "cluster", "--executor dask")
+    if signal.getsignal(signal.SIGINT) is not heard_by:  # dask-jobqueue takes it as it is imported
+        signal.signal(signal.SIGINT, heard_by)
+    return module

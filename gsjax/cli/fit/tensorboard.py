@@ -1,6 +1,5 @@
 """The curve of a fit as TensorBoard's event files, beside metrics.jsonl; an optional extra."""
 
-import importlib
 import math
 import shutil
 from collections.abc import Mapping, Sequence
@@ -8,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+
+from gsjax import extras
 
 TAGS = {"loss": "loss", "psnr": "psnr", "test_psnr": "psnr_held_out", "alive": "gaussians"}
 """What the values of a curve's row are called there."""
@@ -26,11 +27,11 @@ class TensorBoard:
         rows: those that a resumed run begins with; none begins anew, without what an earlier run left.
 
     Raises:
-        ValueError: tensorboardX is not installed.
+        MissingExtra: tensorboardX is not installed.
     """
 
     def __init__(self, folder: Path, rows: Sequence[Mapping[str, Any]] = ()):
-        writer = _writer_class()
+        writer = extras.load("tensorboardX", "tensorboard", "--tensorboard").SummaryWriter
         path = folder / "tensorboard"
         going_on = len(rows) > 0 and any(path.glob("events.*"))
         if path.exists() and not going_on:
@@ -61,12 +62,3 @@ class TensorBoard:
             if picture is not None:
                 self._writer.add_image(name, picture[..., ::-1], self._step, dataformats="HWC")
         self._writer.close()
-
-
-def _writer_class() -> Any:
-    try:
-        return importlib.import_module("tensorboardX").SummaryWriter
-    except ImportError as error:
-        raise ValueError(
-            '--tensorboard: expected tensorboardX, which is not installed: pip install "gsjax[tensorboard]"'
-        ) from error

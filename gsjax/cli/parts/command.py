@@ -159,10 +159,7 @@ def _check(options: Options, recording: Recording) -> None:
 
 
 def _segmenter(options: Options) -> Segmenter:
-    try:
-        return PieceSegmenter() if options.sam is None else load_sam(options.sam)
-    except ImportError as error:
-        raise ValueError(f"--sam: {error}") from error
+    return PieceSegmenter() if options.sam is None else load_sam(options.sam)
 
 
 def _masks(

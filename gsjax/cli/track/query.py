@@ -193,10 +193,7 @@ def _encoder(options: ObjectQuery, saved: SavedRun) -> LanguageEncoder:
     from gsjax.perception.clip import load_clip
 
     assert options.weights is not None
-    try:
-        return load_clip(options.weights)
-    except ImportError as error:
-        raise ValueError(f"--encoder clip: {error}") from error
+    return load_clip(options.weights)
 
 
 def _ranked(scores: dict[str, float]) -> list[tuple[str, float]]:

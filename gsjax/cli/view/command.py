@@ -53,12 +53,10 @@ def run(options: Options) -> int:
     """Show it until Ctrl-C, whose exit code it returns.
 
     Raises:
+        MissingExtra: viser is not installed.
         ValueError, OSError: there is nothing to look at, or nothing can listen at that address.
     """
-    try:
-        load_viser()
-    except ImportError as error:
-        raise ValueError(str(error)) from error
+    load_viser()  # before anything is read
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
         with stage(console, f"reading {options.path}"):

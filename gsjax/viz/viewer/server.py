@@ -1,16 +1,15 @@
 """A web server that shows a scene: one page for each browser that comes."""
 
 import contextlib
-import importlib
 import io
 import ipaddress
-import shlex
 import socket
-import sys
 import threading
 from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
+from gsjax import extras
 from gsjax.viz.viewer.cameras import far_plane, first_pose, scene_up
 from gsjax.viz.viewer.drawing import Drawer
 from gsjax.viz.viewer.page import Page, Save, Shared
@@ -100,7 +99,7 @@ def open_viewer(
         compiler_options: of the program that draws; `gsjax.optim.compiler.host_options()` makes it faster.
 
     Raises:
-        ImportError: viser is not installed.
+        MissingExtra: viser is not installed.
         ValueError: `max_gaussians` is below 1, or there is no such port.
         OSError: nothing can listen there.
     """
@@ -125,19 +124,13 @@ def open_viewer(
     return Viewer(server, Shared(scene, drawer, max_gaussians, save), host)
 
 
-def load_viser() -> Any:
+def load_viser() -> ModuleType:
     """viser, which is optional.
 
     Raises:
-        ImportError: it is not installed; says what to do.
+        MissingExtra: it is not installed.
     """
-    try:
-        return importlib.import_module("viser")
-    except ImportError as error:
-        raise ImportError(
-            f"the viewer needs viser, and {error.name} is not installed: "
-            f"{shlex.quote(sys.executable)} -m pip install 'gsjax[viewer]'"
-        ) from error
+    return extras.load("viser", "viewer", "the viewer")
 
 
 def is_loopback(host: str) -> bool:

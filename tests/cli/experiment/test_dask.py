@@ -1,6 +1,5 @@
 """Sweeps on a Dask cluster: what is kept is what a run here keeps, also where a worker is killed."""
 
-import importlib
 import json
 import os
 import shutil
@@ -275,13 +274,8 @@ def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch
 
 def test_without_the_extra_it_is_named(toy, gsjax, monkeypatch):
     toy()
-
-    def missing(name: str):
-        if name == "distributed":
-            raise ImportError(name)
-        return importlib.import_module(name)
-
-    monkeypatch.setattr("gsjax.cli.experiment.cluster.import_module", missing)
+    monkeypatch.setitem(sys.modules, "distributed", None)
     code, _, err = gsjax("run", "toy", "--executor", "dask")
     assert (code, calls()) == (2, [])
-    assert f"which is not installed: {sys.executable} -m pip install 'gsjax[cluster]'" in err
+    assert "--executor dask needs distributed, which is not installed: " in err
+    assert f"{sys.executable} -m pip install 'gsjax[cluster]'" in err

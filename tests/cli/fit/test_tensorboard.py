@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gsjax.cli.fit.tensorboard import TensorBoard
+from gsjax.extras import MissingExtra
 
 pytest.importorskip("tensorboardX")
 
@@ -90,6 +91,6 @@ def test_a_resumed_run_that_had_none_writes_all_and_a_new_one_begins_anew(tmp_pa
 
 def test_without_the_package_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ValueError, match=r'--tensorboard: .* pip install "gsjax\[tensorboard\]"'):
+    with pytest.raises(MissingExtra, match=r"--tensorboard needs tensorboardX, .* 'gsjax\[tensorboard\]'"):
         TensorBoard(tmp_path)
     assert not (tmp_path / "tensorboard").exists()
