@@ -81,7 +81,8 @@ def test_one_mask_is_enough(sound, recording):
             file.unlink()
     for camera in ("0", "2"):
         shutil.rmtree(recording / "seg" / camera, ignore_errors=True)
-    said, found = sound(recording, "--mask-camera", "1")
+    quick = ("--frames", "0:2", "--tracker.start.iterations", "2", "--tracker.refine.iterations", "0")
+    said, found = sound(recording, "--cameras", "0", "1", "--mask-camera", "1", *quick)
     assert found["complete"]
     assert "no such file" not in said
 

@@ -41,7 +41,8 @@ def test_what_is_not_run_says_why():
     assert Counter(block.page for block in kept) == Counter(NOT_RUN)
 
 
-SLOW = {f"docs/{page}.md" for page in ("composition", "deform", "fields", "semantics")}
+LONG = ("composition", "deform", "fields", "fit", "howto/loss", "howto/step", "rasterizer", "semantics")
+SLOW = {f"docs/{page}.md" for page in LONG}
 """Of these pages, tests of methods and commands run the calls as well."""
 PROGRAMS = [
     pytest.param(page, marks=pytest.mark.slow) if page in SLOW else page

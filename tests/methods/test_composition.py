@@ -83,6 +83,7 @@ def graph_config(kind: str) -> GraphConfig:
 
 
 class TestOneStep:
+    @pytest.mark.slow
     def test_a_gradient_reaches_features_and_poses(self, small, composed):
         loss, *_ = composed("none")
         batch = small.batches[1]

@@ -197,6 +197,7 @@ class TestOtherMethods:
         np.testing.assert_allclose(added.gaussians.means, uphill(state.gaussians.means), atol=1e-4)
         assert not np.any(added.gaussians.sh0)
 
+    @pytest.mark.slow
     def test_of_parts(self, pictures):
         batch, bodies = batch_of(pictures)
         params = StreamParams(shifted(0.01), soft(bodies))

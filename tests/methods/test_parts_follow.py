@@ -115,6 +115,7 @@ def test_the_outcome_moves_as_the_parts_did(boxes, halves):
         np.testing.assert_allclose(scene.centers[part], scene.gaussians.means[members].mean(0), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_two_boxes_in_one_piece_are_divided(boxes):
     config = replace(CONFIG, unify=replace(CONFIG.unify, least_cut=4.5))
     start, steps = discovered(boxes, np.minimum(boxes.bodies, 1), config)

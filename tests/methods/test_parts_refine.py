@@ -64,6 +64,7 @@ def off_mm(boxes, parts):
     return 1000 * np.linalg.norm(parts.translations[:, 1] - true, axis=1)
 
 
+@pytest.mark.slow
 def test_colours_and_poses_come_back(boxes, astray):
     steps = list(refine(boxes, astray, CONFIG))
     losses = np.array([float(step.loss) for step in steps])

@@ -239,7 +239,8 @@ def test_the_derivative_of_residuals_is_that_of_differences(boxes):
 UNDAMPED = optimistix.GaussNewton(1e-4, 1e-5, linear_solver=lineax.AutoLinearSolver(well_posed=False))
 
 
-@pytest.mark.parametrize("solver", [LEVENBERG_MARQUARDT, pytest.param(UNDAMPED, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [LEVENBERG_MARQUARDT, UNDAMPED])
 def test_gauss_newton_brings_handles_home(boxes, solver):
     batch = forward(batch_of(boxes, past=False)[0])
     frame = batch.now.frame

@@ -191,6 +191,7 @@ def test_a_turned_camera_stays_where_it_is_and_twists_of_all_move_none(views):
     np.testing.assert_allclose(refined(viewmats, alike, jnp.int32(1), 2.0), viewmats, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_slots_fill_up_to_the_cap_and_no_further(views):
     growth = replace(QUICK.growth, every=5, begin=5, factor=1.5, opacity_cost=0.0)
     config = replace(QUICK, growth=growth, start=StartConfig(source="depth", count=40, opacity=0.5))

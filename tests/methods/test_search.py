@@ -94,6 +94,7 @@ def test_without_turns_only_translation_is_sought_and_found(moved):
     assert gap(carry(behind, twist, start), sight, config) < gap(behind, sight, config)
 
 
+@pytest.mark.slow
 def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
     """It may be where it was believed to be. What is lost is not, and what agrees as ever has not jumped."""
     *given, shift = jumped

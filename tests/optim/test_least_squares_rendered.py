@@ -81,6 +81,7 @@ def pose_error(a, b) -> float:
     return float(jnp.abs((a.inverse() @ b).log()).max())
 
 
+@pytest.mark.slow
 def test_a_pose_is_found_by_levenberg_marquardt_also_with_pixels_missing(scene, forward):
     poses = [off_by(seed) for seed in range(3)]
     images = [observe(scene, pose, K, forward) for pose in poses]
@@ -123,6 +124,7 @@ def test_gauss_newton_tracks_poses_from_frame_to_frame_in_a_scan(scene, forward)
     assert (infos["loss"][:, -1] < 1e-6).all()
 
 
+@pytest.mark.slow
 def test_intrinsics_are_found(scene, forward):
     truth = K.at[0, 0].set(53.0).at[1, 1].set(48.0).at[:2, 2].add(jnp.array([1.5, -1.0]))
     batch = {"scene": scene, "image": observe(scene, POSE, truth, forward), "plan": forward}
