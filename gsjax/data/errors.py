@@ -9,5 +9,9 @@ class DataError(ValueError):
         self.path = str(path)
 
 
+class MissingFile(DataError):
+    """A picture or array of a frame that is not where it should be."""
+
+
 class DataWarning(UserWarning):
     """Data that is used although part of it is missing or unusable."""

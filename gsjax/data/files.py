@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from gsjax.data.errors import DataError
+from gsjax.data.errors import DataError, MissingFile
 
 SATURATED_DEPTH = 65535
 """The largest 16-bit value: what converters clip to and what Kinect writes where it measured nothing."""
@@ -179,9 +179,9 @@ def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
     return image
 
 
-def _no_such_file(path: Path, kind: str) -> DataError:
+def _no_such_file(path: Path, kind: str) -> MissingFile:
     advice = "Restore it, or leave out that frame (of all cameras, in the meta too)."
-    return DataError(path, kind, "no such file", advice)
+    return MissingFile(path, kind, "no such file", advice)
 
 
 def _check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:

@@ -1,6 +1,7 @@
 """`gsjax info`: what is understood of a recording or of photographs, before anything is made of them."""
 
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from gsjax.cli.messages import Notes
 from gsjax.cli.options import Common, OneDataset, Reading
 from gsjax.cli.run.folder import expect_dataset
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
+from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_of_photographs, is_recording
 from gsjax.methods.reconstruction import extent_of
 
@@ -116,8 +118,11 @@ def _depth_range(photographs: Photographs) -> str:
 
 
 def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
-    """The first mask of each camera that has one, by camera id."""
-    masks = {camera: sequence.mask(0, c) for c, camera in enumerate(sequence.camera_ids)}
+    """The first mask of each camera that has one, by camera id. One is enough, so files may be missing."""
+    masks = {}
+    for c, camera in enumerate(sequence.camera_ids):
+        with suppress(MissingFile):
+            masks[camera] = sequence.mask(0, c)
     return {camera: mask for camera, mask in masks.items() if mask is not None}
 
 
@@ -180,9 +185,13 @@ def _depth(sequence: Sequence) -> str:
 def _masks(masks: dict[int, np.ndarray], sequence: Sequence) -> str:
     if not masks:
         return "none"
-    whose = "all cameras" if len(masks) == sequence.num_cameras else f"{len(masks)} cameras"
+    whose = "all cameras" if len(masks) == sequence.num_cameras else _named(list(masks))
     labels = sorted({int(value) for mask in masks.values() for value in np.unique(mask)} - {0})
     return f"{whose}, labels {', '.join(map(str, labels)) or 'none but the background'} in the first frame"
+
+
+def _named(cameras: list[int]) -> str:
+    return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(map(str, cameras))}"
 
 
 def mask_table(masks: dict[int, np.ndarray], sequence: Sequence) -> Table | None:
