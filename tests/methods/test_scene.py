@@ -76,6 +76,12 @@ def test_a_mask_of_a_camera_that_is_not_there_is_refused(table):
         labelled_cloud(frames[0], mask, 9, START)
 
 
+@pytest.mark.usefixtures("as_users_run")
+def test_no_mask_is_refused_in_words(table):
+    with pytest.raises(ValueError, match=r"mask: expected labels .*, found None"):
+        labelled_cloud(table()[1][0], None, 0, START)
+
+
 def test_bad_input_says_what_is_wrong(table):
     _, frames, mask = table()
     first = frames[0]

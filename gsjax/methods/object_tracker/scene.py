@@ -58,8 +58,8 @@ def labelled_cloud(
     """All cameras' points; labels come from one camera's mask, and from it to near neighbours unseen there.
 
     Raises:
-        ValueError: the frame has no depth or no valid depth, the mask has another size, or there is no such
-            camera.
+        ValueError: the frame has no depth or no valid depth, there is no mask or one of another size, or no
+            such camera.
     """
     if frame.depths is None:
         raise ValueError(
@@ -69,6 +69,11 @@ def labelled_cloud(
     viewmats, Ks = np.asarray(frame.cameras.viewmat, np.float64), np.asarray(frame.cameras.K, np.float64)
     if not 0 <= mask_camera < len(depths):
         raise ValueError(f"mask_camera is {mask_camera}; the frame has {len(depths)} cameras, counted from 0")
+    if mask is None:
+        raise ValueError(
+            "mask: expected labels [H, W] of one camera's image, found None, as of data without masks; "
+            "a segmenter of gsjax.perception makes one"
+        )
     if mask.shape != depths.shape[1:]:
         raise ValueError(f"mask has shape {mask.shape}; the images have {depths.shape[1:]} (height, width)")
     clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]
