@@ -16,7 +16,7 @@ help: ## list the targets
 demo: $(VENV)/installed ## track the built-in scene from nothing to a report
 	@rm -rf $(RUN)
 	$(BIN)/gsjax track $(DEMO) --out $(RUN) --frames 0:30 --cameras 0 1 --mask-camera 1 --eval-cameras 2 \
-	  --tracker.start.iterations 60
+	  --track.start.iterations 60
 
 # Two workers at most: XLA compiles on several threads by itself. A file stays with one worker, so what one
 # of its tests compiled serves the next.
@@ -63,7 +63,7 @@ dist: $(VENV)/installed-dev ## build the wheel and the sdist, check them, and tr
 	$(EMPTY)/bin/python -m pip check
 	cd build/tried && $(EMPTY)/bin/gsjax --help && $(EMPTY)/bin/gsjax info simulated:tabletop
 	cd build/tried && $(EMPTY)/bin/gsjax track "simulated:tabletop?width=160&height=120" --out run --frames 0:5 \
-	  --cameras 0 1 --mask-camera 1 --eval-cameras 2 --tracker.start.iterations 20
+	  --cameras 0 1 --mask-camera 1 --eval-cameras 2 --track.start.iterations 20
 	cd build/tried && test -s run/report.html && $(EMPTY)/bin/gsjax query run can
 
 clean: ## remove .venv and everything that was built

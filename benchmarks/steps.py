@@ -17,9 +17,9 @@ from benchmarks.workloads import ball
 from gsjax.data import open_sequence
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
-from gsjax.methods.feature_field import FieldConfig, begin_field, distill, teacher_of_objects
-from gsjax.methods.object_tracker import PRESETS, start_scene, track
-from gsjax.methods.surgical import GraphConfig, Look, SurgicalConfig, begin_surgical, reconstruct
+from gsjax.methods.distill import DistillConfig, begin_distill, distill, teacher_of_objects
+from gsjax.methods.track import PRESETS, start_scene, track
+from gsjax.methods.deform import GraphConfig, Look, DeformConfig, begin_deform, reconstruct
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import gaussians_from_activated
@@ -88,8 +88,8 @@ def field(repeats: int) -> StepTimes:
     camera = Camera(scene.viewmat, scene.K, width, height)
     thing = np.indices((height, width)).sum(axis=0) // 40 % 3  # stripes
     teacher = teacher_of_objects([thing], [np.eye(3, 512, dtype=np.float32)])
-    config = FieldConfig(iterations=repeats + 1, contrast_after=0.0)
-    updates = list(distill(*begin_field(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
+    config = DistillConfig(iterations=repeats + 1, contrast_after=0.0)
+    updates = list(distill(*begin_distill(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
     if any(bool(update.info["skipped"]) for update in updates):
         raise RuntimeError("a step of the distillation was skipped: a number is not finite")
     what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {config.channels} channels"
@@ -112,8 +112,8 @@ def deform(repeats: int) -> StepTimes:
         )
         for t in range(seen.num_frames)
     ]
-    config = SurgicalConfig(warmup=0, iterations=repeats + 1, graph=GraphConfig(after=0.0))
-    problem, state = begin_surgical(looks, config, np.eye(2, config.channels))
+    config = DeformConfig(warmup=0, iterations=repeats + 1, graph=GraphConfig(after=0.0))
+    problem, state = begin_deform(looks, config, np.eye(2, config.channels))
     updates = list(reconstruct(problem, state))
     if any(bool(update.info["skipped"]) for update in updates):
         raise RuntimeError("a step of the deforming scene was skipped: a number is not finite")

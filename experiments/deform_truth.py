@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 import gsjax
-from gsjax.methods.surgical import Look, Question
+from gsjax.methods.deform import Look, Question
 
 NAMES = ("background", *(f"patch {i}" for i in range(1, REGIONS + 1)), "tool")
 THE_TOOL = len(NAMES) - 1

@@ -16,12 +16,12 @@ from gsjax.cli.deform.scores import draw
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.geometry.cameras import PixelsOf, pixels_of
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     Look,
-    SurgicalConfig,
-    SurgicalProblem,
-    SurgicalState,
-    begin_surgical,
+    DeformConfig,
+    DeformProblem,
+    DeformState,
+    begin_deform,
     reconstruct,
 )
 from gsjax.metrics.image import psnr, ssim
@@ -77,17 +77,17 @@ def dataset(name: str = "tissue_0", scale: float = 1.0) -> Dataset:
 class Reconstructed:
     """A deforming scene that was learned, and what that took."""
 
-    problem: SurgicalProblem
-    state: SurgicalState
+    problem: DeformProblem
+    state: DeformState
     seconds: float
     compile_seconds: float
 
 
 def learned(
-    looks: list[Look], config: SurgicalConfig, codebook: np.ndarray | None = None, first: int | None = None
+    looks: list[Look], config: DeformConfig, codebook: np.ndarray | None = None, first: int | None = None
 ) -> Reconstructed:
     """A scene of these looks, that begins with one of them; no step may be skipped."""
-    problem, state = begin_surgical(looks, config, codebook, first)
+    problem, state = begin_deform(looks, config, codebook, first)
     seconds = compiling = skipped = 0.0
     for found in reconstruct(problem, state):
         state = found.state

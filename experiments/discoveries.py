@@ -19,7 +19,7 @@ from gsjax.cli.parts.command import run as run_parts
 from gsjax.cli.parts.saved import open_parts_run
 from gsjax.cli.parts.views import part_views
 from gsjax.data import Sequence
-from gsjax.methods.motion_parts import PartsConfig, Start, begin, choose_anchor
+from gsjax.methods.parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores
 from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.optical_flow import DisFlow

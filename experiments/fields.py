@@ -19,13 +19,13 @@ from gsjax.cli.track import command as track_command
 from gsjax.data.photographs import Photographs
 from gsjax.data.simulated.flawed_masks import Flaws, flawed_masks
 from gsjax.geometry.cameras import project
-from gsjax.methods.feature_field import (
+from gsjax.methods.distill import (
     FeatureField,
-    FieldConfig,
-    FieldProblem,
-    FieldState,
+    DistillConfig,
+    DistillProblem,
+    DistillState,
     Teacher,
-    begin_field,
+    begin_distill,
     compiled_step,
     distill,
     finished,
@@ -33,7 +33,7 @@ from gsjax.methods.feature_field import (
     majority_labels,
     teacher_of_objects,
 )
-from gsjax.methods.reconstruction import PRESETS
+from gsjax.methods.fit import PRESETS
 from gsjax.perception.codebook import ClassCodebook
 from gsjax.perception.outlines import snap_outlines
 from gsjax.rasterize.frozen import paint
@@ -148,10 +148,10 @@ class Learned:
     losses: dict[str, float]
 
 
-def learned(scene: FieldScene, which: Any, teacher: Teacher, config: FieldConfig) -> Learned:
+def learned(scene: FieldScene, which: Any, teacher: Teacher, config: DistillConfig) -> Learned:
     """Distil a field from some photographs."""
     cameras = [scene.photographs.camera(i) for i in which]
-    problem, state = begin_field(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
+    problem, state = begin_distill(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
     seconds, compiling, infos = 0.0, 0.0, []
     for found in distill(problem, state):
         state = found.state
@@ -172,7 +172,7 @@ def learned(scene: FieldScene, which: Any, teacher: Teacher, config: FieldConfig
     )
 
 
-def step_memory_mb(problem: FieldProblem, state: FieldState) -> float:
+def step_memory_mb(problem: DistillProblem, state: DistillState) -> float:
     """What a compiled step is given, and what it needs beside."""
     batch, config = problem.views[0], problem.config
     given = (state.field, state.optimizer, batch, jnp.asarray(0), jax.random.key(0))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.data import Sequence
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     PRESETS,
     StartConfig,
     TrackedScene,
@@ -17,11 +17,11 @@ from gsjax.methods.object_tracker import (
     plan_tracker,
     start_scene,
 )
-from gsjax.methods.object_tracker.layers import render_labels
-from gsjax.methods.object_tracker.motion import Motion, group_means, move, place
-from gsjax.methods.object_tracker.points import Points
-from gsjax.methods.object_tracker.refine import RefineBatch
-from gsjax.methods.object_tracker.region import near_background, near_scene
+from gsjax.methods.track.layers import render_labels
+from gsjax.methods.track.motion import Motion, group_means, move, place
+from gsjax.methods.track.points import Points
+from gsjax.methods.track.refine import RefineBatch
+from gsjax.methods.track.region import near_background, near_scene
 from gsjax.metrics.tracking import ObjectScore, score_object, true_labels
 from gsjax.rasterize.plan import rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.object_tracker import StartConfig, TrackedScene
-from gsjax.methods.object_tracker.scene import assemble, labelled_cloud
+from gsjax.methods.track import StartConfig, TrackedScene
+from gsjax.methods.track.scene import assemble, labelled_cloud
 from gsjax.scene.frame import Frame
 from gsjax.scene.initialize import gaussians_from_points
 

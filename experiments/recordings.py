@@ -15,7 +15,7 @@ from gsjax.cli.track.loop import Tracking, begin, follow
 from gsjax.cli.track.results import MOVED_MM
 from gsjax.cli.track.scoring import group_values, metrics, score_motion
 from gsjax.cli.track.views import views
-from gsjax.methods.object_tracker import StartConfig, TrackedScene, TrackerConfig, start_scene
+from gsjax.methods.track import StartConfig, TrackedScene, TrackConfig, start_scene
 from gsjax.scene.frame import Frame
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
@@ -49,11 +49,11 @@ def started(
     draw_ahead(recording, QUIET)
     mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)
     assert mask.labels is not None
-    scene = start_scene(frame, mask.labels, cameras.index(MASK_CAMERA), TrackerConfig(start=config))
+    scene = start_scene(frame, mask.labels, cameras.index(MASK_CAMERA), TrackConfig(start=config))
     return Start(recording, mask, frame, scene)
 
 
-def tracked(start: Start, config: TrackerConfig) -> Tracking:
+def tracked(start: Start, config: TrackConfig) -> Tracking:
     """All of it followed; what stops it is raised."""
     tracking = follow(begin(start.scene), start.frame, start.recording.tracked, config, QUIET)
     if tracking.stopped is not None:

@@ -3,7 +3,7 @@
 rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 data        open_sequence, Sequence
-tracking    start_scene, scene_from_shapes, track, object_tracker, TrackerConfig
+tracking    start_scene, scene_from_shapes, track, track_step, TrackConfig
 files       read_ply, write_ply
 speed       host_options, keep_freed_memory, keep_programs
 """
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from gsjax.data import Sequence, open_sequence
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
-    from gsjax.methods.object_tracker import (
-        TrackerConfig,
-        object_tracker,
+    from gsjax.methods.track import (
+        TrackConfig,
+        track_step,
         scene_from_shapes,
         start_scene,
         track,
@@ -38,9 +38,9 @@ _HOMES = {
     "gsjax.data": ("Sequence", "open_sequence"),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
-    "gsjax.methods.object_tracker": (
-        "TrackerConfig",
-        "object_tracker",
+    "gsjax.methods.track": (
+        "TrackConfig",
+        "track_step",
         "scene_from_shapes",
         "start_scene",
         "track",
@@ -63,12 +63,12 @@ __all__ = [
     "Plan",
     "Sequence",
     "Tags",
-    "TrackerConfig",
+    "TrackConfig",
     "composite_tile",
     "host_options",
     "keep_freed_memory",
     "keep_programs",
-    "object_tracker",
+    "track_step",
     "open_sequence",
     "plan",
     "plan_render",

@@ -95,7 +95,7 @@ def tells_of(text: str, name: str) -> bool:
 
 
 def is_of_its_class(argument: ast.arg) -> bool:
-    """Whether an argument is called as its class is, `config: TrackerConfig`: the class tells of it."""
+    """Whether an argument is called as its class is, `config: TrackConfig`: the class tells of it."""
     if argument.annotation is None:
         return False
     classes = re.findall(r"[A-Z]\w*", ast.unparse(argument.annotation).split("[")[0])

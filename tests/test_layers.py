@@ -98,8 +98,8 @@ def toy(tmp_path):
         ("rasterize/plan.py", "from gsjax.geometry import cameras\nimport numpy as np"),
         ("rasterize/plan.py", "from .binning import sort\nfrom ..geometry.cameras import Camera"),
         ("data/panoptic.py", "def f():\n    import gsjax.scene.gaussians"),
-        ("cli/report.py", "from gsjax.methods import object_tracker\nfrom gsjax.viz import plots"),
-        ("__init__.py", "from gsjax.methods import object_tracker"),
+        ("cli/report.py", "from gsjax.methods import track\nfrom gsjax.viz import plots"),
+        ("__init__.py", "from gsjax.methods import track"),
     ],
 )
 def test_what_is_allowed_passes(toy, path, source):

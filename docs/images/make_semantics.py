@@ -1,7 +1,7 @@
 """Makes docs/images/semantics.jpg out of a run: three moments from a held-out camera.
 
     .venv/bin/gsjax track "simulated:tabletop" --frames 0:37 --cameras 0 2 --mask-camera 0 --eval-cameras 1 \\
-        --tracker.start.iterations 60 --out runs/semantics
+        --track.start.iterations 60 --out runs/semantics
     .venv/bin/gsjax grasp runs/semantics "blue can"
     .venv/bin/python docs/images/make_semantics.py runs/semantics
 """
@@ -17,7 +17,7 @@ from make_picture import join
 from gsjax.cli.track.saved import SavedRun, open_run
 from gsjax.cli.track.views import views
 from gsjax.io.video import read_video_frames
-from gsjax.methods.object_tracker import distill_features, first_pose, render_features
+from gsjax.methods.track import distill_features, first_pose, render_features
 from gsjax.perception.gabor import GaborEncoder
 from gsjax.viz.colors import PcaColors, colorize_features, fit_pca_colors, overlay_labels, to_uint8
 

@@ -21,11 +21,11 @@ from boxes import OBJECTS, PIXELS_PER_MM, boxes
 from jaxtyping import Array, Float
 from one_update import Update, scene_at, update_of
 
-from gsjax.methods.object_tracker.align import compose
-from gsjax.methods.object_tracker.config import RefineConfig
-from gsjax.methods.object_tracker.motion import Motion
-from gsjax.methods.object_tracker.points import carry
-from gsjax.methods.object_tracker.refine import RefineBatch, refine_loss, refine_residual
+from gsjax.methods.track.align import compose
+from gsjax.methods.track.config import RefineConfig
+from gsjax.methods.track.motion import Motion
+from gsjax.methods.track.points import carry
+from gsjax.methods.track.refine import RefineBatch, refine_loss, refine_residual
 from gsjax.metrics.tracking import relative_motion
 
 HOME_MM = 3.0

@@ -21,19 +21,19 @@ from timing import CALLS, jitted, timed
 import gsjax
 from gsjax.data.photographs import photographs_of
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     PRESETS,
     StartConfig,
-    TrackerBatch,
-    TrackerState,
+    TrackBatch,
+    TrackState,
     first_pose,
     first_state,
-    object_tracker,
+    track_step,
     place,
     plan_tracker,
     start_scene,
 )
-from gsjax.methods.surgical import GraphConfig, nodes_of
+from gsjax.methods.deform import GraphConfig, nodes_of
 from gsjax.metrics.segmentation import LabelOverlap
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.render import plan_render, render
@@ -63,7 +63,7 @@ class Problem(NamedTuple):
     truth: np.ndarray  # the class of each Gaussian
     held_out: list[tuple[Any, np.ndarray]]  # camera and true mask of every sixth frame
     plan: Any  # of the tracker
-    first: TrackerState
+    first: TrackState
 
 
 @cache
@@ -101,7 +101,7 @@ def problem() -> Problem:
 def stepper(graph: str, shrink: int) -> tuple[Callable, tuple, Camera]:
     """The jitted step of a kind of graph, its first state, and cameras that features are drawn in."""
     p, config = problem(), GRAPHS[graph]
-    tracker = object_tracker(TRACKER, p.scene.num_objects, TrackerBatch(p.scene, p.frames[0], p.plan))
+    tracker = track_step(TRACKER, p.scene.num_objects, TrackBatch(p.scene, p.frames[0], p.plan))
     views = part_of(p.frames[0], shrink=shrink).cameras
     plan = plan_render(p.scene.gaussians, views, headroom=2.0)
     how = (jnp.asarray(p.codebook), RADIUS, optax.adam(RATE), config, plan)
@@ -138,7 +138,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     taught = [[noisy(one, options["wrong"], options["share"], random) for one in pair] for pair in p.masks]
     in_space, overlap = [], LabelOverlap()
     for t in range(1, len(p.frames)):
-        batch = TrackerBatch(p.scene, p.frames[t], p.plan)
+        batch = TrackBatch(p.scene, p.frames[t], p.plan)
         given = batch, views, jnp.asarray(np.stack(taught[t])[:, cells, cells]), jnp.float32(t / 10)
         state, told = step(state, *given)
         assert not bool(told["skipped"] | told["overflow"].any())

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from gsjax.methods.object_tracker import TrackerBatch, place
-from gsjax.methods.surgical import feature_loss, graph_loss, graph_of, seen_ids
+from gsjax.methods.track import TrackBatch, place
+from gsjax.methods.deform import feature_loss, graph_loss, graph_of, seen_ids
 from gsjax.optim.step import gradient_step
 from gsjax.scene.render import render
 
@@ -31,7 +31,7 @@ def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
     """The losses of a frame, the optimizer's first state, and the step.
 
     Args:
-        tracker: a `Step`, from `object_tracker`.
+        tracker: a `Step`, from `track_step`.
         nodes: Gaussians that have features, of which the others blend theirs (`nodes_of`).
         codebook: what the teacher may say, a row a class.
         radius: of the scene, metres.
@@ -54,7 +54,7 @@ def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
 
     learner = gradient_step(loss, optimizer)
 
-    def step(state, batch: TrackerBatch, views, ids, time):
+    def step(state, batch: TrackBatch, views, ids, time):
         pose, tracking, features, learning, memory = state
         pose, tracking, tracked = tracker.update(pose, tracking, batch, step=0, key=None)
         gaussians, graph = place(batch.scene, pose), None

@@ -11,7 +11,7 @@ import numpy as np
 from deform_regions import CLASSES, meanings, region_map, with_errors
 from deforming import dataset, learned, scores, summary, track_errors
 
-from gsjax.methods.surgical import PRESETS, SurgicalConfig
+from gsjax.methods.deform import PRESETS, DeformConfig
 
 SCALE, WARMUP, ITERATIONS, START_PIXELS = 0.4, 100, 300, 1.8
 HEAVY_NODES = 2048
@@ -38,7 +38,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     return told if codes is None else told | meanings(found, data, codes)
 
 
-def _config(method: str, part: str, seed: int) -> SurgicalConfig:
+def _config(method: str, part: str, seed: int) -> DeformConfig:
     """A paper's recipe in fewer steps, without a part of it."""
     config = replace(
         PRESETS[method], warmup=WARMUP, iterations=ITERATIONS, start_pixels=START_PIXELS, seed=seed

@@ -12,13 +12,13 @@ import numpy as np
 
 import gsjax
 from gsjax.cli.deform.scores import draw
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     GraphConfig,
     Look,
-    SurgicalConfig,
-    SurgicalRatesConfig,
-    SurgicalWeightsConfig,
-    begin_surgical,
+    DeformConfig,
+    DeformRatesConfig,
+    DeformWeightsConfig,
+    begin_deform,
     reconstruct,
     start_gaussians,
 )
@@ -26,7 +26,7 @@ from gsjax.scene.deformation import DeformationConfig
 from gsjax.scene.gaussians import Gaussians
 
 DATA = "simulated:tissue?width=64&height=52&frames=6"
-BASE = SurgicalConfig(
+BASE = DeformConfig(
     warmup=5,
     iterations=25,
     start_pixels=1.0,
@@ -43,7 +43,7 @@ class Given(NamedTuple):
     """What a reconstruction is given."""
 
     looks: list[Look]
-    config: SurgicalConfig
+    config: DeformConfig
     codes: np.ndarray
     gaussians: Gaussians | None = None
 
@@ -104,9 +104,9 @@ CASES: dict[str, Callable[[Given], Given]] = {
     "more nodes than Gaussians": _config(nodes=100_000),
     "no nodes, one Gaussian in a hundred deforms": _config(nodes=0, moving_share=0.01),
     "rates a thousand times as high": _config(
-        rates=SurgicalRatesConfig(*(1e3 * rate for rate in vars(SurgicalRatesConfig()).values()))
+        rates=DeformRatesConfig(*(1e3 * rate for rate in vars(DeformRatesConfig()).values()))
     ),
-    "weights 1e9": _config(weights=SurgicalWeightsConfig(depth=1e9, feature=1e9, plane_tv=1e9)),
+    "weights 1e9": _config(weights=DeformWeightsConfig(depth=1e9, feature=1e9, plane_tv=1e9)),
     "two nodes in the graph": _graph(nodes=2),
     "a graph whose edges end at 1e-6 radii": _graph(tau_x=1e-6, tau_t=1e-6),
     "a graph of weight 1e9": _graph(node=1e9, structure=1e9),
@@ -128,7 +128,7 @@ CASES: dict[str, Callable[[Given], Given]] = {
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Thirty steps of one case, and the scene long before, during and long after the recording."""
     given = CASES[options["case"]](_given(seed))
-    problem, state = begin_surgical(given.looks, given.config, given.codes, gaussians=given.gaussians)
+    problem, state = begin_deform(given.looks, given.config, given.codes, gaussians=given.gaussians)
     rows = []
     for found in reconstruct(problem, state):
         state = found.state

@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, UInt8
 from recordings import recorded
 
 from gsjax.data.resizing import blended, picked
-from gsjax.methods.surgical import Look, SurgicalConfig, begin_surgical, reconstruct
+from gsjax.methods.deform import Look, DeformConfig, begin_deform, reconstruct
 from gsjax.metrics.image import psnr
 from gsjax.metrics.tracking import carried_points
 from gsjax.perception.optical_flow import DisFlow
 
 SCALE = 0.25  # of the pictures that are learned from
-CONFIG = SurgicalConfig(warmup=150, iterations=650, start_pixels=1.8, nodes=512)
+CONFIG = DeformConfig(warmup=150, iterations=650, start_pixels=1.8, nodes=512)
 COARSE = ((1 / 16, 200), (1 / 8, 200), (1 / 4, 100))  # scales and steps before the rest at SCALE
 SMALL = 0.25  # of the pictures that DIS is given, which follows about a tenth of the width
 WITHIN_MM = 50.0
@@ -136,10 +136,10 @@ def by_field(data: Pair, seed: int, coarse: tuple[tuple[float, int], ...]) -> Re
     """The first picture as it is, then both; smaller pictures of both before, if wanted."""
     config = replace(CONFIG, seed=seed)
     total = config.warmup + config.iterations
-    problem, state = begin_surgical([data.look(t, SCALE) for t in (0, 1)], config)
+    problem, state = begin_deform([data.look(t, SCALE) for t in (0, 1)], config)
     parts = [(problem, config.warmup)]
     for scale, steps in coarse:
-        smaller, other = begin_surgical([data.look(t, scale) for t in (0, 1)], config)
+        smaller, other = begin_deform([data.look(t, scale) for t in (0, 1)], config)
         smaller = smaller._replace(plan=smaller.plan_for(other), radius=problem.radius, bounds=problem.bounds)
         parts.append((smaller, parts[-1][1] + steps))
     seconds = compiling = skipped = 0.0

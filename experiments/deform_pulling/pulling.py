@@ -17,11 +17,11 @@ from recordings import recorded
 import gsjax
 from gsjax.cli.deform.data import unit_times
 from gsjax.data import DataWarning, Sequence
-from gsjax.methods.surgical import Look, SurgicalConfig
+from gsjax.methods.deform import Look, DeformConfig
 from gsjax.metrics.image import psnr, ssim
 
 SCALE = 0.25  # of 640x512
-BASE = SurgicalConfig(warmup=100, iterations=500, start_pixels=1.5, nodes=1024)
+BASE = DeformConfig(warmup=100, iterations=500, start_pixels=1.5, nodes=1024)
 COPIES = {
     "previous": "copy of the frame before",
     "neighbors": "mean of both neighbours",

@@ -14,7 +14,7 @@ from deform_truth import NAMES, Truth, built_in
 from deforming import Dataset, Reconstructed, dataset, learned, summary
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     PRESETS,
     QUESTIONS,
     GraphConfig,

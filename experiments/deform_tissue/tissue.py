@@ -10,9 +10,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
-from gsjax.methods.surgical import GraphConfig, SurgicalConfig
+from gsjax.methods.deform import GraphConfig, DeformConfig
 
-BASE = SurgicalConfig(warmup=200, iterations=800, start_pixels=1.8)
+BASE = DeformConfig(warmup=200, iterations=800, start_pixels=1.8)
 CHANNELS = BASE.channels
 
 

@@ -23,10 +23,10 @@ from deforming import (
     track_errors,
 )
 
-from gsjax.methods.surgical import GraphConfig, SurgicalConfig
+from gsjax.methods.deform import GraphConfig, DeformConfig
 from gsjax.scene.deformation import DeformationConfig
 
-BASE = SurgicalConfig(warmup=100, iterations=300, start_pixels=1.8)
+BASE = DeformConfig(warmup=100, iterations=300, start_pixels=1.8)
 SCALE = 0.4
 _FIELD = ("kind", "resolution", "levels", "field_channels")
 _TIMED = 32
@@ -48,7 +48,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def _config(options: dict[str, Any], seed: int) -> SurgicalConfig:
+def _config(options: dict[str, Any], seed: int) -> DeformConfig:
     field = {name.removeprefix("field_"): options[name] for name in _FIELD if name in options}
     rest = {name: options[name] for name in options if name not in (*_FIELD, "scale", "graph")}
     config = replace(BASE, seed=seed, deformation=DeformationConfig(**field), **rest)

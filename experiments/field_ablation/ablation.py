@@ -16,16 +16,16 @@ from autoencoder import trained
 from fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
 from gsjax.cli.distill.scene import FieldScene, scaled
-from gsjax.methods.feature_field import FieldConfig, FieldWeightsConfig, Teacher, features_of
-from gsjax.methods.feature_field.field import FeatureField
+from gsjax.methods.distill import DistillConfig, DistillWeightsConfig, Teacher, features_of
+from gsjax.methods.distill.field import FeatureField
 
 SCALE, ITERATIONS = 0.5, 100
-BASE = FieldConfig(iterations=ITERATIONS)
-NEITHER = replace(BASE, weights=FieldWeightsConfig(contrast=0.0, tv=0.0))
-VARIANTS: dict[str, FieldConfig] = {
+BASE = DistillConfig(iterations=ITERATIONS)
+NEITHER = replace(BASE, weights=DistillWeightsConfig(contrast=0.0, tv=0.0))
+VARIANTS: dict[str, DistillConfig] = {
     "all on": BASE,
-    "without contrast": replace(BASE, weights=FieldWeightsConfig(contrast=0.0)),
-    "without TV": replace(BASE, weights=FieldWeightsConfig(tv=0.0)),
+    "without contrast": replace(BASE, weights=DistillWeightsConfig(contrast=0.0)),
+    "without TV": replace(BASE, weights=DistillWeightsConfig(tv=0.0)),
     "without both": NEITHER,
     "a vector each, not the hash grid": replace(BASE, encoding="table"),
     "a vector each, without both": replace(NEITHER, encoding="table"),
@@ -68,7 +68,7 @@ def _squeezed(scene: FieldScene, teacher: Teacher, size: int, seed: int) -> tupl
     model, _ = trained(teacher.codebook, size, seed)
     codes = np.asarray(model.encode(jnp.asarray(teacher.codebook)))
     aside = perf_counter() - begun
-    weights = FieldWeightsConfig(rec=1000.0 / 512 * size, contrast=0.0, tv=0.0)  # as much a pixel
+    weights = DistillWeightsConfig(rec=1000.0 / 512 * size, contrast=0.0, tv=0.0)  # as much a pixel
     config = replace(NEITHER, encoding="table", channels=size, weights=weights, seed=seed)
     found = learned(scene, scene.taught, teacher._replace(codebook=codes), config)
     low = features_of(found.field, None) @ found.field.lift.T

@@ -11,8 +11,8 @@ import numpy as np
 from fields import by_majority, codebook_of, fitted, learned, of_field, scored
 
 from gsjax.data import ReadOptions
-from gsjax.methods.feature_field import FieldConfig, teacher_of_objects
-from gsjax.methods.reconstruction import FitConfig, StartConfig
+from gsjax.methods.distill import DistillConfig, teacher_of_objects
+from gsjax.methods.fit import FitConfig, StartConfig
 
 WITHHELD = (4, 12, 20, 27)  # cameras whose masks only judge
 HELD_OUT = (0, 10, 15, 30)  # that the scene was not fitted to; they have no masks
@@ -40,7 +40,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     masks = [np.asarray(photographs.labels(i), np.int64) for i in taught]
     teacher = teacher_of_objects(masks, [codes] * len(masks))
     voted = scored(scene, by_majority(scene, taught, masks, len(names)), names)
-    found = learned(scene, taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
+    found = learned(scene, taught, teacher, DistillConfig(iterations=options["iterations"], seed=seed))
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
     return {
         **asked,

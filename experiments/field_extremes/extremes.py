@@ -14,12 +14,12 @@ import numpy as np
 from fields import codebook_of, fitted, flawed_teacher, true_labels
 
 from gsjax.cli.distill.scene import FieldScene, scaled
-from gsjax.methods.feature_field import (
-    FieldConfig,
-    FieldRatesConfig,
-    FieldWeightsConfig,
+from gsjax.methods.distill import (
+    DistillConfig,
+    DistillRatesConfig,
+    DistillWeightsConfig,
     Teacher,
-    begin_field,
+    begin_distill,
     distill,
     finished,
     gaussian_cosines,
@@ -29,7 +29,7 @@ from gsjax.scene.feature_grid import FeatureGridConfig, locate
 from gsjax.scene.gaussians import take
 
 SCALE = 0.25
-BASE = FieldConfig(iterations=40, contrast_after=0.25)
+BASE = DistillConfig(iterations=40, contrast_after=0.25)
 ONE_LEVEL = FeatureGridConfig(levels=1, least_resolution=16, most_resolution=16)
 
 
@@ -70,10 +70,10 @@ CASES: dict[str, Any] = {
     "one channel": _config(channels=1),
     "a table of 8 entries": _config(grid=FeatureGridConfig(log2_entries=3)),
     "one level": _config(grid=ONE_LEVEL),
-    "rates a thousand times as high": _config(rates=FieldRatesConfig(table=10.0, layers=2.0, lift=2.0)),
-    "weight of the difference 1e9": _config(weights=FieldWeightsConfig(rec=1e9)),
+    "rates a thousand times as high": _config(rates=DistillRatesConfig(table=10.0, layers=2.0, lift=2.0)),
+    "weight of the difference 1e9": _config(weights=DistillWeightsConfig(rec=1e9)),
     "gamma of the contrast 1e4": _config(contrast_gamma=1e4),
-    "contrast alone": _config(weights=FieldWeightsConfig(rec=0.0, cos=0.0, tv=0.0)),
+    "contrast alone": _config(weights=DistillWeightsConfig(rec=0.0, cos=0.0, tv=0.0)),
     "strips of one row of tiles": _config(strip_megabytes=0.1),
     "embeddings of length 1e6": _teacher(lambda t: _longer(t, 1e6)),
     "embeddings of length 1e-6": _teacher(lambda t: _longer(t, 1e-6)),
@@ -109,7 +109,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     assert isinstance(teacher, Teacher)
     scene, teacher, config = CASES[options["case"]](scene, teacher, BASE)
     cameras = [scene.photographs.camera(i) for i in scene.taught]
-    problem, state = begin_field(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
+    problem, state = begin_distill(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
     losses, skipped = [], 0
     for found in distill(problem, state):
         state = found.state

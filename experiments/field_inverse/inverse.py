@@ -14,8 +14,8 @@ from fields import codebook_of, fitted, flawed_teacher, learned, scored
 from timing import jitted, median_ms, timed
 
 from gsjax.cli.distill.scene import scaled
-from gsjax.methods.feature_field import (
-    FieldConfig,
+from gsjax.methods.distill import (
+    DistillConfig,
     back_projected_cosines,
     features_of,
     gaussian_cosines,
@@ -33,7 +33,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         scene = fitted("articulated_0", folder, eval_cameras=(3, 8), frames="0:1")
         names, codes = codebook_of(scene.photographs)
         teacher, _ = flawed_teacher(scene, codes, seed, scale=SCALE)
-        config, small = FieldConfig(iterations=ITERATIONS, seed=seed), scaled(scene, SCALE)
+        config, small = DistillConfig(iterations=ITERATIONS, seed=seed), scaled(scene, SCALE)
         _KEPT[seed] = scene, names, jnp.asarray(codes), learned(small, scene.taught, teacher, config)
     scene, names, codes, found = _KEPT[seed]
     field, located, way = found.field, found.located, options["way"]

@@ -19,7 +19,7 @@ from fields import (
 )
 
 from gsjax.cli.distill.scene import FieldScene
-from gsjax.methods.feature_field import FieldConfig
+from gsjax.methods.distill import DistillConfig
 
 
 def scene_of(name: str, folder: Path) -> FieldScene:
@@ -39,7 +39,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     voted = scored(scene, by_majority(scene, scene.taught, ids, len(names)), names)
     teacher, snapped = flawed_teacher(scene, codes, seed, snap=options["snap"])
     of_snapped = scored(scene, by_majority(scene, scene.taught, snapped, len(names)), names)
-    found = learned(scene, scene.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
+    found = learned(scene, scene.taught, teacher, DistillConfig(iterations=options["iterations"], seed=seed))
     by_field = (found.field, found.located, codes)
     asked = scored(scene, of_field(found, codes), names, by_field)
     return {

@@ -14,7 +14,7 @@ from timing import jitted, median_ms
 
 from gsjax.cli.distill.scene import FieldScene
 from gsjax.data.photographs import Photographs
-from gsjax.methods.feature_field import FieldConfig, Teacher, gaussian_cosines
+from gsjax.methods.distill import DistillConfig, Teacher, gaussian_cosines
 from gsjax.scene.gaussians import concatenate
 
 ITERATIONS = 1500  # the paper's
@@ -29,7 +29,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     iterations = ITERATIONS
     if options["size"] == "640x480":
         scene, teacher, iterations = _doubled(scene), _enlarged(teacher), FEW
-    found = learned(scene, scene.taught, teacher, FieldConfig(iterations=iterations, seed=seed))
+    found = learned(scene, scene.taught, teacher, DistillConfig(iterations=iterations, seed=seed))
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
     step_s = found.seconds / (iterations - 1)
     return {

@@ -17,8 +17,8 @@ from gsjax.cli.distill.scores import ClassScores, class_maps
 from gsjax.cli.track import command as track_command
 from gsjax.cli.track.saved import open_run
 from gsjax.data.simulated.flawed_masks import Flaws
-from gsjax.methods.feature_field import FeatureField, FieldConfig, features_of, frozen_views
-from gsjax.methods.object_tracker import place
+from gsjax.methods.distill import FeatureField, DistillConfig, features_of, frozen_views
+from gsjax.methods.track import place
 from gsjax.scene.gaussians import Gaussians
 
 CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, (2,), 6
@@ -42,7 +42,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     first, saved = scene_of_run(path), open_run(path)
     names, codes = codebook_of(first.photographs)
     teacher, _ = flawed_teacher(first, codes, seed, NO_FLAWS if options["masks"] == "true" else Flaws())
-    found = learned(first, first.taught, teacher, FieldConfig(iterations=options["iterations"], seed=seed))
+    found = learned(first, first.taught, teacher, DistillConfig(iterations=options["iterations"], seed=seed))
     carried = FeatureField(
         features_of(found.field, found.located), found.field.lift
     )  # by Gaussian, not place

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
 from gsjax.cli.distill.scene import scaled
-from gsjax.methods.feature_field import FieldConfig
+from gsjax.methods.distill import DistillConfig
 from gsjax.scene.feature_grid import FeatureGridConfig
 
 AXES = {
@@ -31,7 +31,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     small = scaled(scene, told["scale"])
     teacher, _ = flawed_teacher(scene, codes, seed, scale=told["scale"])
     grid = FeatureGridConfig(levels=told["levels"], log2_entries=told["log2_entries"], hidden=told["hidden"])
-    config = FieldConfig(iterations=told["iterations"], channels=told["channels"], grid=grid, seed=seed)
+    config = DistillConfig(iterations=told["iterations"], channels=told["channels"], grid=grid, seed=seed)
     found = learned(small, small.taught, teacher, config)
     # Judged at full resolution, whatever it learned from.
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))

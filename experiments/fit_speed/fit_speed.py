@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the benchmarks' 
 
 from benchmarks.workloads import ball
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.reconstruction import Batch, FitConfig, Observation, fit_loss, grow, reconstruction_step
-from gsjax.methods.reconstruction.model import model_of, with_degree
+from gsjax.methods.fit import Batch, FitConfig, Observation, fit_loss, grow, fit_step
+from gsjax.methods.fit.model import model_of, with_degree
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
@@ -34,7 +34,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     target = jnp.round(255 * jnp.clip(render(goal, camera).colors, 0, 1)).astype(jnp.uint8)
     plan = plan_render(model.gaussians, camera, headroom=1.3)
     batch = Batch(Observation(target, None, None, camera, jnp.int32(0)), jnp.zeros((1, 3)), plan)
-    step, loss = reconstruction_step(config, 1.0), fit_loss(config, 1.0)
+    step, loss = fit_step(config, 1.0), fit_loss(config, 1.0)
     state, key = step.init(model), jax.random.key(seed)
 
     def drawn(model, state, batch, key):

@@ -21,7 +21,7 @@ from gsjax.cli.fit.results import Curve, judge, living, look
 from gsjax.cli.photographs import split
 from gsjax.data import open_photographs
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.reconstruction import (
+from gsjax.methods.fit import (
     FitConfig,
     SplitConfig,
     StartConfig,

@@ -20,9 +20,9 @@ from gsjax.cli.track.loop import Tracking
 from gsjax.cli.track.scoring import lost_over_frames, score_motion, turn_unknown
 from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
-from gsjax.methods.object_tracker import PRESETS, TrackerConfig, start_scene
+from gsjax.methods.track import PRESETS, TrackConfig, start_scene
 
-START = TrackerConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
+START = TrackConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here
 ASTRAY_MM = 20.0  # the objects are 60 to 130 mm long
 TURNED_DEG = 8.0  # an object that is turned otherwise by more than this ...
 TURN_MM = 40.0  # ... may have its seen surface's centroid so far off, though its place is right

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 from recordings import recorded
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.reconstruction import FitConfig, GrowthConfig, View, begin, fit
+from gsjax.methods.fit import FitConfig, GrowthConfig, View, begin, fit
 from gsjax.metrics.image import psnr, ssim
 from gsjax.optim.densification import is_alive
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated, take

@@ -19,7 +19,7 @@ import tyro
 
 import gsjax
 from gsjax.cli import machine
-from gsjax.methods.object_tracker import Pose, first_pose, render_labels, scene_from_shapes, track
+from gsjax.methods.track import Pose, first_pose, render_labels, scene_from_shapes, track
 from gsjax.metrics.segmentation import iou_of_masks
 
 SPECK = 100  # pixels: smaller patches of the colour are not the block

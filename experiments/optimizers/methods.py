@@ -20,12 +20,12 @@ from timing import jitted, median_ms, timed
 from trimesh.registration import procrustes
 
 from gsjax.geometry.cameras import pixel_grid, unproject
-from gsjax.methods.object_tracker.align import align, widened
-from gsjax.methods.object_tracker.config import AlignConfig, RefineConfig
-from gsjax.methods.object_tracker.motion import Motion, place
-from gsjax.methods.object_tracker.points import sight_of
-from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
-from gsjax.methods.object_tracker.search import first_watch, search
+from gsjax.methods.track.align import align, widened
+from gsjax.methods.track.config import AlignConfig, RefineConfig
+from gsjax.methods.track.motion import Motion, place
+from gsjax.methods.track.points import sight_of
+from gsjax.methods.track.refine import refine_loss, refine_residual
+from gsjax.methods.track.search import first_watch, search
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.optim.step import Step
 from gsjax.scene.render import render

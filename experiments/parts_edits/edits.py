@@ -17,10 +17,10 @@ from recordings import recorded
 from gsjax.cli.parts.saved import PartsRun, open_parts_run, read_parts
 from gsjax.geometry.cameras import Camera
 from gsjax.io.video import VideoWriter
-from gsjax.methods.motion_parts import Moment, gaussians_at, moment
-from gsjax.methods.motion_parts.film import Film, film_gaussians
-from gsjax.methods.motion_parts.limits import beyond_captured
-from gsjax.methods.motion_parts.timeline import Script, apply, parse_op
+from gsjax.methods.parts import Moment, gaussians_at, moment
+from gsjax.methods.parts.film import Film, film_gaussians
+from gsjax.methods.parts.limits import beyond_captured
+from gsjax.methods.parts.timeline import Script, apply, parse_op
 from gsjax.metrics.edit_judge import (
     Finding,
     asked_displacement,

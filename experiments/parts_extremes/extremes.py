@@ -18,7 +18,7 @@ from jaxtyping import Int
 
 from gsjax.data import Sequence, open_sequence
 from gsjax.io.ply import read_ply
-from gsjax.methods.motion_parts import (
+from gsjax.methods.parts import (
     PartScene,
     PartsConfig,
     Trajectory,

@@ -24,7 +24,7 @@ from timing import jitted, median_ms, timed
 
 from gsjax.cli.recording import open_recording
 from gsjax.io.ply import read_ply
-from gsjax.methods.motion_parts import (
+from gsjax.methods.parts import (
     BACKGROUND,
     Canonical,
     PartsConfig,
@@ -32,10 +32,10 @@ from gsjax.methods.motion_parts import (
     StreamParams,
     stream_step,
 )
-from gsjax.methods.motion_parts.follow import seen_at
-from gsjax.methods.motion_parts.residual import pose_residual
-from gsjax.methods.motion_parts.screws import motions_of, pose_of
-from gsjax.methods.motion_parts.stream import posed, skinning_weights
+from gsjax.methods.parts.follow import seen_at
+from gsjax.methods.parts.residual import pose_residual
+from gsjax.methods.parts.screws import motions_of, pose_of
+from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.handles import HandlePose, rigid_motions

@@ -24,8 +24,8 @@ from gsjax.data import Sequence
 from gsjax.geometry.cameras import project
 from gsjax.geometry.flow import seen_in_both
 from gsjax.io.ply import read_ply
-from gsjax.methods.motion_parts import PartsConfig, Start, first_parts, follow
-from gsjax.methods.motion_parts.stream import posed, skinning_weights
+from gsjax.methods.parts import PartsConfig, Start, first_parts, follow
+from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.compiler import host_options
 from gsjax.perception.optical_flow import DisFlow
 from gsjax.perception.propagation import FlowPropagator

@@ -8,7 +8,7 @@ from bins import CAN, Bins
 from panda import as_frame, fed, motion_between, start
 
 import gsjax
-from gsjax.methods.object_tracker import PRESETS
+from gsjax.methods.track import PRESETS
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]

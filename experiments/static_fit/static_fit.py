@@ -13,7 +13,7 @@ from gsjax.cli.fit.command import Options
 from gsjax.cli.fit.command import run as run_fit
 from gsjax.cli.machine import resident_mb
 from gsjax.data import ReadOptions
-from gsjax.methods.reconstruction import FitConfig
+from gsjax.methods.fit import FitConfig
 
 GOAL_DB = 25.0
 # fox at 270x480, the others at 320x240. The K of icl_living_room is told beside it, centres at integers.

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from recordings import recorded, scored, started, tracked
 
-from gsjax.methods.object_tracker import PRESETS, TrackerConfig
+from gsjax.methods.track import PRESETS, TrackConfig
 
 RECORDINGS = {  # with the frames that are taken
     "tabletop": (lambda: "simulated:tabletop?width=240&height=180", "0:24"),
@@ -24,7 +24,7 @@ CAMERAS, HELD_OUT = (0, 1), (2,)
 FULL = PRESETS["paper"]
 
 
-def without_alignment(config: TrackerConfig) -> TrackerConfig:
+def without_alignment(config: TrackConfig) -> TrackConfig:
     """What the paper has not: no Gauss-Newton, and no search by shifts and turns before it."""
     return replace(config, align=replace(config.align, iterations=0, reach=0.0, turns=()))
 

@@ -14,7 +14,7 @@ import numpy as np
 from recordings import Start, recorded, scored, started, tracked
 
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.object_tracker import PRESETS, TrackerConfig
+from gsjax.methods.track import PRESETS, TrackConfig
 
 FAST = PRESETS["fast"]
 CAMERAS = (0, 1, 2)
@@ -22,13 +22,13 @@ WARM = 3  # updates at the start that are left out: they fault their memory in
 ROUNDING = 3e-4  # by which colours differ from run to run, as on another machine
 
 
-def setting(knob: str, value: Any) -> TrackerConfig:
+def setting(knob: str, value: Any) -> TrackConfig:
     """`fast` with one knob turned."""
 
-    def align(**changes) -> TrackerConfig:
+    def align(**changes) -> TrackConfig:
         return replace(FAST, align=replace(FAST.align, **changes))
 
-    def start(**changes) -> TrackerConfig:
+    def start(**changes) -> TrackConfig:
         return replace(FAST, start=replace(FAST.start, **changes))
 
     whole = replace(FAST, redraw="all", coarseness=1)
@@ -55,7 +55,7 @@ def setting(knob: str, value: Any) -> TrackerConfig:
 
 
 @lru_cache(maxsize=1)
-def starts(dataset: str, config: TrackerConfig) -> tuple[Start, Start]:
+def starts(dataset: str, config: TrackConfig) -> tuple[Start, Start]:
     """What a setting begins with, and `fast`; programs of the setting before are forgotten, for every setting
     compiles its own, which fill the process's memory map."""
     jax.clear_caches()

@@ -19,7 +19,7 @@ from gsjax.cli.run.folder import expect_dataset
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
-from gsjax.methods.reconstruction import View
+from gsjax.methods.fit import View
 
 _LARGE = 1600  # pixels, a side
 _BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 if TYPE_CHECKING:
-    from gsjax.methods.surgical import Answer, SceneFacts
+    from gsjax.methods.deform import Answer, SceneFacts
 
 
 @runtime_checkable
@@ -112,7 +112,7 @@ class LanguageEncoder(Protocol):
 
 @runtime_checkable
 class Answerer(Protocol):
-    """What is the answer to a question on a scene; `gsjax.methods.surgical` has the default."""
+    """What is the answer to a question on a scene; `gsjax.methods.deform` has the default."""
 
     def __call__(self, question: str, facts: "SceneFacts") -> "Answer":
         """A sentence, and a value where it comes to one.

@@ -21,8 +21,8 @@ from gsjax.cli.track import loop
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
-from gsjax.methods.feature_field import FeatureField
-from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+from gsjax.methods.distill import FeatureField
+from gsjax.methods.track import Tracked, first_pose, start_scene
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 

@@ -275,7 +275,7 @@ def test_a_meta_of_other_types(refused, recording, key, value, says):
 @pytest.mark.parametrize(
     ("option", "value", "says"),
     [
-        ("headroom", "0.5", "TrackerConfig.headroom: expected 1 or more, found 0.5"),
+        ("headroom", "0.5", "TrackConfig.headroom: expected 1 or more, found 0.5"),
         ("start.part-size", "0", "StartConfig.part_size: expected more than 0, found 0"),
         ("refine.iterations", "-1", "RefineConfig.iterations: expected 0 or more, found -1"),
         ("align.spacing", "nan", "AlignConfig.spacing: expected more than 0, found nan"),
@@ -283,7 +283,7 @@ def test_a_meta_of_other_types(refused, recording, key, value, says):
 )
 def test_settings_without_a_meaning(gsjax_track, pristine, capfd, option, value, says):
     with pytest.raises(SystemExit) as left:
-        gsjax_track(pristine, f"--tracker.{option}", value)
+        gsjax_track(pristine, f"--track.{option}", value)
     assert left.value.code == 2
     said = capfd.readouterr().err
     assert says in " ".join(said.replace("│", " ").split())

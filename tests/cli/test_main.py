@@ -13,7 +13,7 @@ from rich.console import Console
 from gsjax.cli import COMMANDS, main
 from gsjax.cli.messages import Notes, describe
 from gsjax.data import DataWarning
-from gsjax.methods.object_tracker import PRESETS, TrackerConfig
+from gsjax.methods.track import PRESETS, TrackConfig
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_every_option_is_explained(say, capfd, command):
     # What it takes, two spaces or a new line, and at once its default.
     assert not re.findall(r"│ --[\w.-]+(?: \S+)*(?:  +|\s*│\n│\s+)\((?:default|required)", out)
     if command == "track":
-        assert "--tracker.refine.iterations" in out
+        assert "--track.refine.iterations" in out
 
 
 def test_missing_option_is_named(say, capfd):
@@ -133,9 +133,9 @@ def test_a_preset_is_where_the_trackers_settings_begin(monkeypatch, tmp_path):
     chosen = []
     monkeypatch.setattr("gsjax.cli.track.command.run", lambda options: chosen.append(options) or 0)
     command = ["track", "simulated:tabletop", "--out", str(tmp_path / "run")]
-    for more in ([], ["--preset", "fast"], ["--preset=fast", "--tracker.align.iterations", "3"]):
+    for more in ([], ["--preset", "fast"], ["--preset=fast", "--track.align.iterations", "3"]):
         assert main([*command, *more]) == 0
-    accurate, fast, changed = (options.tracker for options in chosen)
-    assert accurate == TrackerConfig() == PRESETS["accurate"]
+    accurate, fast, changed = (options.track for options in chosen)
+    assert accurate == TrackConfig() == PRESETS["accurate"]
     assert fast == PRESETS["fast"]
     assert changed == replace(fast, align=replace(fast.align, iterations=3))

@@ -21,6 +21,6 @@ def test_it_fits_one_screen_and_its_picture_is_there():
 @pytest.mark.slow
 def test_its_programs_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    quick = ("--frames", "0:1", "--tracker.start.iterations", "1")
+    quick = ("--frames", "0:1", "--track.start.iterations", "1")
     assert main(["track", "simulated:tabletop", "--cameras", "0", "--out", "runs/demo", *quick]) == 0
     assert run_programs("README.md")

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.object_tracker.motion import Motion, first_pose, group_means, move, place
-from gsjax.methods.object_tracker.refine import RefineBatch
-from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.methods.track.motion import Motion, first_pose, group_means, move, place
+from gsjax.methods.track.refine import RefineBatch
+from gsjax.methods.track.scene import TrackedScene
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.methods.object_tracker.align import disagreement
-from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.points import sight_of
+from gsjax.methods.track.align import disagreement
+from gsjax.methods.track.config import AlignConfig
+from gsjax.methods.track.points import sight_of
 
 CONFIG = AlignConfig(iterations=12)
 CARTON = 2

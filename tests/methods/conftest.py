@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from gsjax.data.simulated import tabletop
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     PRESETS,
     MatchConfig,
     RefineConfig,
     StartConfig,
-    TrackerConfig,
+    TrackConfig,
     start_scene,
 )
-from gsjax.methods.object_tracker.points import pixels_of_groups
+from gsjax.methods.track.points import pixels_of_groups
 from tests.methods.carton import CARTON, CONFIG, SIZE, middle, see
 
 QUICK = replace(
@@ -35,7 +35,7 @@ def _table(frames: int, cameras: int, width: int, height: int, still: bool, leav
 
 
 @pytest.fixture(scope="session")
-def quick() -> TrackerConfig:
+def quick() -> TrackConfig:
     return QUICK
 
 

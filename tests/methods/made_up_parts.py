@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.joints import Joint
-from gsjax.methods.motion_parts.trajectory import Moment, PartScene, Trajectory, trajectory_of
+from gsjax.methods.parts.trajectory import Moment, PartScene, Trajectory, trajectory_of
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import HandlePose
 

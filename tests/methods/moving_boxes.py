@@ -58,7 +58,7 @@ class Box:
 
 
 class MovingBoxes:
-    """What cameras see of boxes; as `gsjax.methods.motion_parts.Views` wants it.
+    """What cameras see of boxes; as `gsjax.methods.parts.Views` wants it.
 
     Attributes:
         gaussians: at the canonical frame, the floor's first.

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.reconstruction import View
+from gsjax.methods.fit import View
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 

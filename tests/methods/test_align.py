@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.object_tracker.align import (
+from gsjax.methods.track.align import (
     _normal_equations,
     _residuals,
     align,
@@ -14,7 +14,7 @@ from gsjax.methods.object_tracker.align import (
     spot,
     turned,
 )
-from gsjax.methods.object_tracker.points import Points, carry
+from gsjax.methods.track.points import Points, carry
 from tests.methods.carton import CONFIG, SIZE, error, gap, see
 
 # Compiled once for calls that differ in values alone.

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.methods.object_tracker import PRESETS, GrowConfig, TrackerConfig, track
-from gsjax.methods.object_tracker.budget import Costs, Governor, choose, ladder
+from gsjax.methods.track import PRESETS, GrowConfig, TrackConfig, track
+from gsjax.methods.track.budget import Costs, Governor, choose, ladder
 
-RUNGS = ladder(TrackerConfig(), 3)
+RUNGS = ladder(TrackConfig(), 3)
 NAMES = list(RUNGS)
 
 
@@ -38,7 +38,7 @@ def test_the_ladder_goes_from_the_richest_to_one_camera():
     assert NAMES[:3] == ["accurate", "balanced", "fast"]
     assert NAMES[-1] == "fast, half the resolution, 1 camera"
     assert RUNGS[NAMES[-1]].cameras == (0,)
-    few = ladder(TrackerConfig(grow=GrowConfig(slots=7)), 3).values()
+    few = ladder(TrackConfig(grow=GrowConfig(slots=7)), 3).values()
     assert [rung.grow.slots for rung in few] == [7] * len(RUNGS)
     assert set(PRESETS) - {"paper"} <= set(NAMES)
 
@@ -111,7 +111,7 @@ def test_what_updates_cost_is_measured_with_the_second_frame(table, started, mon
     def measured(scene, pose, first, second, config):
         raise Measured(second)
 
-    monkeypatch.setattr("gsjax.methods.object_tracker.tracking._measured", measured)
+    monkeypatch.setattr("gsjax.methods.track.tracking._measured", measured)
     for following, expected in ((frames[1:], frames[1]), ([], frames[0])):
         with pytest.raises(Measured) as seen:
             next(track(started, frames[0], following, budget_ms=33.0))

@@ -14,17 +14,17 @@ import pytest
 from jaxtyping import Array, Int
 
 from gsjax.geometry.cameras import unproject
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     PRESETS,
     AlignConfig,
-    TrackerBatch,
+    TrackBatch,
     first_pose,
     first_state,
-    object_tracker,
+    track_step,
     place,
     plan_tracker,
 )
-from gsjax.methods.surgical import GraphConfig, graph_of, nodes_of, seen_ids
+from gsjax.methods.deform import GraphConfig, graph_of, nodes_of, seen_ids
 from gsjax.scene.deformation import Nodes
 from gsjax.scene.render import plan_render
 
@@ -45,7 +45,7 @@ def page_names() -> dict:
 class Small(NamedTuple):
     config: Any
     plan: Any
-    batches: list[TrackerBatch]
+    batches: list[TrackBatch]
     ids: Int[Array, "t c h w"]
     nodes: Nodes
 
@@ -57,7 +57,7 @@ def small(table, started):
     align = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
     config = replace(PRESETS["fast"], align=align)
     plan = plan_tracker(started, first_pose(started), frames[0], config)
-    batches = [TrackerBatch(started, frame, plan) for frame in frames[:3]]
+    batches = [TrackBatch(started, frame, plan) for frame in frames[:3]]
     ids = np.stack([[sequence.mask(t, c) for c in (0, 1)] for t in range(3)])
     nodes = nodes_of(started.gaussians, 8, np.asarray(started.labels))
     return Small(config, plan, batches, jnp.asarray(ids, jnp.int32), nodes)
@@ -69,7 +69,7 @@ def composed(small):
     page = page_names()
     scene, cameras = small.batches[0].scene, small.batches[0].frame.cameras
     plan = plan_render(scene.gaussians, cameras, headroom=2.0)
-    tracker = object_tracker(small.config, scene.num_objects, small.batches[0])
+    tracker = track_step(small.config, scene.num_objects, small.batches[0])
 
     def make(kind):
         how = (RADIUS, optax.adam(0.1), graph_config(kind), plan)

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 
 from gsjax.losses.extra import extra_terms
-from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
-from gsjax.methods.motion_parts.refine import RefineBatch as PartsBatch
-from gsjax.methods.motion_parts.refine import RefineParams, refine_step
-from gsjax.methods.motion_parts.stream import StreamParams, skinning_weights, stream_loss
-from gsjax.methods.object_tracker import AlignConfig, track
-from gsjax.methods.object_tracker.config import RefineConfig
-from gsjax.methods.object_tracker.motion import Motion
-from gsjax.methods.object_tracker.refine import refine, refine_loss
-from gsjax.methods.reconstruction import Batch, FitConfig, StartConfig, begin, fit, fit_loss
-from gsjax.methods.reconstruction.fit import _observe
-from gsjax.methods.surgical import (
+from gsjax.methods.parts.config import PartsConfig, StreamConfig
+from gsjax.methods.parts.refine import RefineBatch as PartsBatch
+from gsjax.methods.parts.refine import RefineParams, refine_step
+from gsjax.methods.parts.stream import StreamParams, skinning_weights, stream_loss
+from gsjax.methods.track import AlignConfig, track
+from gsjax.methods.track.config import RefineConfig
+from gsjax.methods.track.motion import Motion
+from gsjax.methods.track.refine import refine, refine_loss
+from gsjax.methods.fit import Batch, FitConfig, StartConfig, begin, fit, fit_loss
+from gsjax.methods.fit.method import _observe
+from gsjax.methods.deform import (
     Look,
-    SurgicalConfig,
-    begin_surgical,
+    DeformConfig,
+    begin_deform,
     reconstruct,
-    surgical_loss,
+    deform_loss,
     with_field,
 )
 from gsjax.scene.deformation import DeformationConfig
@@ -228,11 +228,11 @@ class TestOtherMethods:
     @pytest.mark.slow
     def test_of_a_deforming_scene(self, photographs):
         looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
-        config = SurgicalConfig(start_pixels=2.0, deformation=TINY)
-        problem, state = begin_surgical(looks, config)
+        config = DeformConfig(start_pixels=2.0, deformation=TINY)
+        problem, state = begin_deform(looks, config)
         batch = problem.batches[0]._replace(plan=problem.plan)
         scene, *_ = with_field(problem, state.scene)
-        added = slope_added(lambda extra: surgical_loss(config, problem.radius, extra), scene, batch)
+        added = slope_added(lambda extra: deform_loss(config, problem.radius, extra), scene, batch)
         np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
         assert np.any(added.field.layers[-1].weight)  # through the deformation
 
@@ -248,8 +248,8 @@ class TestOtherMethods:
         assert calls == calls[:1] * 4
 
         looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
-        config = SurgicalConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
-        for advanced in reconstruct(*begin_surgical(looks, config), extra_losses=(height,)):
+        config = DeformConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
+        for advanced in reconstruct(*begin_deform(looks, config), extra_losses=(height,)):
             assert np.isfinite(advanced.info["extra"]["height"])
         assert advanced.state.step == 2
 
@@ -274,13 +274,13 @@ class TestMistakes:
     def test_a_list_is_refused_by_loops(self, table, started, config, photographs):
         _, frames, _ = table()
         problem, state = begin(photographs, FIT)
-        surgical = SurgicalConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
+        surgical = DeformConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
         looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
         given = {"extra_losses": [nothing]}
         loops = (
             track(started, frames[0], frames[1:], config, **given),
             fit(problem, state, **given),
-            reconstruct(*begin_surgical(looks, surgical), **given),
+            reconstruct(*begin_deform(looks, surgical), **given),
         )
         for loop in loops:
             with pytest.raises(ValueError, match="extra_losses: expected a tuple of functions"):

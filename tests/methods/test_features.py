@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import gsjax.methods.object_tracker.features
+import gsjax.methods.track.features
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     FeatureBatch,
     Pose,
     TrackedScene,
@@ -132,7 +132,7 @@ def test_pixels_that_are_not_finite_do_not_count(little, maps):
 
 
 def test_many_channels_are_done_a_few_at_a_time(little, maps, monkeypatch):
-    monkeypatch.setattr(gsjax.methods.object_tracker.features, "_CHANNELS", 3)
+    monkeypatch.setattr(gsjax.methods.track.features, "_CHANNELS", 3)
     mixed = (maps @ np.random.default_rng(1).normal(size=(3, 7))).astype(np.float32)
     many = distill_features(*little, mixed)
     assert many.shape == (COUNT, 7)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.spherical_harmonics import SH_C0
-from gsjax.methods.object_tracker import first_pose, render_labels
-from gsjax.methods.object_tracker.config import GrowConfig
-from gsjax.methods.object_tracker.grow import (
+from gsjax.methods.track import first_pose, render_labels
+from gsjax.methods.track.config import GrowConfig
+from gsjax.methods.track.grow import (
     EMPTY,
     _nearest,
     _some_of,
@@ -20,7 +20,7 @@ from gsjax.methods.object_tracker.grow import (
     unexplained,
     with_slots,
 )
-from gsjax.methods.object_tracker.layers import shown_by
+from gsjax.methods.track.layers import shown_by
 from gsjax.metrics.tracking import true_labels
 from gsjax.scene.render import plan_render, render
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.object_tracker import first_pose, render_labels
-from gsjax.methods.object_tracker.layers import (
+from gsjax.methods.track import first_pose, render_labels
+from gsjax.methods.track.layers import (
     Backdrop,
     background_of,
     draw_backdrop,

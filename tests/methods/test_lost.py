@@ -12,24 +12,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax.geometry.cameras import camera_centers
-from gsjax.methods.object_tracker import GrowConfig, RefineConfig, first_pose, track
-from gsjax.methods.object_tracker.align import coarse_shifts
-from gsjax.methods.object_tracker.config import AlignConfig
-from gsjax.methods.object_tracker.firsts import Firsts, all_facing, as_facing, as_last_seen, firsts_of, radii
-from gsjax.methods.object_tracker.layers import Shown
-from gsjax.methods.object_tracker.lost import FOUND, LOST, confidence, is_found
-from gsjax.methods.object_tracker.motion import facing
-from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, sight_of
-from gsjax.methods.object_tracker.recover import (
-    Around,
-    Elsewhere,
+from gsjax.methods.track import GrowConfig, RefineConfig, first_pose, track
+from gsjax.methods.track.align import coarse_shifts
+from gsjax.methods.track.config import AlignConfig
+from gsjax.methods.track.reference import ReferencePoints, all_facing, as_facing, as_last_seen, reference_points, radii
+from gsjax.methods.track.layers import Shown
+from gsjax.methods.track.lost import FOUND, LOST, confidence, is_found
+from gsjax.methods.track.motion import facing
+from gsjax.methods.track.points import Points, carry, pixels_of_groups, sight_of
+from gsjax.methods.track.recover import (
+    SearchContext,
+    Relocation,
     depths_of_others,
     guesses,
     recover,
     since,
-    with_strangers,
+    with_unexplained,
 )
-from gsjax.methods.object_tracker.tracker import has_turn
+from gsjax.methods.track.update import in_search_round
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -114,17 +114,17 @@ def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera
     pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
     group = np.asarray(started.labels[: started.num_moving])
     config = replace(quick.align, centers=int(np.bincount(group).max()))
-    firsts = firsts_of(started, pose, config)
+    reference = reference_points(started, pose, config)
     nothing = jnp.zeros((2, cameras.height, cameras.width))
     unseen = Shown(nothing.astype(int), nothing, nothing > 0)
-    assert not as_last_seen(firsts, unseen, cameras, GAP).seen.any()
+    assert not as_last_seen(reference, unseen, cameras, GAP).seen.any()
     sight = sight_of(frames[0], config.shading)
-    asked = all_facing(firsts, jnp.zeros((count, 6)), jnp.zeros((count, 3)), sight)
+    asked = all_facing(reference, jnp.zeros((count, 6)), jnp.zeros((count, 3)), sight)
     faces = facing(started, pose, camera_centers(cameras.viewmat))[:, : started.num_moving] > 0.5
     for k in range(count):
         np.testing.assert_array_equal(asked.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
     about = jnp.array([0.0, 0.0, 0.1])
-    around = as_facing(jax.tree.map(lambda a: a[0], firsts), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight)
+    around = as_facing(jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight)
     assert float((around.seen != asked.seen[0]).sum()) > 0  # what turns away faces them no more
 
 
@@ -139,23 +139,23 @@ def test_strangers_are_nearer_than_what_is_modelled(carton):
     sight, _ = carton
     model = jnp.full(sight.depths.shape, 0.9)
     shown = Shown(jnp.ones(model.shape, jnp.int32), model, model > 0)
-    found = with_strangers(shown, sight, 1, GAP, GAP, 1)
+    found = with_unexplained(shown, sight, 1, GAP, GAP, 1)
     strange = np.asarray((sight.depths > 0) & (sight.depths < 0.9 - GAP))
     assert 0 < strange.mean() < 1
     np.testing.assert_array_equal(found.labels, np.where(strange, 2, 1))
     np.testing.assert_array_equal(found.depths, np.where(strange, sight.depths, 0.9))
-    thick = with_strangers(shown, sight, 1, GAP, 0.1, 1)  # a group explains what is a little nearer
+    thick = with_unexplained(shown, sight, 1, GAP, 0.1, 1)  # a group explains what is a little nearer
     np.testing.assert_array_equal(thick.labels == 2, np.asarray((sight.depths > 0) & (sight.depths < 0.8)))
     blind = sight._replace(pixels=sight.tones)
-    assert with_strangers(shown, blind, 1, GAP, GAP, 1) is shown
+    assert with_unexplained(shown, blind, 1, GAP, GAP, 1) is shown
 
 
 @pytest.fixture(scope="module")
 def one(table, started, quick):
     """(the carton's first Gaussians, their centre, what is seen then, which pixels show the carton)."""
     sequence, (frame, *_), _ = table()
-    firsts = firsts_of(started, first_pose(started), quick.align)
-    mine = jax.tree.map(lambda a: a[started.label_ids.index(CARTON) - 1], firsts)
+    reference = reference_points(started, first_pose(started), quick.align)
+    mine = jax.tree.map(lambda a: a[started.label_ids.index(CARTON) - 1], reference)
     center = (mine.means * mine.real).sum(-1) / mine.real.sum()
     shown = jnp.stack([sequence.mask(0, c) == CARTON for c in range(2)])
     return mine, center, sight_of(frame, quick.align.shading), shown
@@ -167,58 +167,58 @@ def strangers_of(sight, strange) -> Points:
 
 
 def test_guesses_bring_points_to_strangers_or_stay_near(one):
-    firsts, center, sight, shown = one
-    config, hunch = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
-    strangers, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
+    reference, center, sight, shown = one
+    config, guess = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
+    unexplained_pixels, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
 
-    def draw(seed, strangers=strangers, config=config):
-        return guesses(jax.random.key(seed), shifts, firsts, center, strangers, hunch, config)
+    def draw(seed, unexplained_pixels=unexplained_pixels, config=config):
+        return guesses(jax.random.key(seed), shifts, reference, center, unexplained_pixels, guess, config)
 
     drawn = [draw(0), draw(0), draw(1)]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert np.abs(drawn[0] - drawn[2]).max() > 0.1
-    np.testing.assert_allclose(drawn[0][::4, :3], hunch[:3] + shifts[::4, :3] / 2, atol=1e-6)
+    np.testing.assert_allclose(drawn[0][::4, :3], guess[:3] + shifts[::4, :3] / 2, atol=1e-6)
     np.testing.assert_array_equal(drawn[0][2::4, :3], shifts[2::4, :3])
-    places = np.asarray(strangers.means).transpose(0, 2, 1)[np.asarray(strangers.seen) > 0]
+    places = np.asarray(unexplained_pixels.means).transpose(0, 2, 1)[np.asarray(unexplained_pixels.seen) > 0]
     for twist in drawn[0][1:20:2]:
-        reached = np.asarray(as_facing(firsts, twist, center, sight).means)[0].T[np.asarray(firsts.real)]
+        reached = np.asarray(as_facing(reference, twist, center, sight).means)[0].T[np.asarray(reference.real)]
         assert np.linalg.norm(reached[:, None] - places, axis=-1).min() < 1e-5
-    nowhere = strangers._replace(seen=jnp.zeros_like(strangers.seen))
+    nowhere = unexplained_pixels._replace(seen=jnp.zeros_like(unexplained_pixels.seen))
     np.testing.assert_array_equal(draw(0, nowhere)[1::2, :3], shifts[1::2, :3])
     unturned = draw(0, config=replace(config, max_turn=0.0))
     np.testing.assert_array_equal(unturned[1:4, 3:], 0)
     np.testing.assert_allclose(
-        unturned[::4, 3:], jnp.broadcast_to(hunch[3:], unturned[::4, 3:].shape), atol=1e-6
+        unturned[::4, 3:], jnp.broadcast_to(guess[3:], unturned[::4, 3:].shape), atol=1e-6
     )
 
 
 def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one):
-    """From 15 cm and 57 degrees off; each frame goes on from the last one's hunch."""
-    firsts, center, sight, shown = one
+    """From 15 cm and 57 degrees off; each frame goes on from the last one's guess."""
+    reference, center, sight, shown = one
     off = jnp.array([0.1, -0.1, 0.05, 0.0, 0.0, 1.0])
-    lost = firsts._replace(
-        means=carry(Points(firsts.means, firsts.tones, firsts.real), off, center).means,
-        normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), firsts.normals),
+    lost = reference._replace(
+        means=carry(Points(reference.means, reference.tones, reference.real), off, center).means,
+        normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), reference.normals),
     )
     others, config = jnp.where(shown, 0.0, sight.depths), AlignConfig()
-    strangers = strangers_of(sight, shown)
+    unexplained_pixels = strangers_of(sight, shown)
     look = jax.jit(
-        lambda seed, hunch, around: recover(
-            jax.random.key(seed), lost, center + off[:3], hunch, around, config, GAP
+        lambda seed, guess, around: recover(
+            jax.random.key(seed), lost, center + off[:3], guess, around, config, GAP
         )
     )
 
     def after(frames, others, start=0 * off):
-        found = Elsewhere(start, None, None)
+        found = Relocation(start, None, None)
         for seed in range(frames):
-            found = look(seed, found.twists, Around(sight, None, others, strangers))
+            found = look(seed, found.twists, SearchContext(sight, None, others, unexplained_pixels))
         return found
 
     found = after(8, others)
     back = as_facing(lost, found.twists, center + off[:3], sight).means[0]
-    assert float(jnp.linalg.norm(back - firsts.means, axis=0)[firsts.real].max()) < 0.01
+    assert float(jnp.linalg.norm(back - reference.means, axis=0)[reference.real].max()) < 0.01
     showed = confidence(
-        jax.tree.map(lambda a: a[None], as_facing(firsts, 0 * off, center, sight)), sight, GAP
+        jax.tree.map(lambda a: a[None], as_facing(reference, 0 * off, center, sight)), sight, GAP
     ).shows
     assert is_found(jax.tree.map(lambda a: a[None], found.sure), showed)[0]
     assert is_found(jax.tree.map(lambda a: a[None], found.before), showed)[0]
@@ -247,8 +247,8 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
 def test_radii_are_of_those_that_there_are():
     means = jnp.zeros((2, 3, 4)).at[0, 0].set(jnp.array([3.0, 5.0, 1.0, 9.0])).at[1, 2, 0].set(7.0)
     real = jnp.array([[True, True, False, False], [False] * 4])
-    firsts = Firsts(means, means, means, real)
-    found = radii(firsts, jnp.array([[4.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
+    reference = ReferencePoints(means, means, means, real)
+    found = radii(reference, jnp.array([[4.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(found, [5**0.5, 0.0], rtol=1e-6)
 
 
@@ -261,7 +261,7 @@ def test_depths_of_others_are_those_of_what_is_not_in_doubt(carton):
 
 
 def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
-    turns = np.array([has_turn(jnp.int32(count), 3) for count in range(8)])
+    turns = np.array([in_search_round(jnp.int32(count), 3) for count in range(8)])
     np.testing.assert_array_equal(turns[:, 0], [True, True, False, False] * 2)
     np.testing.assert_array_equal(turns[:, 1], ~turns[:, 0])
     np.testing.assert_array_equal(turns[:, 2], turns[:, 0])

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at, project
-from gsjax.methods.object_tracker.config import MatchConfig
-from gsjax.methods.object_tracker.matching import Match, Template, correlate, lift, match_templates
+from gsjax.methods.track.config import MatchConfig
+from gsjax.methods.track.matching import Match, Template, correlate, lift, match_templates
 from gsjax.scene.frame import Frame
 
 WIDTH, HEIGHT = 64, 48

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.object_tracker.motion import (
+from gsjax.methods.track.motion import (
     Motion,
     Pose,
     facing,
@@ -17,7 +17,7 @@ from gsjax.methods.object_tracker.motion import (
     move,
     place,
 )
-from gsjax.methods.object_tracker.scene import TrackedScene
+from gsjax.methods.track.scene import TrackedScene
 from gsjax.scene.gaussians import gaussians_from_activated
 
 GROUPS = np.array([1, 2, 1, 2, 2, 1, 1])

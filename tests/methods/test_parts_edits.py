@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.joints import Joint, fit_joint
-from gsjax.methods.motion_parts import edits
-from gsjax.methods.motion_parts.trajectory import gaussians_at, moment, still
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.trajectory import gaussians_at, moment, still
 from tests.methods.made_up_parts import (
     CENTERS,
     STEP,

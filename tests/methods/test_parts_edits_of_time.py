@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.joints import Joint
-from gsjax.methods.motion_parts import edits
-from gsjax.methods.motion_parts.trajectory import still
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.trajectory import still
 from tests.methods.made_up_parts import (
     CENTERS,
     STEP,

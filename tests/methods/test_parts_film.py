@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.motion_parts import edits
-from gsjax.methods.motion_parts.film import Layer, composite, film_gaussians, placed, trimmed
-from gsjax.methods.motion_parts.trajectory import gaussians_at, moment
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.film import Layer, composite, film_gaussians, placed, trimmed
+from gsjax.methods.parts.trajectory import gaussians_at, moment
 from gsjax.scene.gaussians import concatenate
 from tests.methods.made_up_parts import STEP, assert_same, scene_of, trajectory
 

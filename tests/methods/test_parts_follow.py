@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.motion_parts import (
+from gsjax.methods.parts import (
     BACKGROUND,
     DiscoverConfig,
     PartsConfig,
@@ -23,8 +23,8 @@ from gsjax.methods.motion_parts import (
     outcome,
     without_needless,
 )
-from gsjax.methods.motion_parts.finish import given, settled, touching
-from gsjax.methods.motion_parts.follow import joined, order_of_frames
+from gsjax.methods.parts.finish import given, settled, touching
+from gsjax.methods.parts.follow import joined, order_of_frames
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import skin
 from tests.methods.moving_boxes import Box, MovingBoxes, linear

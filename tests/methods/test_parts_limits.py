@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax.geometry.joints import Joint
-from gsjax.methods.motion_parts import edits
-from gsjax.methods.motion_parts.film import Layer
-from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.film import Layer
+from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
 from tests.methods.made_up_parts import STEP, jointed, scene_of, trajectory
 
 TIMES = STEP * np.arange(9.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsjax.methods.motion_parts import (
+from gsjax.methods.parts import (
     DiscoverConfig,
     PartsConfig,
     RefineConfig,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.methods.motion_parts.entries import key_of
-from gsjax.methods.motion_parts.operations import (
+from gsjax.methods.parts.entries import key_of
+from gsjax.methods.parts.operations import (
     OPERATIONS,
     Amplify,
     Composite,
@@ -24,8 +24,8 @@ from gsjax.methods.motion_parts.operations import (
     Scale,
     Speed,
 )
-from gsjax.methods.motion_parts.signatures import explained, first_line
-from gsjax.methods.motion_parts.timeline import Script, parse_op, parse_script, to_yaml
+from gsjax.methods.parts.signatures import explained, first_line
+from gsjax.methods.parts.timeline import Script, parse_op, parse_script, to_yaml
 
 EXAMPLE = """
 fps: 8

@@ -5,18 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.motion_parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
-from gsjax.methods.motion_parts.config import DiscoverConfig, PartsConfig
-from gsjax.methods.motion_parts.discover import begin, pixel_width
-from gsjax.methods.motion_parts.lift import label_votes, lift_masks
-from gsjax.methods.motion_parts.masks import (
+from gsjax.methods.parts.anchor import Anchor, choose_anchor, difference_image, moved_pixels
+from gsjax.methods.parts.config import DiscoverConfig, PartsConfig
+from gsjax.methods.parts.discover import begin, pixel_width
+from gsjax.methods.parts.lift import label_votes, lift_masks
+from gsjax.methods.parts.masks import (
     masks_of_labels,
     moving_segments,
     order_of_views,
     propagated_masks,
 )
-from gsjax.methods.motion_parts.stream import skinning_weights
-from gsjax.methods.motion_parts.weights import new_field, saying, weights_of
+from gsjax.methods.parts.stream import skinning_weights
+from gsjax.methods.parts.weights import new_field, saying, weights_of
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.render import plan_render
 from tests.methods.moving_boxes import Box, MovingBoxes, linear

@@ -10,10 +10,10 @@ import numpy as np
 import optimistix
 import pytest
 
-from gsjax.methods.motion_parts.config import PartsConfig, StreamConfig
-from gsjax.methods.motion_parts.residual import pose_residual
-from gsjax.methods.motion_parts.screws import motions_of, pose_of
-from gsjax.methods.motion_parts.stream import (
+from gsjax.methods.parts.config import PartsConfig, StreamConfig
+from gsjax.methods.parts.residual import pose_residual
+from gsjax.methods.parts.screws import motions_of, pose_of
+from gsjax.methods.parts.stream import (
     StreamParams,
     posed,
     skinning_weights,
@@ -21,7 +21,7 @@ from gsjax.methods.motion_parts.stream import (
     stream_step,
     tearing,
 )
-from gsjax.methods.motion_parts.weights import SimplexTable, new_field
+from gsjax.methods.parts.weights import SimplexTable, new_field
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import FeatureGridConfig

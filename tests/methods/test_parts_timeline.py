@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.methods.motion_parts import edits
-from gsjax.methods.motion_parts.film import Layer, film_gaussians
-from gsjax.methods.motion_parts.operations import (
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.film import Layer, film_gaussians
+from gsjax.methods.parts.operations import (
     Amplify,
     Composite,
     Echo,
@@ -23,8 +23,8 @@ from gsjax.methods.motion_parts.operations import (
     Scale,
     Speed,
 )
-from gsjax.methods.motion_parts.timeline import Script, apply, parse_script
-from gsjax.methods.motion_parts.trajectory import PartScene
+from gsjax.methods.parts.timeline import Script, apply, parse_script
+from gsjax.methods.parts.trajectory import PartScene
 from tests.methods.made_up_parts import STEP, assert_same, rows, scene_of, trajectory
 from tests.methods.test_parts_scripts import EXAMPLE
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from gsjax.methods.motion_parts.trajectory import (
+from gsjax.methods.parts.trajectory import (
     Moment,
     PartScene,
     Trajectory,

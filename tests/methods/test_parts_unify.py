@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsjax.methods.motion_parts.unify import best_cut, extent, gap, motions_of, unified
+from gsjax.methods.parts.unify import best_cut, extent, gap, motions_of, unified
 
 T = 6
 seeds = st.integers(0, 10_000)

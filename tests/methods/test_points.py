@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.methods.object_tracker.points import (
+from gsjax.methods.track.points import (
     Points,
     carry_keyframe,
     faded,

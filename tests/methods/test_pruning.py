@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsjax.geometry.cameras import intrinsics, look_at
-from gsjax.methods.reconstruction import View, light_of, needed
+from gsjax.methods.fit import View, light_of, needed
 from gsjax.rasterize.reference import rasterization_reference
 from gsjax.scene.gaussians import gaussians_from_activated
 

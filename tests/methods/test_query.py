@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.methods.object_tracker import find_object
+from gsjax.methods.track import find_object
 
 OBJECTS = jnp.array([[3.0, 0.0], [1.0, 1.0], [0.0, 0.0]])
 

@@ -8,9 +8,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from gsjax.methods.object_tracker.config import RefineConfig
-from gsjax.methods.object_tracker.motion import Motion
-from gsjax.methods.object_tracker.refine import refine_loss, refine_residual
+from gsjax.methods.track.config import RefineConfig
+from gsjax.methods.track.motion import Motion
+from gsjax.methods.track.refine import refine_loss, refine_residual
 from gsjax.optim.least_squares import least_squares_step
 from gsjax.scene.frame import Frame
 from tests.methods.ball_before_wall import OBJECT, batch_after

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.methods.object_tracker import first_pose, place
-from gsjax.methods.object_tracker.plan import Needed, TrackerPlan
-from gsjax.methods.object_tracker.region import near_background, near_scene, shift_background, spread
+from gsjax.methods.track import first_pose, place
+from gsjax.methods.track.plan import Needed, TrackPlan
+from gsjax.methods.track.region import near_background, near_scene, shift_background, spread
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render, render
@@ -40,11 +40,11 @@ def test_touched_tiles_hold_the_points_and_their_neighbours(table):
 
 
 def test_a_plan_grows_to_the_lowest_rungs_that_hold_what_was_needed():
-    plan = TrackerPlan(Plan(96, 72, rung(1)), Plan(96, 72, rung(5000)), rung(1))
+    plan = TrackPlan(Plan(96, 72, rung(1)), Plan(96, 72, rung(5000)), rung(1))
     needed = Needed(jnp.array(7000), jnp.array(100), jnp.array(9000))
     assert needed.exceeds(plan)
     grown = plan.grown(needed, 1.5)
-    assert grown == TrackerPlan(Plan(96, 72, rung(10500)), Plan(96, 72, rung(5000)), rung(13500))
+    assert grown == TrackPlan(Plan(96, 72, rung(10500)), Plan(96, 72, rung(5000)), rung(13500))
     assert not needed.exceeds(grown)
     assert grown.grown(needed, 1.5) == grown
     assert hash(grown) == hash(grown.grown(needed, 1.0))

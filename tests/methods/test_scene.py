@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import camera_centers
-from gsjax.methods.object_tracker import first_pose
-from gsjax.methods.object_tracker.config import StartConfig
-from gsjax.methods.object_tracker.motion import facing
-from gsjax.methods.object_tracker.scene import labelled_cloud, scene_from_cloud
+from gsjax.methods.track import first_pose
+from gsjax.methods.track.config import StartConfig
+from gsjax.methods.track.motion import facing
+from gsjax.methods.track.scene import labelled_cloud, scene_from_cloud
 
 START = StartConfig(iterations=0)
 

@@ -8,10 +8,10 @@ import jaxlie
 import numpy as np
 import pytest
 
-from gsjax.methods.object_tracker.lost import Confidence
-from gsjax.methods.object_tracker.points import Points, carry, pixels_of_groups, tones
-from gsjax.methods.object_tracker.recover import Elsewhere
-from gsjax.methods.object_tracker.search import (
+from gsjax.methods.track.lost import Confidence
+from gsjax.methods.track.points import Points, carry, pixels_of_groups, tones
+from gsjax.methods.track.recover import Relocation
+from gsjax.methods.track.search import (
     TELLS_TURN,
     Sought,
     first_watch,
@@ -104,7 +104,7 @@ def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
     def searched(**changes) -> Sought:
         watch = first_watch(jnp.ones(1))._replace(**changes)
         how = (replace(CONFIG, iterations=3), watch, yes, jnp.int32(1), yes)
-        nowhere = Elsewhere(jnp.ones(6), sure, sure)
+        nowhere = Relocation(jnp.ones(6), sure, sure)
         return search(jnp.zeros((1, 1, 6)), points, centers, given[2], *how, lambda _: nowhere)
 
     followed = searched(usual=jnp.array([0.05]))

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.object_tracker import scene_from_shapes
-from gsjax.methods.object_tracker.shapes import Shape, find_pose
+from gsjax.methods.track import scene_from_shapes
+from gsjax.methods.track.shapes import Shape, find_pose
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import concatenate, gaussians_from_activated
 from gsjax.scene.render import plan_render, render

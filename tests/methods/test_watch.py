@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.methods.object_tracker.lost import Confidence
-from gsjax.methods.object_tracker.recover import Elsewhere
-from gsjax.methods.object_tracker.search import TELLS_TURN, Found, Sought, first_watch
+from gsjax.methods.track.lost import Confidence
+from gsjax.methods.track.recover import Relocation
+from gsjax.methods.track.search import TELLS_TURN, Found, Sought, first_watch
 
 
 def test_a_watch_knows_what_is_usual_and_who_waits():
@@ -27,7 +27,7 @@ def nothing_of(looked_for, leads=jnp.inf):
     found, none = Found(still, still[:, 0]), still[:, 0]
     sure = Confidence(none, none, none > 0)
     leads = jnp.broadcast_to(jnp.asarray(leads), len(still))
-    return Sought(found, jnp.array(looked_for), Elsewhere(still, sure, sure), none > 0, leads)
+    return Sought(found, jnp.array(looked_for), Relocation(still, sure, sure), none > 0, leads)
 
 
 def test_what_is_lost_is_found_only_when_it_shows_itself():

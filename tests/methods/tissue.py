@@ -5,18 +5,18 @@ from functools import cache
 import numpy as np
 
 import gsjax
-from gsjax.methods.surgical import GraphConfig, Look, SurgicalConfig, SurgicalRatesConfig
+from gsjax.methods.deform import GraphConfig, Look, DeformConfig, DeformRatesConfig
 from gsjax.scene.deformation import DeformationConfig
 
 CODES = np.eye(2, 4)
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
-CONFIG = SurgicalConfig(
+CONFIG = DeformConfig(
     warmup=8,
     iterations=70,
     start_pixels=1.0,
     nodes=64,
     channels=4,
-    rates=SurgicalRatesConfig(planes=3e-2, layers=1e-2, features=3e-2),
+    rates=DeformRatesConfig(planes=3e-2, layers=1e-2, features=3e-2),
     deformation=TINY,
     graph=GraphConfig(nodes=24, neighbors=3, matches=2, window=1),
 )

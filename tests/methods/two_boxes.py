@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.methods.motion_parts.stream import Canonical, Seen, StreamBatch
+from gsjax.methods.parts.stream import Canonical, Seen, StreamBatch
 from gsjax.scene.feature_grid import locate
 from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose, at_rest

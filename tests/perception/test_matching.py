@@ -82,8 +82,8 @@ def test_photographs_that_share_nothing(wall):
     same_place = np.tile(viewmats[:1], (4, 1, 1))
     assert len(match_points(pictures, same_place, Ks).points) == 0
     others = wall_seen_from(EYES[1:2], seed=1)[0]
-    strangers = match_points([pictures[0], *others], viewmats[:2], Ks[:2])
-    assert len(strangers.points) < 5
+    unexplained_pixels = match_points([pictures[0], *others], viewmats[:2], Ks[:2])
+    assert len(unexplained_pixels.points) < 5
     alone = match_points(pictures[:1], viewmats[:1], Ks[:1])
     assert len(alone.points) == 0
 

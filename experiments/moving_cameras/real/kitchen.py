@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from gsjax.data import Sequence, read_seven_scenes
-from gsjax.methods.object_tracker import PRESETS, first_pose, start_scene, track
+from gsjax.methods.track import PRESETS, first_pose, start_scene, track
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")

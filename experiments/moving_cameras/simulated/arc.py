@@ -14,11 +14,11 @@ import numpy as np
 from gsjax.cli.track.results import MOVED_MM
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     PRESETS,
     Tracked,
     TrackedScene,
-    TrackerConfig,
+    TrackConfig,
     first_pose,
     start_scene,
     track,
@@ -56,14 +56,14 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     return found | {"camera_turned_deg": turned.max()}
 
 
-def started(recording: Sequence, config: TrackerConfig) -> TrackedScene:
+def started(recording: Sequence, config: TrackConfig) -> TrackedScene:
     """The scene at the first frame, with the true mask of one camera."""
     mask = recording.mask(0, MASK_CAMERA)
     assert mask is not None
     return start_scene(recording.frame(0), mask, MASK_CAMERA, config)
 
 
-def followed(scene: TrackedScene, recording: Sequence, config: TrackerConfig) -> Iterator[Tracked]:
+def followed(scene: TrackedScene, recording: Sequence, config: TrackConfig) -> Iterator[Tracked]:
     """One update a frame, each when it is asked for."""
     return track(scene, recording.frame(0), (recording.frame(t) for t in range(1, FRAMES)), config)
 

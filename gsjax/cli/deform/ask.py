@@ -14,7 +14,7 @@ from gsjax.cli.deform.file import NAME, StoredDeformation, read_deformation, war
 from gsjax.cli.messages import Notes, stage
 from gsjax.cli.options import Common
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     QUESTIONS,
     Question,
     SceneFacts,

@@ -29,11 +29,11 @@ from gsjax.data import Photographs
 from gsjax.data.open import is_of_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_in_time
 from gsjax.io.ply import write_ply
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     PRESETS,
-    SurgicalConfig,
-    SurgicalState,
-    begin_surgical,
+    DeformConfig,
+    DeformState,
+    begin_deform,
     of_step,
     reconstruct,
 )
@@ -63,7 +63,7 @@ class Options(TeacherOptions, OfDataset):
     depth: Depth = "auto"
     """Where depth is from: data (files), stereo (camera to learn from and the next one are matched) or plane
     (none: the scene begins on one, and its depth is of no unit). auto: the first of these that there is."""
-    deform: SurgicalConfig = field(default_factory=lambda: PRESETS["surst"])
+    deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
     """How it is learned."""
 
 
@@ -98,7 +98,7 @@ def run(options: Options) -> int:
             console.print(f"{only}; for gsjax query and ask: --tools draw, or --features", soft_wrap=True)
         config = options.deform
         with stage(console, "placing the first Gaussians"):
-            problem, state = begin_surgical(data.looks, config, data.codes, data.first)
+            problem, state = begin_deform(data.looks, config, data.codes, data.first)
         learning = Learning(state, {"frames, depth, masks, poses and features": data.digest()})
         if options.resume:
             learning = load(folder.resume, learning, lambda first, step: of_step(problem, first, step))
@@ -179,7 +179,7 @@ def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) 
     )
 
 
-def write_scene(folder: RunFolder, state: SurgicalState, data: DeformData, metric: bool = True) -> None:
+def write_scene(folder: RunFolder, state: DeformState, data: DeformData, metric: bool = True) -> None:
     """Writes deformation.npz, and scene.ply, the scene as it was at the first frame.
 
     Args:

@@ -15,7 +15,7 @@ from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.messages import Notes
 from gsjax.data import Sequence
 from gsjax.data.tool_masks import TISSUE, is_tool
-from gsjax.methods.surgical import Look, begins, counted_ids
+from gsjax.methods.deform import Look, begins, counted_ids
 
 Tools = Literal["leave-out", "draw"]
 _OF_CLASSES = ("auto", "classes")

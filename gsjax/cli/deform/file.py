@@ -17,7 +17,7 @@ from gsjax.cli.distill.source import Source
 from gsjax.cli.messages import Notes
 from gsjax.geometry.cameras import Camera
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
-from gsjax.methods.surgical import DeformingScene, Moving
+from gsjax.methods.deform import DeformingScene, Moving
 from gsjax.scene.deformation import DeformationConfig, Nodes, init_deformation
 from gsjax.scene.gaussians import Gaussians
 

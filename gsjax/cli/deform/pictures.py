@@ -18,7 +18,7 @@ from gsjax.cli.run.pictures import frame_rate
 from gsjax.geometry.cameras import Camera
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
-from gsjax.methods.surgical.query import most_likely, prompt_probabilities
+from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room

@@ -9,14 +9,14 @@ from gsjax.cli.deform.data import DeformData
 from gsjax.cli.messages import Notes
 from gsjax.cli.run.folder import RunFolder
 from gsjax.io.atomic import write_npz
-from gsjax.methods.surgical import DeformingScene, SurgicalProblem, refined_viewmats
+from gsjax.methods.deform import DeformingScene, DeformProblem, refined_viewmats
 
 NAME = "poses.npz"
 """View matrices that were found, of all frames and cameras, in the folder of a run."""
 
 
 def as_refined(
-    folder: RunFolder, problem: SurgicalProblem, scene: DeformingScene, data: DeformData, notes: Notes
+    folder: RunFolder, problem: DeformProblem, scene: DeformingScene, data: DeformData, notes: Notes
 ) -> tuple[DeformData, dict[str, Any] | None]:
     """The data with poses as they were found, which are also written, and what metrics.json says of them; the
     data themselves and None where poses stand as given."""

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsjax.cli.deform.teacher import Meaning
-from gsjax.methods.feature_field import Threshold, relevancy, threshold_for
+from gsjax.methods.distill import Threshold, relevancy, threshold_for
 from gsjax.methods.protocols import LanguageEncoder
-from gsjax.methods.surgical.query import like_feature, prompt_cosines
-from gsjax.methods.surgical.questions import plain_words
+from gsjax.methods.deform.query import like_feature, prompt_cosines
+from gsjax.methods.deform.questions import plain_words
 
 
 class Wanted(NamedTuple):

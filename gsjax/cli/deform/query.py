@@ -22,7 +22,7 @@ from gsjax.cli.recording import parse_frames
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.surgical.query import most_likely, region_feature
+from gsjax.methods.deform.query import most_likely, region_feature
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
 from gsjax.viz.colors import INVALID, label_color

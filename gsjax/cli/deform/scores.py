@@ -17,16 +17,16 @@ from gsjax.cli.run.pictures import PANELS
 from gsjax.cli.run.scores import mean_scores
 from gsjax.geometry.cameras import Camera, pixels_of
 from gsjax.io.pictures import write_png
-from gsjax.methods.surgical import (
+from gsjax.methods.deform import (
     DeformingScene,
     Look,
     Moving,
-    SurgicalProblem,
-    SurgicalState,
+    DeformProblem,
+    DeformState,
     counted_ids,
     on_grid,
 )
-from gsjax.methods.surgical.query import prompt_probabilities
+from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim, psnr, ssim
 from gsjax.metrics.segmentation import IGNORED_LABEL, LabelOverlap
@@ -52,7 +52,7 @@ _LEAST_LONGER_SIDE = 12  # of DIS's patches
 
 
 def judge(
-    folder: RunFolder, problem: SurgicalProblem, state: SurgicalState, data: DeformData, tools: Tools
+    folder: RunFolder, problem: DeformProblem, state: DeformState, data: DeformData, tools: Tools
 ) -> dict[str, Any]:
     """Scores of held-out frames, or of some that were learned from where none is, and pictures of them."""
     memory = peak_memory_mb()  # of learning, before anything is scored

@@ -19,8 +19,8 @@ from gsjax.cli.distill.teacher import Teaching
 from gsjax.cli.messages import Notes, describe
 from gsjax.data import Photographs, Sequence
 from gsjax.data.photographs import photographs_of
-from gsjax.methods.feature_field import Teacher
-from gsjax.methods.surgical import Look, counted_ids
+from gsjax.methods.distill import Teacher
+from gsjax.methods.deform import Look, counted_ids
 from gsjax.perception.codebook import ClassCodebook
 
 GROUPS = 8

@@ -17,7 +17,7 @@ from gsjax.cli.messages import Notes, describe
 from gsjax.cli.query.selected import EXTRACTED, keep_part
 from gsjax.cli.run.files import reopen
 from gsjax.data.ordered import open_in_time
-from gsjax.methods.surgical.query import most_likely
+from gsjax.methods.deform.query import most_likely
 from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
 
 _AGAIN = "reconstruct it again with this version of gsjax"

@@ -24,7 +24,7 @@ from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, plain
 from gsjax.cli.run.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.cli.run.records import digest
-from gsjax.methods.feature_field import FieldConfig, begin_field, distill
+from gsjax.methods.distill import DistillConfig, begin_distill, distill
 
 HELP = (
     " As in `gsjax distill RUN`, or, of what others made, `gsjax distill scene.ply --images PHOTOGRAPHS "
@@ -42,11 +42,11 @@ class Options(Common, Resuming, Timed, Seeded, TeacherOptions, SceneOptions):
     """Folder for the field. Unless given, `field` in the run's."""
     second: Second = "none"
     """Who teaches beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches, by
-    the same --weights. What they count is --field.weights.map."""
+    the same --weights. What they count is --distill.weights.map."""
     snap: int = 0
     """Put outlines of masks on the picture's edges, where there are any within so many pixels: for masks
     whose outlines are off, as many segmenters' are."""
-    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    field: DistillConfig = dataclasses.field(default_factory=DistillConfig)
     """How it is learned."""
 
 
@@ -81,8 +81,8 @@ def run(options: Options) -> int:
             console.print(f"[bold]features[/]  {teaching.source.kind}: {teaching.about}", soft_wrap=True)
         with stage(console, "looking which Gaussians each view shows"):
             cameras = [photographs.camera(i) for i in scene.taught]
-            problem, state = begin_field(
-                scene.gaussians, cameras, teaching.teacher, options.field, scene.rasterize_mode
+            problem, state = begin_distill(
+                scene.gaussians, cameras, teaching.teacher, options.distill, scene.rasterize_mode
             )
         learning = Learning(
             state,
@@ -95,7 +95,7 @@ def run(options: Options) -> int:
             learning = load(folder.resume, learning)
             notes.add(f"Resumed after {learning.state.step} steps of an earlier run.")
         folder.write_config(settings)  # from here on an earlier field is gone
-        course = Course("distilling", options.field.iterations, _LOSSES, _told)
+        course = Course("distilling", options.distill.iterations, _LOSSES, _told)
         learning = learn(distill(problem, learning.state), learning, course, folder, console, options.minutes)
         told = asdict(settings)
         stored = StoredField(
@@ -112,7 +112,7 @@ def run(options: Options) -> int:
         )
         write_field(folder.path / NAME, stored)
         with stage(console, "asking it about views"):
-            judged = judge(folder, scene, teaching, stored, options.field, notes)
+            judged = judge(folder, scene, teaching, stored, options.distill, notes)
         say_if_cut_short(learning, course, notes)
         _say_what_was_odd(scene, learning, notes)
         found = {

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from gsjax.cli.distill.source import Source
 from gsjax.cli.run.files import check_arrays, read_arrays
 from gsjax.io.atomic import write_npz
-from gsjax.methods.feature_field import FeatureField
+from gsjax.methods.distill import FeatureField
 from gsjax.scene.feature_grid import FeatureGrid, FeatureGridConfig, Located, locate
 
 NAME = "field.npz"

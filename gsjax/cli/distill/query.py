@@ -20,7 +20,7 @@ from gsjax.cli.query.selected import Changes, write_scenes, write_selection
 from gsjax.cli.run.folder import OF_QUERY, replaced_folder
 from gsjax.data.photographs import Photographs
 from gsjax.io.atomic import write_json
-from gsjax.methods.feature_field import (
+from gsjax.methods.distill import (
     Threshold,
     frozen_views,
     gaussian_cosines,

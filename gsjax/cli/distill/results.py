@@ -19,7 +19,7 @@ from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.run.report import Media, Table, write_report
 from gsjax.cli.run.scores import mean_scores
 from gsjax.io.pictures import write_png
-from gsjax.methods.feature_field import FeatureField, FieldConfig, carried
+from gsjax.methods.distill import FeatureField, DistillConfig, carried
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import Located
 from gsjax.viz.colors import (
@@ -43,7 +43,7 @@ def judge(
     scene: FieldScene,
     teaching: Teaching,
     stored: StoredField,
-    config: FieldConfig,
+    config: DistillConfig,
     notes: Notes,
 ) -> dict[str, Any]:
     """Compares held-out views, or those that taught where none is held out, with what the teacher says of

@@ -11,18 +11,18 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.feature_field import (
+from gsjax.methods.distill import (
     FeatureField,
-    FieldBatch,
-    FieldConfig,
+    DistillBatch,
+    DistillConfig,
     Teacher,
     carried,
-    field_loss,
+    distill_loss,
     frozen_views,
     gaussian_cosines,
     painted_cosines,
 )
-from gsjax.methods.feature_field.teacher import most_rows, of_view
+from gsjax.methods.distill.teacher import most_rows, of_view
 from gsjax.metrics.segmentation import MaskOverlap
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, filled_up, paint_shown, rows_within, strip_of
@@ -123,18 +123,18 @@ def classes_of(
     return np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)).argmax(axis=-1))
 
 
-def angle_error(config: FieldConfig) -> Callable[[FeatureField, Located | None, Frozen, Teacher], float]:
+def angle_error(config: DistillConfig) -> Callable[[FeatureField, Located | None, Frozen, Teacher], float]:
     """1 - cosine to what a teacher of one view says, the mean over its pixels, by a program that is compiled
     once for views of one kind."""
     quiet = replace(config, weights=replace(config.weights, rec=1.0, contrast=0.0, tv=0.0))
-    loss = jax.jit(partial(field_loss(quiet), step=0, key=None), compiler_options=host_options())
+    loss = jax.jit(partial(distill_loss(quiet), step=0, key=None), compiler_options=host_options())
 
     def error(field: FeatureField, located: Located | None, frozen: Frozen, teacher: Teacher) -> float:
         view, plan = frozen
         rows = 1 << (most_rows(teacher) - 1).bit_length()  # few lengths
         ids, codebook = of_view(teacher, 0, rows)
         said = None if teacher.maps is None else teacher.maps[0]
-        batch = FieldBatch(
+        batch = DistillBatch(
             view, located, jnp.asarray(ids), None if codebook is None else jnp.asarray(codebook), said, plan
         )
         return float(loss(field, batch)[1]["cos"])

@@ -16,8 +16,8 @@ from gsjax.cli.distill.choice import TeacherChoice
 from gsjax.cli.distill.source import SAID, Source
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
-from gsjax.methods.feature_field import Teacher, teacher_of_maps, teacher_of_objects, with_maps
-from gsjax.methods.feature_field.teacher import UNKNOWN_ID
+from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
+from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder, Segmenter
 from gsjax.perception.feature_files import PictureFeatures, read_feature_folder
 from gsjax.perception.outlines import snap_outlines

@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from gsjax.cli.distill.query import Question, select
 from gsjax.cli.distill.saved import FieldRun
 from gsjax.cli.query.selected import EXTRACTED, keep_part
-from gsjax.methods.feature_field import FeatureField, features_of, gaussian_cosines, threshold_for
+from gsjax.methods.distill import FeatureField, features_of, gaussian_cosines, threshold_for
 from gsjax.viz.viewer import Asking, Found
 
 

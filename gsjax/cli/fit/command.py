@@ -27,7 +27,7 @@ from gsjax.cli.run.ending import ended, exit_code, finish
 from gsjax.cli.run.folder import RunFolder
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.reconstruction import (
+from gsjax.methods.fit import (
     PRESETS,
     FitConfig,
     Model,

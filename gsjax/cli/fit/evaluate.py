@@ -28,7 +28,7 @@ from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
-from gsjax.methods.reconstruction import View
+from gsjax.methods.fit import View
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim
 from gsjax.metrics.perceptual import LpipsWeights, fingerprint, load_lpips, lpips
 from gsjax.scene.gaussians import Gaussians

@@ -12,7 +12,7 @@ from gsjax.cli.fit.resume import Saver
 from gsjax.cli.fit.tensorboard import TensorBoard
 from gsjax.cli.interrupts import hear, undisturbed
 from gsjax.cli.run.folder import RunFolder
-from gsjax.methods.reconstruction import Fitted, Problem, View, fit
+from gsjax.methods.fit import Fitted, Problem, View, fit
 
 _SHOWN_EVERY_S = 0.2
 _LOGGED_EVERY = 100  # steps

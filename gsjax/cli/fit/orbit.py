@@ -7,7 +7,7 @@ from gsjax.cli.run.folder import RunFolder
 from gsjax.geometry.cameras import Camera
 from gsjax.geometry.paths import orbit
 from gsjax.io.video import VideoWriter
-from gsjax.methods.reconstruction import Problem
+from gsjax.methods.fit import Problem
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
 

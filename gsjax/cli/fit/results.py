@@ -20,7 +20,7 @@ from gsjax.cli.run.scores import mean_scores
 from gsjax.geometry.cameras import Camera
 from gsjax.io.atomic import atomic_write
 from gsjax.io.pictures import write_png
-from gsjax.methods.reconstruction import Fitted, Problem, View
+from gsjax.methods.fit import Fitted, Problem, View
 from gsjax.metrics.image import depth_error, psnr, ssim, with_matched_colors
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import Plan

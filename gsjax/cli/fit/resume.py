@@ -9,8 +9,8 @@ from gsjax.cli.fit.results import Curve
 from gsjax.cli.run import saving
 from gsjax.cli.run.folder import RunFolder
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
-from gsjax.methods.reconstruction import FitState, Problem
-from gsjax.methods.reconstruction.fit import enlarged
+from gsjax.methods.fit import FitState, Problem
+from gsjax.methods.fit.method import enlarged
 
 KEPT = 2
 """Checkpoints that are kept: one that is damaged leaves the one before."""

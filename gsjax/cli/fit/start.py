@@ -8,7 +8,7 @@ from rich.console import Console
 
 from gsjax.cli.messages import stage
 from gsjax.data.photographs import Photographs
-from gsjax.methods.reconstruction import FitConfig, View
+from gsjax.methods.fit import FitConfig, View
 from gsjax.perception.matching import filled_up, match_points
 
 _MOST_MATCHED = 150  # photographs; of more, as many that are spread over them

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.cli.fit.results import Curve, Plans, judge
-from gsjax.methods.reconstruction import Problem, View
+from gsjax.methods.fit import Problem, View
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
 

@@ -16,7 +16,7 @@ from gsjax.cli.run.folder import expect_dataset
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.errors import MissingFile
 from gsjax.data.open import is_of_photographs, is_recording
-from gsjax.methods.reconstruction import extent_of
+from gsjax.methods.fit import extent_of
 
 PICTURES = (".png", ".svg", ".pdf")
 MOST_LABELS, MOST_CAMERAS = 8, 6  # that a table of masks shows

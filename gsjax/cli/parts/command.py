@@ -22,7 +22,7 @@ from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.data import Sequence
 from gsjax.io.ply import read_ply
-from gsjax.methods.motion_parts import (
+from gsjax.methods.parts import (
     Anchor,
     PartsConfig,
     Start,
@@ -34,7 +34,7 @@ from gsjax.methods.motion_parts import (
     without_needless,
 )
 from gsjax.methods.protocols import Segmenter
-from gsjax.methods.reconstruction import FitConfig, StartConfig
+from gsjax.methods.fit import FitConfig, StartConfig
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians

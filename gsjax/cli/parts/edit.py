@@ -13,9 +13,9 @@ from gsjax.cli.messages import Notes, stage
 from gsjax.cli.options import Common, Overwriting
 from gsjax.cli.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
 from gsjax.cli.parts.saved import open_parts_run
-from gsjax.methods.motion_parts.operation import Edit
-from gsjax.methods.motion_parts.operations import OPERATIONS, Composite
-from gsjax.methods.motion_parts.timeline import Names, Script, parse_op, parse_script
+from gsjax.methods.parts.operation import Edit
+from gsjax.methods.parts.operations import OPERATIONS, Composite
+from gsjax.methods.parts.timeline import Names, Script, parse_op, parse_script
 
 HELP = (
     f" Operations: {', '.join(OPERATIONS)}. A script is a YAML file, `edits: [{{op: speed, parts: [door], "

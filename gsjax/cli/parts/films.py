@@ -22,12 +22,12 @@ from gsjax.geometry.cameras import Camera, resized
 from gsjax.io.atomic import atomic_write, write_json
 from gsjax.io.ply import write_ply
 from gsjax.io.video import VideoWriter
-from gsjax.methods.motion_parts.film import Film, Layer, film_gaussians
-from gsjax.methods.motion_parts.limits import Beyond, beyond_captured, describe_beyond
-from gsjax.methods.motion_parts.operation import Edit
-from gsjax.methods.motion_parts.operations import label
-from gsjax.methods.motion_parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
-from gsjax.methods.motion_parts.trajectory import Trajectory
+from gsjax.methods.parts.film import Film, Layer, film_gaussians
+from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.parts.operation import Edit
+from gsjax.methods.parts.operations import label
+from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
+from gsjax.methods.parts.trajectory import Trajectory
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.handles import Blend

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.cli.messages import Notes, counted, reason
 from gsjax.data import Sequence
-from gsjax.methods.motion_parts import Parts, PartsConfig, Start, follow, refine
+from gsjax.methods.parts import Parts, PartsConfig, Start, follow, refine
 
 _LINES = 10  # of a log, about the frames of a run
 

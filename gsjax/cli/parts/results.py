@@ -24,7 +24,7 @@ from gsjax.cli.run.tables import Column, grid, table, time_table
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.motion_parts import Parts, PartScene, PartsConfig, Start, Trajectory, outcome
+from gsjax.methods.parts import Parts, PartScene, PartsConfig, Start, Trajectory, outcome
 from gsjax.viz.colors import label_color
 
 PART_COLUMNS = (

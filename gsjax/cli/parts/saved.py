@@ -14,10 +14,10 @@ import yaml
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.cli.run.folder import expect_run
-from gsjax.methods.motion_parts import PartScene, trajectory_of
-from gsjax.methods.motion_parts.film import Layer
-from gsjax.methods.motion_parts.follow import order_of_frames
-from gsjax.methods.motion_parts.timeline import Names
+from gsjax.methods.parts import PartScene, trajectory_of
+from gsjax.methods.parts.film import Layer
+from gsjax.methods.parts.follow import order_of_frames
+from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
 
 _FILES = ("parts.npz", "scene.ply", "metrics.json")

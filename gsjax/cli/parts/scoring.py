@@ -11,8 +11,8 @@ from gsjax.cli.recording import Recording
 from gsjax.cli.run.scores import motion_metrics
 from gsjax.geometry.joints import FittedJoint, fit_joint
 from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.motion_parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
-from gsjax.methods.motion_parts.unify import motions_of
+from gsjax.methods.parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
+from gsjax.methods.parts.unify import motions_of
 from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
 from gsjax.scene.handles import Blend

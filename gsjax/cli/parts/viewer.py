@@ -14,12 +14,12 @@ from gsjax.cli.messages import Notes
 from gsjax.cli.parts.films import Shot, edited, frames_of, new_folder, write_film
 from gsjax.cli.parts.saved import PartsRun
 from gsjax.cli.recording import Recording
-from gsjax.methods.motion_parts.entries import ALL
-from gsjax.methods.motion_parts.film import Film, Layer
-from gsjax.methods.motion_parts.operations import OPERATIONS
-from gsjax.methods.motion_parts.signatures import explained, first_line
-from gsjax.methods.motion_parts.timeline import Names, Script, parse_op
-from gsjax.methods.motion_parts.trajectory import BACKGROUND
+from gsjax.methods.parts.entries import ALL
+from gsjax.methods.parts.film import Film, Layer
+from gsjax.methods.parts.operations import OPERATIONS
+from gsjax.methods.parts.signatures import explained, first_line
+from gsjax.methods.parts.timeline import Names, Script, parse_op
+from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.scene.gaussians import concatenate, take
 from gsjax.scene.handles import Blend
 from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable

@@ -7,7 +7,7 @@ import jax
 
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.views import View, views_of
-from gsjax.methods.motion_parts import Moment, PartScene, Trajectory, gaussians_at, moment
+from gsjax.methods.parts import Moment, PartScene, Trajectory, gaussians_at, moment
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
 from gsjax.scene.handles import Blend

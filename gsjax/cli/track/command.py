@@ -40,7 +40,7 @@ from gsjax.cli.track.scoring import (
     turn_unknown_from,
 )
 from gsjax.cli.track.views import views
-from gsjax.methods.object_tracker import PRESETS, TrackedScene, TrackerConfig, scene_from_shapes, start_scene
+from gsjax.methods.track import PRESETS, TrackedScene, TrackConfig, scene_from_shapes, start_scene
 from gsjax.scene.frame import Frame
 
 
@@ -53,7 +53,7 @@ class Options(FirstMasks, OfRecording):
     how the scene starts and how much may join it count."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
     """The tracker's settings unless given: for small errors, between, for 30 Hz, or as in the paper."""
-    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    tracker: TrackConfig = field(default_factory=TrackConfig)
     """The tracker's own settings."""
 
 
@@ -91,14 +91,14 @@ def run(options: Options) -> int:
         first = recording.tracked.frame(0)
         after = None
         if options.resume:
-            tracking, after = load(folder.resume, first, options.tracker)
+            tracking, after = load(folder.resume, first, options.track)
             notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
         else:
-            scene, seconds["start"] = _start(recording, first, mask, options.tracker, console, notes)
+            scene, seconds["start"] = _start(recording, first, mask, options.track, console, notes)
             tracking = begin(scene)
         saver = Saver(folder.resume, tracking.resumed)
         how = {"budget_ms": options.budget_ms, "after": after, "saved": saver}
-        tracking = follow(tracking, first, recording.tracked, options.tracker, console, **how)
+        tracking = follow(tracking, first, recording.tracked, options.track, console, **how)
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
         _say_if_stopped(tracking, recording, notes)
@@ -116,7 +116,7 @@ def _start(
     recording: Recording,
     frame: Frame,
     mask: FirstMask,
-    config: TrackerConfig,
+    config: TrackConfig,
     console: Console,
     notes: Notes,
 ) -> tuple[TrackedScene, float]:

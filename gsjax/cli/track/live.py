@@ -24,7 +24,7 @@ from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.track.scoring import budget_metrics
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, Newest, Snapshot, replay
-from gsjax.methods.object_tracker import PRESETS, Tracked, TrackedScene, start_scene, track
+from gsjax.methods.track import PRESETS, Tracked, TrackedScene, start_scene, track
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 

@@ -15,16 +15,16 @@ from gsjax.cli.machine import usable_cores
 from gsjax.cli.messages import COMPILING, MEASURING
 from gsjax.cli.recording import Prefetched
 from gsjax.data import Sequence
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     EMPTY,
     Pose,
     Tracked,
     TrackedScene,
-    TrackerConfig,
+    TrackConfig,
     first_pose,
     track,
 )
-from gsjax.methods.object_tracker.budget import Chosen
+from gsjax.methods.track.budget import Chosen
 from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
@@ -125,7 +125,7 @@ def follow(
     tracking: Tracking,
     first: Frame,
     tracked: Sequence,
-    config: TrackerConfig,
+    config: TrackConfig,
     console: Console,
     *,
     budget_ms: float | None = None,

@@ -24,7 +24,7 @@ from gsjax.cli.track.views import views
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
-from gsjax.methods.object_tracker import find_object
+from gsjax.methods.track import find_object
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.viz.colors import highlight, label_color, to_uint8

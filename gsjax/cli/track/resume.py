@@ -11,15 +11,15 @@ from gsjax.cli.run import saving
 from gsjax.cli.track.loop import Tracking
 from gsjax.io.atomic import write_npz
 from gsjax.io.checkpoints import CheckpointError, load_checkpoint, load_metadata, save_checkpoint
-from gsjax.methods.object_tracker import (
+from gsjax.methods.track import (
     Pose,
     Tracked,
     TrackedScene,
-    TrackerConfig,
+    TrackConfig,
     first_pose,
     first_state,
 )
-from gsjax.methods.object_tracker.budget import Chosen, Costs, ladder
+from gsjax.methods.track.budget import Chosen, Costs, ladder
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
@@ -65,7 +65,7 @@ class Saver:
         self._saved = tracking.num_frames
 
 
-def load(folder: Path, first: Frame, config: TrackerConfig) -> tuple[Tracking, Tracked]:
+def load(folder: Path, first: Frame, config: TrackConfig) -> tuple[Tracking, Tracked]:
     """What a run had come to, and its last update, to go on from.
 
     Args:
@@ -168,7 +168,7 @@ def _chosen_metadata(chosen: Chosen | None) -> dict[str, Any] | None:
     }
 
 
-def _chosen(found: dict[str, Any] | None, config: TrackerConfig, num_cameras: int) -> Chosen | None:
+def _chosen(found: dict[str, Any] | None, config: TrackConfig, num_cameras: int) -> Chosen | None:
     if found is None:
         return None
     tried = {name: Costs(*costs) for name, costs in found["tried"].items()}

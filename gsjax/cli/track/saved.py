@@ -11,7 +11,7 @@ from gsjax.cli.recording import Recording
 from gsjax.cli.run.files import chosen_camera, read_arrays, read_scene, reopen
 from gsjax.cli.run.folder import expect_run
 from gsjax.cli.track.loop import Tracking
-from gsjax.methods.object_tracker import Pose, TrackedScene
+from gsjax.methods.track import Pose, TrackedScene
 
 _AGAIN = "track again with this version of gsjax, or name another folder"
 

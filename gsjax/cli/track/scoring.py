@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from gsjax.cli.recording import FirstMask, Recording, label_names
 from gsjax.cli.run.scores import Scores, camera_metrics, motion_metrics
 from gsjax.cli.track.loop import Tracking
-from gsjax.methods.object_tracker.budget import Chosen
+from gsjax.methods.track.budget import Chosen
 from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
 
 
@@ -63,7 +63,7 @@ def metrics(
     values: np.ndarray | None,
 ) -> dict[str, Any]:
     """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
-    though some Gaussian may lie on it. docs/tracker.md says what each score means.
+    though some Gaussian may lie on it. docs/track.md says what each score means.
 
     Args:
         tracking: the scene and its poses.

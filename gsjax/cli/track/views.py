@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from gsjax.cli.recording import Recording
 from gsjax.cli.run.views import View, views_of
 from gsjax.cli.track.loop import Tracking
-from gsjax.methods.object_tracker import place, render_labels
+from gsjax.methods.track import place, render_labels
 
 
 def views(tracking: Tracking, recording: Recording, every: int = 1) -> Iterator[list[View]]:

@@ -12,7 +12,7 @@ from gsjax.cli.deform.file import NAME, StoredDeformation, write_deformation
 from gsjax.cli.deform.teacher import Meaning
 from gsjax.cli.distill.source import Source
 from gsjax.geometry.cameras import intrinsics
-from gsjax.methods.surgical import QUESTIONS, DeformingScene
+from gsjax.methods.deform import QUESTIONS, DeformingScene
 from gsjax.scene.initialize import gaussians_from_points
 
 WIDTH, HEIGHT, FRAMES = 48, 40, 3

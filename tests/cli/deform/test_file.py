@@ -9,7 +9,7 @@ from gsjax.cli.deform.file import StoredDeformation, read_deformation, write_def
 from gsjax.cli.deform.teacher import Meaning
 from gsjax.cli.distill.source import Source
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
-from gsjax.methods.surgical import DeformingScene, nodes_of
+from gsjax.methods.deform import DeformingScene, nodes_of
 from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
 

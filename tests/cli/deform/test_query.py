@@ -24,8 +24,8 @@ from gsjax.cli.view.viewables import open_viewable
 from gsjax.data import open_sequence
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.surgical import SurgicalConfig, SurgicalState, begin_surgical, with_field
-from gsjax.methods.surgical.query import (
+from gsjax.methods.deform import DeformConfig, DeformState, begin_deform, with_field
+from gsjax.methods.deform.query import (
     like_feature,
     most_likely,
     prompt_probabilities,
@@ -44,8 +44,8 @@ def taught(tmp_path_factory):
     told = ("draw", TeacherChoice("classes"), 4, ())
     data = deform_data(open_sequence(SCENE), 8, *told, Notes(console), console)
     moves = DeformationConfig(resolution=8, time_resolution=4, levels=1)
-    config = SurgicalConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
-    problem, state = begin_surgical(data.looks, config, data.codes)
+    config = DeformConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
+    problem, state = begin_deform(data.looks, config, data.codes)
     scene, _, moving = with_field(problem, state.scene)
     layers = jax.tree.map(
         lambda leaf: leaf + 0.02 * jax.random.normal(jax.random.key(1), leaf.shape), scene.field.layers
@@ -53,7 +53,7 @@ def taught(tmp_path_factory):
     scene = eqx.tree_at(lambda s: s.field.layers, scene, layers)
     folder = RunFolder(run)
     folder.write_config(Options(dataset=SCENE, out=run, tools="draw"))
-    write_scene(folder, SurgicalState(scene, None, moving, None, 0, 0), data)
+    write_scene(folder, DeformState(scene, None, moving, None, 0, 0), data)
     stored = read_deformation(run / "deformation.npz")
     rows = in_corner(stored, 1).astype(int)
     features = jnp.asarray(FAINT * stored.meaning.codebook[rows], jnp.float32)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.cli.deform.scores import OVER_TIME, classes_of_pixels, over_time
-from gsjax.methods.surgical import Look
+from gsjax.methods.deform import Look
 
 HEIGHT, WIDTH = 40, 48
 

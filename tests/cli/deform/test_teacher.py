@@ -23,7 +23,7 @@ from gsjax.cli.distill.source import Source
 from gsjax.cli.messages import Notes
 from gsjax.cli.run import learning
 from gsjax.data import open_sequence
-from gsjax.methods.surgical import SurgicalConfig, begin_surgical, counted_ids
+from gsjax.methods.deform import DeformConfig, begin_deform, counted_ids
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
 
@@ -187,7 +187,7 @@ def test_cells_of_which_a_tool_has_a_part_do_not_count(files):
     np.testing.assert_array_equal(counted_ids(data.looks[0]) < 0, cells)
     tool = OF_TOOL @ data.meaning.basis  # of which nothing was learned
     assert np.linalg.norm(tool) < 0.75 * np.linalg.norm(OF_TOOL)
-    problem, _ = begin_surgical(data.looks, SurgicalConfig(channels=4), data.codes)
+    problem, _ = begin_deform(data.looks, DeformConfig(channels=4), data.codes)
     assert len({id(batch.codebook) for batch in problem.batches}) == 1  # of all frames, in memory once
 
 

@@ -13,7 +13,7 @@ from tests.cli.conftest import LABELS, first_picture, write_made_field
 
 CAN = 3
 NAMES = {label + 1: name for label, name in LABELS.items()}  # as a distillation counts them
-SMALL = ("--field.encoding", "table", "--field.channels", 8, "--field.contrast-patch", 4)
+SMALL = ("--distill.encoding", "table", "--distill.channels", 8, "--distill.contrast-patch", 4)
 
 
 @pytest.fixture(scope="session")

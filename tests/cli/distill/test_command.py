@@ -75,7 +75,7 @@ def test_views_that_are_odd_cost_nothing_but_themselves(gsjax, recording, scene,
     seen = cv2.imread(str(recording / "seg/2/000001.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(recording / "seg/2/000001.png"), np.where(seen == 2, 77, np.where(seen == 3, 0, seen)))
     told = ("--images", recording, "--frames", "0:2", "--eval-cameras", 2, "--features", "closed", *SMALL)
-    code, said = gsjax("distill", scene, "--out", tmp_path / "field", *told, "--field.iterations", 2)
+    code, said = gsjax("distill", scene, "--out", tmp_path / "field", *told, "--distill.iterations", 2)
     assert code == 0, said
     assert "no mask says anything teach nothing: 1/0, 1/1" in said
     assert said.count("teach nothing") == 1
@@ -103,7 +103,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
         0,
         *SMALL,
     )
-    told += ("--field.iterations", 20)
+    told += ("--distill.iterations", 20)
     steps = []
 
     def hear():

@@ -37,7 +37,7 @@ def encoders(request, monkeypatch):
     ],
 )
 def test_foundation_models_teach(gsjax, pristine, scene, tmp_path, encoders, name, kind, masks, dimension):
-    told = ("--images", pristine, "--frames", "0:1", "--eval-cameras", 2, *SMALL, "--field.iterations", 40)
+    told = ("--images", pristine, "--frames", "0:1", "--eval-cameras", 2, *SMALL, "--distill.iterations", 40)
     code, said = gsjax("distill", scene, "--out", tmp_path / name, *told, *encoders[name])
     assert code == 0, said
     found = metrics(tmp_path / name)

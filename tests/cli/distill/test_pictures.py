@@ -13,8 +13,8 @@ from gsjax.cli.distill.saved import short_names
 from gsjax.cli.distill.scores import class_maps, classes_of, one_by_one
 from gsjax.geometry.cameras import Camera
 from gsjax.io.ply import read_ply
-from gsjax.methods.feature_field import (
-    FieldConfig,
+from gsjax.methods.distill import (
+    DistillConfig,
     carried,
     frozen_views,
     init_field,
@@ -33,7 +33,7 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
     gaussians = jax.tree.map(lambda a: jnp.asarray(a[::40]), gaussians)
     grid = FeatureGridConfig(levels=2, most_resolution=16, log2_entries=8, hidden=8)
     field, located = init_field(
-        jax.random.key(0), FieldConfig(channels=6, encoding=encoding, grid=grid), gaussians.means, 4
+        jax.random.key(0), DistillConfig(channels=6, encoding=encoding, grid=grid), gaussians.means, 4
     )
     K = jnp.array([[40.0, 0, 20], [0, 40.0, 16], [0, 0, 1]])
     back = jnp.eye(4).at[2, 3].set(3.0)
@@ -59,7 +59,7 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
 def test_classes_of_a_picture_are_found_strip_by_strip(scene, monkeypatch):
     gaussians = jax.tree.map(lambda a: jnp.asarray(a[::20]), read_ply(scene)[0])
     grid = FeatureGridConfig(levels=2, most_resolution=32, log2_entries=8, hidden=8)
-    field, located = init_field(jax.random.key(0), FieldConfig(channels=6, grid=grid), gaussians.means, 4)
+    field, located = init_field(jax.random.key(0), DistillConfig(channels=6, grid=grid), gaussians.means, 4)
     field = eqx.tree_at(lambda f: f.encoding.table, field, 1e5 * field.encoding.table)
     codes, rows = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32), []
     K = jnp.array([[40.0, 0, 20], [0, 40.0, 30], [0, 0, 1]])

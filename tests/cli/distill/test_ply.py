@@ -11,10 +11,10 @@ import yaml
 
 from gsjax.cli import main
 
-SMALL = ("--field.grid.levels", "4", "--field.grid.most-resolution", "32", "--field.grid.log2-entries", "12")
-SMALL += ("--field.grid.hidden", "16", "--field.channels", "16", "--field.contrast-patch", "8")
-SMALL += ("--field.rates.table", "0.1", "--field.rates.layers", "0.01", "--field.rates.lift", "0.02")
-TABLE = ("--field.encoding", "table")  # learns in fewer steps
+SMALL = ("--distill.grid.levels", "4", "--distill.grid.most-resolution", "32", "--distill.grid.log2-entries", "12")
+SMALL += ("--distill.grid.hidden", "16", "--distill.channels", "16", "--distill.contrast-patch", "8")
+SMALL += ("--distill.rates.table", "0.1", "--distill.rates.layers", "0.01", "--distill.rates.lift", "0.02")
+TABLE = ("--distill.encoding", "table")  # learns in fewer steps
 STEPS = 200
 
 
@@ -35,7 +35,7 @@ def images(pristine):
 def distilled(pristine, scene, tmp_path_factory):
     """The field of the classes of the recording's masks."""
     out = tmp_path_factory.mktemp("fields") / "field"
-    steps = ("--field.iterations", STEPS, *TABLE)
+    steps = ("--distill.iterations", STEPS, *TABLE)
     assert main([str(a) for a in ("distill", scene, "--out", out, *images(pristine), *SMALL, *steps)]) == 0
     return out
 
@@ -83,7 +83,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
     from gsjax.cli.run import learning
 
-    steps, heard = ("--field.iterations", STEPS, *TABLE), []
+    steps, heard = ("--distill.iterations", STEPS, *TABLE), []
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
 
     def hear():  # after each step
@@ -125,7 +125,7 @@ def test_a_field_is_found_within_the_run_of_its_scene(gsjax, pristine, scene, tm
     (run / "config.yml").write_text(
         "# gsjax run\n" + yaml.safe_dump(settings | {"fit": {"antialiased": False}})
     )
-    code, said = gsjax("distill", run, *SMALL, "--field.iterations", 20)
+    code, said = gsjax("distill", run, *SMALL, "--distill.iterations", 20)
     assert code == 0, said
     assert (run / "field" / "field.npz").is_file()
     code, said = gsjax("query", run, "can", "--threshold", 0.0)
@@ -144,7 +144,7 @@ def test_a_field_is_found_within_the_run_of_its_scene(gsjax, pristine, scene, tm
 @pytest.mark.slow
 def test_colours_need_no_names_and_answer_to_pictures(gsjax, pristine, scene, tmp_path):
     out = tmp_path / "closed"
-    told = ("--features", "closed", "--masks", "segment", *SMALL, *TABLE, "--field.iterations", STEPS)
+    told = ("--features", "closed", "--masks", "segment", *SMALL, *TABLE, "--distill.iterations", STEPS)
     code, said = gsjax("distill", scene, "--out", out, *images(pristine), *told)
     assert code == 0, said
     assert _metrics(out)["masks"] == "segment"
@@ -165,7 +165,7 @@ def test_colours_need_no_names_and_answer_to_pictures(gsjax, pristine, scene, tm
 
 
 def test_what_was_encoded_is_not_encoded_again(gsjax, pristine, scene, distilled, tmp_path, cache):
-    told = ("distill", scene, *images(pristine), *SMALL, "--field.iterations", 2)
+    told = ("distill", scene, *images(pristine), *SMALL, "--distill.iterations", 2)
     assert gsjax(*told, "--out", tmp_path / "a")[0] == 0
     again, kept = _metrics(tmp_path / "a")["encoded"], list(cache.rglob("*.npz"))
     assert again["anew"] == 0
@@ -187,7 +187,7 @@ def test_files_of_features_are_read_and_checked(gsjax, pristine, scene, tmp_path
     (folder / "2").mkdir()
     for camera in "012":
         np.save(folder / camera / "0.npy", random.normal(size=(15, 20, 12)).astype(np.float32))
-    told = ("distill", scene, *images(pristine), *SMALL, "--field.iterations", 2, "--features", folder)
+    told = ("distill", scene, *images(pristine), *SMALL, "--distill.iterations", 2, "--features", folder)
     assert gsjax(*told, "--out", tmp_path / "a")[0] == 0
     assert _metrics(tmp_path / "a")["dimension"] == 12
     code, said = gsjax("query", tmp_path / "a", "can")

@@ -21,7 +21,7 @@ from gsjax.cli.fit.results import Curve
 from gsjax.cli.fit.worth import parts_of_time
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply
-from gsjax.methods.reconstruction import PRESETS
+from gsjax.methods.fit import PRESETS
 
 QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
 QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")

@@ -121,7 +121,7 @@ def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, r
 def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
     from gsjax.cli.fit.evaluate import scores
     from gsjax.cli.fit.results import Seen
-    from gsjax.methods.reconstruction import View
+    from gsjax.methods.fit import View
 
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (170, 180, 3))

@@ -16,8 +16,8 @@ from gsjax.cli.parts.saved import open_parts_run
 from gsjax.data.video import describe_video
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.motion_parts import PartScene, gaussians_at, moment, trajectory_of
-from gsjax.methods.motion_parts.timeline import apply, parse_op, parse_script
+from gsjax.methods.parts import PartScene, gaussians_at, moment, trajectory_of
+from gsjax.methods.parts.timeline import apply, parse_op, parse_script
 from gsjax.scene.gaussians import gaussians_from_activated, take
 from gsjax.scene.handles import HandlePose
 

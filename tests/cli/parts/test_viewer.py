@@ -14,9 +14,9 @@ from gsjax.cli.parts.saved import open_parts_run
 from gsjax.cli.parts.viewer import script_of
 from gsjax.cli.view.viewables import open_viewable
 from gsjax.io.video import read_video_frames
-from gsjax.methods.motion_parts.film import film_gaussians
-from gsjax.methods.motion_parts.operations import OPERATIONS
-from gsjax.methods.motion_parts.timeline import apply, parse_op
+from gsjax.methods.parts.film import film_gaussians
+from gsjax.methods.parts.operations import OPERATIONS
+from gsjax.methods.parts.timeline import apply, parse_op
 from tests.cli.parts.test_edit import write_run
 
 pytest.importorskip("viser", reason="viser is not installed")

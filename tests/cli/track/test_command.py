@@ -18,7 +18,7 @@ from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
 CARTON, CAN, BALL = 2, 3, 4
-QUICK = ("--tracker.start.iterations", "2")
+QUICK = ("--track.start.iterations", "2")
 CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 
 

@@ -11,7 +11,7 @@ import pytest
 import gsjax.cli.track.live
 import gsjax.data.stream
 from gsjax.cli import main
-from gsjax.methods.object_tracker import Tracked, first_pose, start_scene
+from gsjax.methods.track import Tracked, first_pose, start_scene
 
 
 def standing_still(scene, first, frames, config, *, budget_ms):

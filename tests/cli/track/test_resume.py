@@ -13,11 +13,11 @@ import pytest
 import gsjax.cli.run.saving
 import gsjax.cli.track.loop
 import gsjax.cli.track.resume
-import gsjax.methods.object_tracker
+import gsjax.methods.track
 from gsjax.cli.track.loop import Tracking
-from gsjax.methods.object_tracker import Pose, Tracked, track
+from gsjax.methods.track import Pose, Tracked, track
 
-OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--tracker.start.iterations", "5")
+OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--track.start.iterations", "5")
 
 
 def interrupted(after: int):

@@ -16,8 +16,8 @@ from gsjax.cli.track.command import Options as TrackOptions
 from gsjax.cli.track.loop import Tracking
 from gsjax.cli.track.outputs import write_tracking
 from gsjax.io.ply import write_ply
-from gsjax.methods.object_tracker import Pose, TrackedScene
-from gsjax.methods.reconstruction import FitConfig
+from gsjax.methods.track import Pose, TrackedScene
+from gsjax.methods.fit import FitConfig
 from gsjax.scene.gaussians import gaussians_from_activated
 
 

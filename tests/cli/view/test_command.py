@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 from gsjax.cli.distill.saved import Whereabouts
 from gsjax.cli.view.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
-from gsjax.methods.motion_parts import gaussians_at, moment
+from gsjax.methods.parts import gaussians_at, moment
 from tests.cli.parts.test_edit import scene_and_trajectory
 from tests.cli.parts.test_edit import write_run as write_parts_run
 from tests.cli.view.conftest import some

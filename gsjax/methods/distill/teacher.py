@@ -1,0 +1,187 @@
+"""What pixels are to say: masks with an embedding each (papers/002, section 3.2), or a feature a pixel. On
+the host.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+# Shapes stand in the docstrings: the functions check them, and say more than an annotation could.
+
+UNKNOWN_ID = -1
+
+
+class Teacher(NamedTuple):
+    """Of V views.
+
+    Attributes:
+        ids: which row of the codebook each pixel shows, [H,W] a view; -1 where nobody knows. Pixels of one id
+            are of one thing, which is what the contrast goes by. Without a codebook they say no more.
+        codebook: the embeddings, [K, D], no two alike; None where there are maps only.
+        maps: a feature a pixel of a picture of any size, [h,w,D] a view, stretched over the view; None where
+            there are none.
+
+    Embeddings, and features of maps, have a mean length of 1, whatever the encoder's had: cosines do not
+    depend on it, but how fast a field learns would.
+    """
+
+    ids: list[np.ndarray]
+    codebook: Float[np.ndarray, "k d"] | None
+    maps: list[np.ndarray] | None = None
+
+    @property
+    def dimension(self) -> int:
+        """D, how many numbers the teacher says of a pixel."""
+        if self.codebook is not None:
+            return self.codebook.shape[1]
+        assert self.maps is not None
+        return self.maps[0].shape[-1]
+
+
+def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndarray]) -> Teacher:
+    """One that says of each pixel the embedding of the object whose mask it lies in.
+
+    Objects with the same embedding are one thing, in one view as over all of them.
+
+    Args:
+        masks: labels of each view, integers [H,W], 0 to n; negative where nobody knows.
+        embeddings: of the labels 0 to n of each view, [n+1, D]; a row of zeros is a label of which nothing is
+            known.
+
+    Raises:
+        ValueError: there is no view, or one says nothing of its labels; dimensions differ; numbers are not
+            finite; or nothing is said anywhere.
+    """
+    if len(masks) != len(embeddings):
+        raise ValueError(f"embeddings: expected those of {len(masks)} views, found {len(embeddings)}")
+    if not len(masks):
+        raise ValueError("masks: expected those of at least one view, found none")
+    dimension = np.shape(embeddings[0])[-1] if np.ndim(embeddings[0]) else 0
+    for v, (mask, rows) in enumerate(zip(masks, embeddings, strict=True)):
+        if np.ndim(mask) != 2 or not np.issubdtype(np.asarray(mask).dtype, np.integer):
+            raise ValueError(f"masks of view {v}: expected integers [H,W], found {_kind(mask)}")
+        if np.ndim(rows) != 2 or np.shape(rows)[1] != dimension or dimension < 1:
+            raise ValueError(
+                f"embeddings of view {v}: expected [labels, {dimension}] as of view 0, found {_kind(rows)}; "
+                "features of all views must come from one encoder"
+            )
+        if not np.isfinite(rows).all():
+            bad = sorted(set(np.nonzero(~np.isfinite(rows))[0].tolist()))
+            raise ValueError(f"embeddings of view {v}: expected numbers, found NaN or infinity in rows {bad}")
+        if np.max(mask, initial=-1) >= len(rows):
+            raise ValueError(
+                f"embeddings of view {v}: expected a row for each of the labels 0 to {np.max(mask)}, found "
+                f"{len(rows)} rows"
+            )
+    codebook, place = np.unique(np.concatenate(embeddings).astype(np.float32), axis=0, return_inverse=True)
+    known = np.abs(codebook).max(axis=1, initial=0) > 0
+    rows = np.where(known, np.cumsum(known) - 1, UNKNOWN_ID)[place.reshape(-1)]
+    begins = np.cumsum([0, *(len(e) for e in embeddings)])
+    ids = [
+        np.append(rows, UNKNOWN_ID)[np.where(mask >= 0, begin + mask, len(rows))].astype(np.int32)
+        for mask, begin in zip(masks, begins[:-1], strict=True)
+    ]
+    _warn_of_silence(ids)
+    return Teacher(ids, codebook[known] / _mean_length([codebook[known]]))
+
+
+def teacher_of_maps(
+    maps: Sequence[np.ndarray],
+    sizes: Sequence[tuple[int, int]],
+    ids: Sequence[np.ndarray] | None = None,
+) -> Teacher:
+    """One that says a feature of its own of each pixel.
+
+    Args:
+        maps: [h,w,D] of each view, of any size.
+        sizes: (height, width) of each view.
+        ids: [H,W], what is one thing, for the contrast; without them there is none.
+
+    Raises:
+        ValueError: dimensions differ, or numbers are not finite, or a map is of another shape than its view.
+    """
+    if len(maps) != len(sizes) or not len(maps):
+        raise ValueError(f"maps: expected those of {len(sizes)} views, found {len(maps)}")
+    dimension = np.shape(maps[0])[-1]
+    for v, (one, (height, width)) in enumerate(zip(maps, sizes, strict=True)):
+        if np.ndim(one) != 3 or np.shape(one)[-1] != dimension:
+            raise ValueError(f"maps of view {v}: expected [h, w, {dimension}], found {_kind(one)}")
+        if not np.isfinite(one).all():
+            raise ValueError(f"maps of view {v}: expected numbers, found NaN or infinity")
+        stretch = (one.shape[1] / one.shape[0]) / (width / height)
+        # A grid of square patches leaves up to one of them at the far side of each axis.
+        if abs(np.log(stretch)) > np.log(1 + 1.5 / min(one.shape[:2])):
+            raise ValueError(
+                f"maps of view {v}: expected a picture of the shape of its view, {width}x{height}, found "
+                f"{one.shape[1]}x{one.shape[0]}"
+            )
+    if ids is None:
+        ids = [np.full(size, UNKNOWN_ID, np.int32) for size in sizes]
+    length = _mean_length(maps)
+    scaled = [(np.asarray(one, np.float32) / length).astype(np.float32) for one in maps]
+    return Teacher([np.asarray(one, np.int32) for one in ids], None, scaled)
+
+
+def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
+    """One that says of each pixel both what its object's embedding is and what a map has there.
+
+    The maps are a second opinion: what no mask holds has a feature by them, and what they are worth beside
+    the masks is `DistillWeightsConfig.map`.
+
+    Args:
+        objects: a teacher of masks.
+        dense: a teacher of maps, of the same views, by the same encoder.
+
+    Raises:
+        ValueError: views or dimensions differ, or one of them is not of its kind.
+    """
+    if objects.codebook is None or dense.maps is None:
+        raise ValueError("teachers: expected one of objects and one of maps, found others")
+    if len(objects.ids) != len(dense.maps):
+        raise ValueError(f"dense: expected maps of {len(objects.ids)} views, found {len(dense.maps)}")
+    if objects.dimension != dense.dimension:
+        raise ValueError(
+            f"dense: expected features of {objects.dimension} numbers as the objects have, found "
+            f"{dense.dimension}; both must come from one encoder"
+        )
+    return objects._replace(maps=dense.maps)
+
+
+def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """What pixels of a view show, as rows of a small codebook of its own, which zeros fill up to `rows`; the
+    ids as they are, and None, where there are maps only."""
+    ids = np.asarray(teacher.ids[v], np.int32)
+    if teacher.codebook is None:
+        return ids, None
+    there, place = np.unique(ids, return_inverse=True)
+    unknown = int(there[0] < 0) if len(there) else 0
+    book = np.zeros((rows, teacher.dimension), np.float32)
+    book[: len(there) - unknown] = teacher.codebook[there[unknown:]]
+    return (place.reshape(ids.shape) - unknown).astype(np.int32), book
+
+
+def most_rows(teacher: Teacher) -> int:
+    """How many rows of the codebook a view shows at most, and at least 1."""
+    return max(1, *(len(np.unique(ids[ids >= 0])) for ids in teacher.ids))
+
+
+def _mean_length(features: Sequence[np.ndarray]) -> np.float32:
+    """Of all features; 1 where all are zeros."""
+    lengths = [np.linalg.norm(np.asarray(one, np.float64), axis=-1).ravel() for one in features]
+    return np.float32(np.concatenate(lengths).mean() or 1.0)
+
+
+def _warn_of_silence(ids: list[np.ndarray]) -> None:
+    silent = [v for v, one in enumerate(ids) if not (one >= 0).any()]
+    if len(silent) == len(ids):
+        raise ValueError("masks: expected some in at least one view, found none that has an embedding")
+    if silent:
+        some = ", ".join(map(str, silent[:8])) + (", ..." if len(silent) > 8 else "")
+        warnings.warn(f"views without any mask teach nothing: {some} of {len(ids)}", stacklevel=3)
+
+
+def _kind(array) -> str:
+    return f"{np.asarray(array).dtype} {list(np.shape(array))}"

@@ -1,0 +1,259 @@
+"""Distillation: a view a step is drawn in features and held against its teacher (papers/002, section 3.4)."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from gsjax.losses.features import (
+    contrastive_loss,
+    cosine_error,
+    feature_error,
+    likeness,
+    likeness_to_map,
+    max_pooled,
+    pooled_ids,
+)
+from gsjax.losses.regularization import total_variation
+from gsjax.methods.distill.config import DistillConfig
+from gsjax.methods.distill.field import Carried, FeatureField, carried
+from gsjax.optim.step import Step, gradient_step
+from gsjax.rasterize.frozen import FrozenView, paint_shown, rows_within, strip_of
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.feature_grid import Located
+
+_FINAL_RATE = 0.1
+
+
+class DistillBatch(NamedTuple):
+    """A view and what its teacher says.
+
+    Attributes:
+        view: of the scene, which stands still.
+        located: where its Gaussians lie in the grid; None without one.
+        ids: rows of the codebook, or things; -1 unknown.
+        codebook: of the teacher, what this view shows of it; None where there are maps only.
+        map: of the teacher, of any size; None where there is none. It stays on the host until its step.
+        plan: of the view.
+    """
+
+    view: FrozenView
+    located: Located | None
+    ids: Int[Array, "height width"]
+    codebook: Float[Array, "k d"] | None
+    map: Float[Array, "h w d"] | None
+    plan: Plan
+
+
+class _Sums(NamedTuple):
+    """Of the pixels of a strip."""
+
+    rec: Float[Array, ""]
+    cos: Float[Array, ""]
+    pixels: Float[Array, ""]
+    tv: Float[Array, ""]
+
+
+def distill_step(config: DistillConfig) -> Step:
+    """Adam on a `FeatureField`; `batch` is a `DistillBatch`, `step` the number of the step, `key` is needed.
+
+    `info` has each loss by name, unweighted.
+    """
+    rates = config.rates
+    fall = optax.exponential_decay(1.0, config.iterations, _FINAL_RATE)
+
+    def label(field: FeatureField):
+        def of(path, _):
+            names = [getattr(key, "name", None) for key in path]
+            return "lift" if "lift" in names else "layers" if "layers" in names else "table"
+
+        return jax.tree_util.tree_map_with_path(of, field)
+
+    def adam(rate: float):
+        return optax.adam(lambda i: rate * fall(i), eps=1e-15)
+
+    adams = {"table": adam(rates.table), "layers": adam(rates.layers), "lift": adam(rates.lift)}
+    return gradient_step(distill_loss(config), optax.multi_transform(adams, label))
+
+
+def distill_loss(config: DistillConfig) -> Callable:
+    """`loss(field, batch, *, step, key)`: eq. 8, of one view."""
+    weights, edge = config.weights, config.contrast_pool
+
+    def loss(field: FeatureField, batch: DistillBatch, *, step: Any, key: Any):
+        corner = _corner(key, batch.ids.shape, config) if weights.contrast else None
+        sums, pooled = _drawn(field, batch, corner, config)
+        channels = field.channels
+        height, width = batch.ids.shape
+        known = jnp.maximum(sums.pixels, 1.0)
+        aux = {"rec": sums.rec / known, "cos": sums.cos / known}
+        value = weights.rec * aux["rec"] + weights.cos * aux["cos"]
+        if weights.tv:
+            aux["tv"] = sums.tv / (height * width * channels)
+            value += weights.tv * aux["tv"]
+        if weights.contrast:
+            assert pooled is not None
+            aux["contrast"] = jax.lax.cond(
+                jnp.asarray(step) >= config.contrast_after * config.iterations,
+                lambda: _contrast(pooled, pooled_ids(batch.ids, edge), corner, config),
+                lambda: jnp.zeros((), pooled.dtype),
+            )
+            value += weights.contrast * aux["contrast"]
+        return value, aux
+
+    return loss
+
+
+def strip_rows(config: DistillConfig, hidden: int, batch: DistillBatch) -> int:
+    """Rows of tiles in a strip whose pixels' numbers take no more memory than they may.
+
+    Args:
+        config: with the megabytes that a strip may take.
+        hidden: channels of what is rendered.
+        batch: of one view.
+    """
+    numbers = hidden + config.channels
+    numbers += 0 if batch.codebook is None else len(batch.codebook)
+    numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # what it says, and what the field does
+    return rows_within(config.strip_megabytes, numbers, batch.plan)
+
+
+def _drawn(
+    field: FeatureField, batch: DistillBatch, corner: Any, config: DistillConfig
+) -> tuple[_Sums, Float[Array, "h_ patch channels"] | None]:
+    """What losses there are in a view, and pooled features of the columns that the contrast looks at.
+
+    The image is worked through strip by strip, each of which forgets its pixels and is drawn once more on the
+    way back. So the memory is that of a strip.
+    """
+    # Of the Gaussians that the view shows; those behind others need no features.
+    parts, plan = carried(field, batch.located, batch.view.rows), batch.plan
+    rows = strip_rows(config, parts.values.shape[1], batch)
+    strips = -(-plan.tiles_y // rows)
+    high = rows * plan.tile_size
+    ids = jnp.pad(batch.ids, ((0, strips * high - plan.height), (0, 0)), constant_values=-1)
+    padded = batch._replace(ids=ids)
+
+    def strip(above, number):
+        return _strip(field, parts, padded, above, number, rows, corner, config)
+
+    above = jnp.zeros((plan.width, field.channels), parts.values.dtype)
+    if strips == 1:
+        _, (sums, pooled) = strip(above, 0)
+        return sums, pooled
+    _, (sums, pooled) = jax.lax.scan(jax.checkpoint(strip), above, jnp.arange(strips))
+    if pooled is not None:
+        pooled = pooled.reshape(-1, *pooled.shape[2:])[: plan.height // config.contrast_pool]
+    return jax.tree.map(jnp.sum, sums), pooled
+
+
+def _strip(
+    field: FeatureField,
+    parts: Carried,
+    batch: DistillBatch,
+    above: Float[Array, "width channels"],
+    number: Int[Array, ""] | int,
+    rows: int,
+    corner: Any,
+    config: DistillConfig,
+):
+    """One strip: its last row, its sums, and pooled features of some of its columns."""
+    plan, weights = batch.plan, config.weights
+    high = rows * plan.tile_size
+    view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
+    image, alphas = paint_shown(view, parts.values, strip_plan)
+    # Pixels on one axis: a matmul over two of them, as in the slope by the weights, XLA:CPU does ten times as
+    # slowly.
+    alphas = alphas.ravel()
+    rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
+    inside = number * high + jnp.arange(high) < plan.height
+    sums = _teacher_sums(field, parts, batch, rendered, alphas, number * high, inside, weights.map)
+    if not weights.tv and not weights.contrast:
+        return above, (sums, None)
+    channels = parts.channels_of(rendered).reshape(high, plan.width, -1)
+    if weights.tv:
+        before = jnp.where(number == 0, channels[0], above)
+        sums = sums._replace(tv=total_variation(channels, before, inside))
+    if not weights.contrast:
+        return channels[-1], (sums, None)
+    edge, (_, wide) = config.contrast_pool, _patch_shape(batch.ids.shape, config)
+    columns = jax.lax.dynamic_slice_in_dim(channels, corner[1] * edge, wide * edge, axis=1)
+    pooled = max_pooled(columns, edge)
+    if rows == plan.tiles_y:
+        pooled = pooled[: plan.height // edge]
+    return channels[-1], (sums, pooled)
+
+
+def _teacher_sums(
+    field: FeatureField,
+    parts: Carried,
+    batch: DistillBatch,
+    rendered,
+    alphas,
+    first_row,
+    inside,
+    beside_masks: float,
+) -> _Sums:
+    """By how much a strip's pixels, in one row, differ from what the teacher says of them. A pixel of a map
+    counts `beside_masks` where there are masks too."""
+    lifted = parts.lifted(field.lift)
+    zero = jnp.zeros((), rendered.dtype)
+    rec, cos, pixels = zero, zero, zero
+    if batch.codebook is not None:
+        ids = jax.lax.dynamic_slice_in_dim(batch.ids, first_row, len(inside)).ravel()
+        like, known = likeness(rendered, lifted, batch.codebook, ids), ids >= 0
+        rec += jnp.where(known, feature_error(like, alphas, field.dimension), 0.0).sum()
+        cos += jnp.where(known, cosine_error(like), 0.0).sum()
+        pixels += known.sum(dtype=zero.dtype)
+    if batch.map is not None:
+        said = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
+        like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
+        known = jnp.repeat(inside, batch.plan.width)
+        weight = jnp.where(known, 1.0 if batch.codebook is None else beside_masks, 0.0)
+        rec += (weight * feature_error(like, alphas, field.dimension)).sum()
+        cos += (weight * cosine_error(like)).sum()
+        pixels += weight.sum()
+    return _Sums(rec, cos, pixels, zero)
+
+
+def _stretched(
+    teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
+) -> Float[Array, "rows width d"]:
+    """Rows of a teacher's map as large as the view, linear between the centres of its pixels."""
+    high, wide = teacher.shape[:2]
+
+    def places(centres, have: int, want: int):
+        at = jnp.clip(centres * (have / want) - 0.5, 0, have - 1)
+        low = jnp.minimum(at.astype(jnp.int32), have - 1)
+        return low, jnp.minimum(low + 1, have - 1), at - low
+
+    top, bottom, down = places(first + jnp.arange(rows) + 0.5, high, plan.height)
+    left, right, across = places(jnp.arange(plan.width) + 0.5, wide, plan.width)
+    lines = teacher[top] * (1 - down)[:, None, None] + teacher[bottom] * down[:, None, None]
+    return lines[:, left] * (1 - across)[:, None] + lines[:, right] * across[:, None]
+
+
+def _patch_shape(shape: tuple[int, ...], config: DistillConfig) -> tuple[int, int]:
+    """Windows, down and across, of a patch in a view of so many pixels."""
+    high, wide = (min(config.contrast_patch, side // config.contrast_pool) for side in shape)
+    return high, wide
+
+
+def _corner(key: Any, shape: tuple[int, ...], config: DistillConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The first window, down and across, of the patch that a key chooses."""
+    (first, second), size = jax.random.split(key), _patch_shape(shape, config)
+    down, across = (side // config.contrast_pool - some for side, some in zip(shape, size, strict=True))
+    return jax.random.randint(first, (), 0, down + 1), jax.random.randint(second, (), 0, across + 1)
+
+
+def _contrast(
+    columns: Float[Array, "h patch channels"], ids: Int[Array, "h w"], corner: Any, config: DistillConfig
+) -> Float[Array, ""]:
+    """The contrast within a patch of pooled features, of which the columns are cut out already."""
+    high, wide = min(config.contrast_patch, ids.shape[0]), columns.shape[1]
+    patch = jax.lax.dynamic_slice_in_dim(columns, corner[0], high)
+    seen = jax.lax.dynamic_slice(ids, corner, (high, wide))
+    return contrastive_loss(patch.reshape(high * wide, -1), seen.ravel(), config.contrast_gamma)

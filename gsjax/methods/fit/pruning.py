@@ -1,0 +1,72 @@
+"""Which Gaussians the photographs need: the light that each of them sends into each view."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.fit.start import View
+from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render, render
+
+
+def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]:
+    """All but those that are needed least, which together send at most a share of the light into any view.
+
+    Args:
+        light: from `light_of`.
+        share: of the light, 0 to 1.
+    """
+    order = np.argsort(light, kind="stable")
+    kept = np.ones(len(light), bool)
+    kept[order[np.cumsum(light[order], dtype=np.float64) <= share]] = (
+        False  # sums of maxima: no view has more
+    )
+    return kept
+
+
+def light_of(
+    gaussians: Gaussians, views: list[View], rasterize_mode: str = "classic"
+) -> Float[np.ndarray, "n"]:
+    """What share of the scene's light each Gaussian sends, in the view that has the most of it: the largest
+    over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i, over that of all.
+
+    The sums are the gradient of the composited sum of a feature that is 1 everywhere.
+
+    Args:
+        gaussians: the scene.
+        views: all photographs.
+        rasterize_mode: "classic" or "antialiased", as the scene is fitted.
+    """
+    most, plans = np.zeros(gaussians.num, np.float32), {}
+    for view in views:
+        height, width = view.image.shape[:2]
+        viewmat, K = (jnp.asarray(a, gaussians.means.dtype)[None] for a in (view.viewmat, view.K))
+        camera = Camera(viewmat, K, width, height, view.near)
+        while True:
+            if (width, height) not in plans:
+                plans[width, height] = plan_render(
+                    gaussians, camera, headroom=1.3, rasterize_mode=rasterize_mode
+                )
+            weights, meta = _weights(gaussians, camera, plans[width, height])
+            if not bool(meta.overflow.any()):
+                break
+            plans[width, height] = plans[width, height].grown(int(meta.needed.max()), 1.3)
+        total = float(weights.sum())
+        most = np.maximum(most, np.asarray(weights) / max(total, 1e-12))
+    return most
+
+
+@partial(jax.jit, static_argnames="plan", compiler_options=host_options())
+def _weights(gaussians: Gaussians, camera: Camera, plan: Plan) -> tuple[Float[Array, "n"], object]:
+    def total(ones):
+        drawn = render(gaussians, camera, plan, features=ones)
+        return jnp.sum(drawn.features), drawn.meta
+
+    gradient, meta = jax.grad(total, has_aux=True)(jnp.ones((gaussians.num, 1), gaussians.means.dtype))
+    return gradient[:, 0], meta

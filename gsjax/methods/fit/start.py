@@ -1,0 +1,193 @@
+"""The first Gaussians: on the data's points, on its depth, or at random before the cameras. On the host."""
+
+import warnings
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from gsjax.geometry.cameras import NEAR
+from gsjax.methods.fit.config import StartConfig
+from gsjax.optim.densification import EMPTY_LOGIT
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
+
+_FEW = 0.1  # share of the points that photographs show, below which something is wrong
+_FLAT_PX = 1.0  # by which cameras shift what they see against each other, below which nothing has a depth
+
+
+class View(NamedTuple):
+    """What a photograph shows, on the host.
+
+    Attributes:
+        image: RGB, uint8.
+        mask: which pixels count, or None for all.
+        depth: 0 where unknown, or None.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics in pixels.
+        near: what is nearer is not drawn, metres.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray | None
+    depth: np.ndarray | None
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    near: float = NEAR
+
+
+class Extent(NamedTuple):
+    """Where a scene is.
+
+    Attributes:
+        focus: the point nearest to all optical axes.
+        radius: 1.1 times how far cameras stand from their middle, at most; the unit of rates. Where all
+            stand at one place, 1, and the focus is as far ahead.
+        is_point: whether all do.
+    """
+
+    focus: Float[np.ndarray, "3"]
+    radius: float
+    is_point: bool = False
+
+
+def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
+    """The extent of a scene that these cameras look at."""
+    rotations = viewmats[:, :3, :3]
+    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
+    axes = rotations[:, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    middle, ahead = centers.mean(0), axes.mean(0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    if spread <= 1e-6 * max(1.0, float(np.abs(centers).max())):  # nothing says how far away things are
+        return Extent(middle + ahead, 1.0, is_point=True)
+    # Parallel axes meet nowhere: then the point one radius ahead of the middle is as good as any.
+    weak = 1e-3 * np.eye(3) * len(centers)
+    total = np.einsum("nij,nj->i", across, centers) + weak @ (middle + ahead * spread)
+    return Extent(np.linalg.solve(across.sum(0) + weak, total), 1.1 * spread)
+
+
+def start_points(
+    views: list[View], cloud: tuple[np.ndarray, np.ndarray] | None, config: StartConfig, seed: int
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], str]:
+    """Points and their colours, and where they come from.
+
+    Args:
+        cloud: points and their colours: the data's own, or, where `config.source` says so, those of matches.
+        views: the photographs.
+        config: which source, and how many points.
+        seed: of what is drawn at random.
+
+    Raises:
+        ValueError: the source that is asked for is not there.
+    """
+    random = np.random.default_rng(seed)
+    has_depth = any(_known_depth(view).any() for view in views)
+    source = config.source
+    if cloud is not None and not len(cloud[0]):
+        cloud = None
+    is_seen = cloud is not None and source in ("auto", "cloud") and _is_seen(cloud[0], views)
+    if source == "auto":
+        source = "cloud" if is_seen else "depth" if has_depth else "random"
+    if source in ("cloud", "matches"):
+        if cloud is None:
+            lacks = "the data has no points" if source == "cloud" else "photographs share nothing"
+            raise ValueError(f"start.source: {lacks}; use depth, random or auto")
+        return *cloud, source
+    if source == "depth":
+        if not has_depth:
+            raise ValueError("start.source: the data has no depth; use cloud, random or auto")
+        return *_from_depth(views, config.count, random), source
+    return *_at_random(views, config.count, random), source
+
+
+def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
+    """Whether photographs show any of the points; a warning where they show few."""
+    seen, disparities = np.zeros(len(points), bool), np.zeros(len(points))
+    extent = extent_of(np.stack([view.viewmat for view in views]))
+    for view in views:
+        height, width = view.image.shape[:2]
+        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        ahead = local[:, 2] > 0
+        x, y, z = (local[ahead] @ view.K.T).T
+        shown = (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
+        seen[ahead] |= shown
+        disparities[np.flatnonzero(ahead)[shown]] = view.K[0, 0] * extent.radius / z[shown]
+    if seen.mean() < _FEW:
+        warnings.warn(
+            f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
+            "the unit of the poses?",
+            stacklevel=2,
+        )
+    elif (flat := np.median(disparities[seen])) < _FLAT_PX and not extent.is_point:
+        warnings.warn(
+            f"the data's points lie so far away that cameras {extent.radius:.3g} apart see them shifted by "
+            f"{flat:.2g} pixels: are they in the unit of the poses?",
+            stacklevel=2,
+        )
+    return bool(seen.any())
+
+
+def _known_depth(view: View) -> np.ndarray:
+    """Depth where it is known and counts, else 0."""
+    if view.depth is None:
+        return np.zeros((1, 1))
+    known = np.isfinite(view.depth) & (view.depth > 0)
+    return np.where(known if view.mask is None else known & view.mask, view.depth, 0)
+
+
+def _from_depth(views, count, random):
+    """Pixels with depth, as many from each view."""
+    each = -(-count // len(views))
+    points, colors = [], []
+    for view in views:
+        known = _known_depth(view)
+        if not known.any():
+            continue
+        some = points_from_rgbd(view.image, known, view.viewmat, view.K)
+        kept = random.permutation(len(some[0]))[:each]
+        points.append(some[0][kept])
+        colors.append(some[1][kept])
+    return np.concatenate(points), np.concatenate(colors)
+
+
+def _at_random(views, count, random):
+    """Pixels of the views at depths about that of what they look at, each coloured as its pixel is."""
+    extent = extent_of(np.stack([view.viewmat for view in views]))
+    points, colors = np.zeros((count, 3)), np.zeros((count, 3))
+    chosen: Int[np.ndarray, "count"] = random.integers(len(views), size=count)
+    for v in np.unique(chosen):
+        view, rows = views[v], np.flatnonzero(chosen == v)
+        height, width = view.image.shape[:2]
+        row, column = random.integers(height, size=len(rows)), random.integers(width, size=len(rows))
+        rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
+        middle = max(float((rotation @ extent.focus + shift)[2]), 0.3 * extent.radius)
+        depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))  # even in disparity, 0.4 to 4 times as far
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1) @ np.linalg.inv(view.K).T
+        points[rows] = (rays * depth[:, None] - shift) @ rotation
+        colors[rows] = view.image[row, column] / 255
+    return points, colors
+
+
+def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int) -> Gaussians:
+    """Spheres on the points (some of them, where there are more than slots), and empty slots behind them.
+
+    Args:
+        points: [M, 3].
+        colors: [M, 3], 0 to 1.
+        slots: how many Gaussians there may ever be.
+        config: their opacity and scale.
+        seed: of which points are taken.
+    """
+    if len(points) > slots:
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:slots])
+        points, colors = points[chosen], colors[chosen]
+    started = gaussians_from_points(points, colors, opacity=config.opacity, scale_factor=config.scale)
+    rest = slots - started.num
+    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], rest, axis=0)]), started)
+    logits = np.asarray(padded.logit_opacities).copy()
+    logits[started.num :] = EMPTY_LOGIT
+    fields = {name: jnp.asarray(getattr(padded, name)) for name in ("means", "quats", "log_scales", "sh0")}
+    return Gaussians(**fields, logit_opacities=jnp.asarray(logits))

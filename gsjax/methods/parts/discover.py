@@ -1,0 +1,258 @@
+"""From a canonical scene and synchronised views to pieces that may move: how a discovery begins."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from scipy.spatial import cKDTree
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.parts.anchor import Anchor
+from gsjax.methods.parts.config import PartsConfig
+from gsjax.methods.parts.lift import label_votes, lift_masks
+from gsjax.methods.parts.masks import order_of_views, propagated_masks
+from gsjax.methods.parts.stream import Canonical
+from gsjax.methods.parts.trajectory import BACKGROUND
+from gsjax.methods.parts.weights import Field, new_field, saying
+from gsjax.methods.protocols import Segmenter
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import Frame, one_camera
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.render import plan_render, render
+
+_SURELY_FIXED = 0.9  # share of the background above which a Gaussian is not asked again ...
+_NEAR = 3.0  # ... unless something that moves is this near, in typical distances between Gaussians
+_NEIGHBORS = 8
+_LEAST_SHOWN = 0.3  # of a pixel, by what earlier views have named, for the name to be told
+
+
+@runtime_checkable
+class Views(Protocol):
+    """Synchronised cameras over time; `gsjax.data.Sequence` is one."""
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        ...
+
+    @property
+    def num_cameras(self) -> int:
+        """C."""
+        ...
+
+    def image(self, t: int, c: int) -> np.ndarray:
+        """RGB of camera `c` in frame `t`, [H,W,3] uint8."""
+        ...
+
+    def frame(self, t: int) -> Frame:
+        """All cameras of frame `t` as arrays."""
+        ...
+
+
+class Start(NamedTuple):
+    """What is known before anything is followed.
+
+    Attributes:
+        anchor: the canonical frame, which `gaussians` shows.
+        order: rows of the given Gaussians, those that may move first.
+        canonical: the scene in that order.
+        field: of skinning weights, warmed up.
+        masks: pieces that changed, in every view of the anchor frame, [C,H,W].
+        losses: of lifting and of the warm-up.
+    """
+
+    anchor: Anchor
+    order: Int[np.ndarray, "N"]
+    canonical: Canonical
+    field: Field
+    masks: Int[np.ndarray, "C H W"]
+    losses: dict[str, np.ndarray]
+
+
+def begin(
+    views: Views,
+    gaussians: Gaussians,
+    anchor: Anchor,
+    moved: Bool[np.ndarray, "C H W"],
+    config: PartsConfig,
+    segmenter: Segmenter | None,
+    key: PRNGKeyArray,
+    masks: Int[np.ndarray, "C H W"] | None = None,
+) -> Start:
+    """Pieces that may move: what changed against the anchor's pictures, lifted to the scene's Gaussians.
+
+    Args:
+        views: what the cameras saw.
+        gaussians: the scene at the anchor frame, as `gsjax.methods.fit` fits it.
+        anchor: from `choose_anchor`.
+        moved: from `moved_pixels`.
+        config: how.
+        segmenter: what belongs together in a picture; not asked where masks are given.
+        key: of the field.
+        masks: of the pieces in every view, where they are known.
+
+    Raises:
+        ValueError: there is one camera only, next to no Gaussian, or nothing that may move.
+    """
+    if views.num_cameras < 2:
+        raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in space")
+    if gaussians.num <= _NEIGHBORS:
+        raise ValueError(
+            f"gaussians: expected a scene of more than {_NEIGHBORS}, found {gaussians.num}; fit one to the "
+            "anchor frame"
+        )
+    frame = views.frame(anchor.frame)
+    plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
+    if masks is None:
+        if not config.discover.difference:
+            moved = np.ones_like(moved)
+        if segmenter is None:
+            raise ValueError("segmenter, masks: expected one of them, found none")
+        masks = find_masks(views, gaussians, frame, plan, anchor, moved, config, segmenter)
+    if not (masks > 0).any():
+        raise ValueError(
+            "masks: expected a piece of which a third changed in other frames, found none; choose another "
+            "anchor, a lower discover.threshold, or discover.difference off"
+        )
+    slots = config.discover.most_parts + 1
+    logits, lifting = lift_masks(
+        gaussians, frame.cameras, plan, masks, slots, config.discover.lift_iterations
+    )
+    weights = np.asarray(jax.nn.softmax(logits))
+    order, count = _movable_first(np.asarray(gaussians.means), weights)
+    weights = weights[order[:count]]
+    labels = weights.argmax(-1)
+    if not (labels != BACKGROUND).any():
+        raise ValueError(
+            f"gaussians: expected some that show the {masks.max()} pieces that changed, found none among "
+            f"{gaussians.num}; is this the scene at frame {anchor.frame}?"
+        )
+    movable, fixed = take(gaussians, order[:count]), take(gaussians, order[count:])
+    alive = np.isin(np.arange(slots), [BACKGROUND, *np.unique(labels)])
+    weights = np.where(alive, weights, 0)
+    weights /= weights.sum(-1, keepdims=True)
+    field, located = new_field(key, config, movable.means, slots)
+    field, warming = saying(field, located, jnp.asarray(weights), jnp.asarray(alive))
+    means = np.asarray(gaussians.means)[order]
+    centers = centers_of(means[:count], labels, slots)
+    canonical = Canonical(
+        movable,
+        fixed,
+        located,
+        jnp.asarray(centers),
+        jnp.asarray(radii_of(means[:count], labels, centers)),
+        jnp.asarray(pixel_width(means[:count][labels != BACKGROUND], frame.cameras), means.dtype),
+        jnp.asarray(alive),
+        jnp.asarray(cKDTree(means).query(means[:count], k=_NEIGHBORS + 1)[1][:, 1:], jnp.int32),
+    )
+    losses = {"lifting": lifting, "warming": warming}
+    return Start(anchor, order, canonical, field, masks, losses)
+
+
+def find_masks(
+    views: Views,
+    gaussians: Gaussians,
+    frame: Frame,
+    plan: Plan,
+    anchor: Anchor,
+    moved: Bool[np.ndarray, "C H W"],
+    config: PartsConfig,
+    segmenter: Segmenter,
+) -> Int[np.ndarray, "C H W"]:
+    """Masks of what changed, by the same numbers in all views; see `masks`.
+
+    Args:
+        views: the recording.
+        gaussians, plan: the canonical scene, and what it is drawn with.
+        frame: the anchor's.
+        anchor: which frame that is.
+        moved: pixels that changed.
+        config: how.
+        segmenter: finds masks in one picture.
+    """
+    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(views.num_cameras)]
+    depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
+    pictures = [views.image(anchor.frame, c) for c in range(views.num_cameras)]
+    first = int(moved.mean((1, 2)).argmax())
+    order = order_of_views(
+        np.asarray(frame.cameras.viewmat), first, np.median(np.asarray(gaussians.means), 0)
+    )
+    room = 4 * config.discover.most_parts  # pieces that views name before the smallest are dropped
+    total = np.zeros((gaussians.num, room), np.float32)
+
+    def known(c: int, last: int, mask: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "H W"]:
+        """What earlier views, of which the last is new, tell of view c."""
+        nonlocal total
+        total += label_votes(gaussians, one_camera(frame.cameras, last), plan, mask[None], room)
+        sums = total.sum(-1, keepdims=True)
+        shares = jnp.asarray(np.where(sums > 1e-2, total / np.maximum(sums, 1e-6), 0.0))
+        drawn = render(gaussians, one_camera(frame.cameras, c), plan, features=shares).features
+        assert drawn is not None
+        shown = np.asarray(drawn[0])
+        return np.where(shown.max(-1) > _LEAST_SHOWN, shown.argmax(-1), -1)
+
+    return propagated_masks(
+        pictures,
+        depths,
+        np.asarray(frame.cameras.K),
+        moved,
+        order,
+        segmenter,
+        known,
+        config.discover.most_parts,
+        room - 1,
+    )
+
+
+def centers_of(
+    means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], slots: int
+) -> Float[np.ndarray, "P 3"]:
+    """The centroid of each part's Gaussians, metres; that of all for a part that has none.
+
+    Args:
+        means: of the Gaussians, metres.
+        labels: the part of each.
+        slots: how many parts there may be.
+    """
+    centers = np.tile(means.mean(0), (slots, 1))
+    for part in np.unique(labels):
+        centers[part] = means[labels == part].mean(0)
+    return centers.astype(means.dtype)
+
+
+def radii_of(
+    means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], centers: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "P"]:
+    """How far each part reaches from its handle, root mean square, metres; 1 for a part without Gaussians.
+
+    Args:
+        means: of the Gaussians, metres.
+        labels: the part of each.
+        centers: of all parts, metres.
+    """
+    squared = np.sum((means - centers[labels]) ** 2, axis=1)
+    sums, counts = (np.bincount(labels, w, len(centers)) for w in (squared, np.ones_like(squared)))
+    radii = np.sqrt(sums / np.maximum(counts, 1))
+    return np.where(radii > 0, radii, 1.0).astype(means.dtype)
+
+
+def pixel_width(points: Float[np.ndarray, "n 3"], cameras: Camera) -> float:
+    """What a pixel is wide at points, metres, in the median over cameras."""
+    viewmats, Ks = np.asarray(cameras.viewmat), np.asarray(cameras.K)
+    depths = np.median(points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3], axis=0)
+    return float(np.median(np.maximum(depths, 1e-6) / Ks[:, 0, 0]))
+
+
+def _movable_first(
+    means: Float[np.ndarray, "N 3"], weights: Float[np.ndarray, "N P"]
+) -> tuple[Int[np.ndarray, "N"], int]:
+    """Rows in order, those that may move first, and how many these are: what is not surely background, and
+    what lies so near to a piece that its border may run there."""
+    moves = weights[:, BACKGROUND] < 0.5
+    tree = cKDTree(means[moves])
+    spacing = np.median(tree.query(means[moves], k=2)[0][:, 1]) if moves.sum() > 1 else 0.0
+    near = tree.query(means)[0] < _NEAR * spacing if moves.any() else moves
+    may = (weights[:, BACKGROUND] < _SURELY_FIXED) | near
+    return np.concatenate([np.flatnonzero(may), np.flatnonzero(~may)]), int(may.sum())

@@ -1,0 +1,299 @@
+"""What an edit script can ask for: a frozen dataclass for each operation, checked when it is made.
+
+A field's name is its key in scripts; only `from` and `to` are `begin` and `end`, for Python's sake.
+Seconds are the film's, from 0, as the edits above have left it; angles are degrees, lengths metres.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gsjax.methods.parts import edits
+from gsjax.methods.parts.entries import (
+    Entry,
+    Vector,
+    did_you_mean,
+    instance,
+    number,
+    read,
+    told,
+    vector,
+    whole,
+)
+from gsjax.methods.parts.film import Film, Layer, composite, placed
+from gsjax.methods.parts.operation import SECONDS, Edit, LookEdit, TimeEdit
+from gsjax.methods.parts.trajectory import Trajectory
+
+_AXIS = vector("a direction of the world", least=1e-6)
+_POINT = vector("a point in metres")
+_DEGREES = number("degrees")
+_OPACITY = number("a factor on opacities, 0 to 1", 0.0, 1.0)
+_RATE = number("a factor from 0.01 to 100, or from -0.01 to -100 for backwards", 0.01, 100.0, of=abs)
+_SIZE = number("a factor from 0.001 to 1000", 1e-3, 1e3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed(TimeEdit):
+    """Parts go faster, slower or backwards."""
+
+    factor: float = field(metadata=_RATE | {"example": 2})
+
+    def ends(self, last: float) -> float:
+        begin, end = self.stretch(last)
+        return max(last, end) + (end - begin) * (1 / abs(self.factor) - 1)
+
+    def retimed(self, trajectory, parts, begin, end):
+        return edits.speed(trajectory, parts, self.factor, begin, end, stay=self.end is None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loop(TimeEdit):
+    """Parts do the same again and again; without end unless told how many times."""
+
+    times: int | None = field(default=None, metadata=whole(1, 1000))
+    bounce: bool = field(default=False, metadata=instance(bool, "true or false"))
+
+    def ends(self, last: float) -> float:
+        begin, end = self.stretch(last)
+        if self.times is None:
+            return max(last, end)
+        lasts = (end - begin) * self.times * (2 if self.bounce else 1)
+        follows = 0.0 if self.end is None else max(last - end, 0.0) + (end - begin if self.bounce else 0.0)
+        return begin + lasts + follows
+
+    def retimed(self, trajectory, parts, begin, end):
+        return edits.loop(trajectory, parts, begin, end, self.times, self.bounce, stay=self.end is None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Freeze(TimeEdit):
+    """Parts stand still as they were `at` a time, and go on from there after `to`, if that is given."""
+
+    at: float | None = field(default=None, metadata=SECONDS)
+
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        return parts
+
+    def stretch(self, last: float) -> tuple[float, float]:
+        begin = self.begin if self.begin is not None else self.at or 0.0
+        end = math.inf if self.end is None else self.end
+        if not begin < end:
+            raise ValueError(f"to: expected a time after {begin:g}, when parts stop, found {end:g}")
+        return begin, end
+
+    def ends(self, last: float) -> float:
+        begin, end = self.stretch(last)
+        left = last - (begin if self.at is None else self.at)
+        return last if end == math.inf else end + max(left, 0.0)
+
+    def retimed(self, trajectory, parts, begin, end):
+        return edits.freeze(trajectory, parts, self.at, begin, end)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Isolate(Freeze):
+    """Only these parts keep moving: all others freeze."""
+
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        return edits.others(trajectory, parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fade(LookEdit):
+    """Parts become translucent; they vanish unless told how far."""
+
+    opacity: float = field(default=0.0, metadata=_OPACITY)
+
+    def changed(self, layer, parts, share):
+        return edits.fade(layer.trajectory, parts, self.opacity, share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ghost(Fade):
+    """Only these parts are shown: all others, the background too, vanish or become translucent."""
+
+    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+        return edits.others(trajectory, parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale(LookEdit):
+    """Parts are larger or smaller, about their handles."""
+
+    factor: float = field(metadata=_SIZE | {"example": 0.5})
+
+    def changed(self, layer, parts, share):
+        return edits.scale(layer.trajectory, parts, self.factor, share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move(LookEdit):
+    """Parts are elsewhere, `by` so many metres along the axes of the world."""
+
+    by: Vector = field(metadata=vector("metres") | {"example": (0, 0, 0.1)})
+
+    def changed(self, layer, parts, share):
+        return edits.move(layer.trajectory, parts, jnp.array(self.by), share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotate(LookEdit):
+    """Parts are turned on top of what they do, about their handles or a point of the canonical scene."""
+
+    axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
+    degrees: float = field(metadata=_DEGREES | {"example": 30})
+    about: Vector | None = field(default=None, metadata=_POINT)
+
+    def changed(self, layer, parts, share):
+        arm = _arm(layer, parts, self.about)
+        return edits.rotate(layer.trajectory, parts, _turn(self.axis, self.degrees), arm, share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Redirect(LookEdit):
+    """What parts do is turned, not the parts: a lid opens to another side, a drawer slides another way."""
+
+    axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
+    degrees: float = field(metadata=_DEGREES | {"example": 30})
+    about: Vector | None = field(default=None, metadata=_POINT)
+    at: float | None = field(default=None, metadata=SECONDS)
+
+    def changed(self, layer, parts, share):
+        turn, arm = _turn(self.axis, self.degrees), _arm(layer, parts, self.about)
+        return edits.redirect(layer.trajectory, parts, turn, arm, self.at, share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Amplify(LookEdit):
+    """Parts go so many times as far from where they were `at` a time, the film's start unless given."""
+
+    factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
+    at: float | None = field(default=None, metadata=SECONDS)
+
+    def changed(self, layer, parts, share):
+        return edits.amplify(layer.trajectory, parts, self.factor, self.at, share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Echo(LookEdit):
+    """Copies follow parts (run ahead if `every` is negative), each fainter than the last by `fade`."""
+
+    copies: int = field(default=3, metadata=whole(1, 100))
+    every: float = field(default=0.2, metadata=number("seconds other than 0", 1e-3, 1e4, of=abs))
+    fade: float = field(default=0.5, metadata=_OPACITY)
+
+    def adds_until(self, last: float) -> float:
+        return min(last + max(self.copies * self.every, 0.0), math.inf if self.end is None else self.end)
+
+    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
+        scene, trajectory = film[0].scene, film[0].trajectory
+        copies = [
+            edits.echo(trajectory, parts, k * self.every, self.fade**k) for k in range(1, self.copies + 1)
+        ]
+        hidden = 1 - self.share(film)
+        return *film, *(Layer(scene, edits.fade(copy, parts, share=hidden)) for copy in copies)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place(Entry):
+    """Where parts of another scene are put.
+
+    Attributes:
+        to: where the middle of their handles comes to be at the start; where it is there unless given.
+        axis, degrees, scale: how they are turned and how much larger they are, about that middle.
+    """
+
+    to: Vector | None = field(default=None, metadata=_POINT)
+    axis: Vector = field(default=(0.0, 0.0, 1.0), metadata=_AXIS)
+    degrees: float = field(default=0.0, metadata=_DEGREES)
+    scale: float = field(default=1.0, metadata=_SIZE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Composite(LookEdit):
+    """Parts of another run are brought in, after `edits` of their own, and put in their `place`."""
+
+    from_run: str = field(metadata=instance(str, "the folder of a run") | {"example": "runs/other"})
+    place: Place = field(
+        default=Place(),
+        metadata={
+            "check": lambda value: value if isinstance(value, Place) else read(Place, value),
+            "wanted": "where they are put, {to: [x, y, z], axis: [x, y, z], degrees: 90, scale: 1}",
+        },
+    )
+    edits: tuple[Edit, ...] = field(
+        default=(), metadata={"check": lambda value: read_edits(value), "wanted": "a list of edits"}
+    )
+
+    def adds_until(self, last: float) -> float:
+        return last if self.end is None else min(last, self.end)
+
+    def joined(self, film: Film, other: Film, parts: list[int]) -> Film:
+        """The film with `parts` of the other's first layer in it, and its further layers whole."""
+        first, place, hidden = other[0], self.place, 1 - self.share(film)
+        handles = first.scene.centers + first.trajectory.poses.translations[0]
+        middle = jnp.mean(handles[jnp.array(parts)], axis=0)
+        shift = jnp.zeros(3) if place.to is None else jnp.array(place.to) - middle
+        turn, everything = _turn(place.axis, place.degrees), range(first.scene.num_parts)
+        faded = [Layer(at.scene, edits.fade(at.trajectory, everything, share=hidden)) for at in other]
+        there = [placed(layer, turn, shift, place.scale, middle) for layer in faded]
+        return *composite(film, there[0], parts), *there[1:]
+
+
+OPERATIONS: dict[str, type[Edit]] = {
+    kind.operation(): kind
+    for kind in (
+        *(Isolate, Freeze, Speed, Loop),
+        *(Ghost, Fade, Echo, Composite),
+        *(Scale, Move, Rotate, Redirect, Amplify),
+    )
+}
+"""By their names in scripts."""
+
+
+def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
+    """Edits from a list of mappings, or of edits.
+
+    Args:
+        first: the number that messages call the first of them by.
+
+    Raises:
+        ValueError: an entry is not as expected; the message begins with its number and operation.
+    """
+    if not isinstance(found, (list, tuple)):
+        raise ValueError(f"expected a list of edits, found {told(found)}")
+    return tuple(_read_edit(entry, number) for number, entry in enumerate(found, first))
+
+
+def label(number: int, operation: str) -> str:
+    """What messages call an edit."""
+    return f"edit {number} ({operation})"
+
+
+def _read_edit(found: Any, number: int) -> Edit:
+    if isinstance(found, Edit):
+        return found
+    if not isinstance(found, dict) or "op" not in found:
+        raise ValueError(f"edit {number}: expected a mapping with the key op, found {told(found)}")
+    name, rest = found["op"], {k: value for k, value in found.items() if k != "op"}
+    if not isinstance(name, str) or name not in OPERATIONS:
+        known = f"one of {', '.join(OPERATIONS)}"
+        raise ValueError(f"edit {number}: op: expected {known}, found {did_you_mean(name, OPERATIONS)}")
+    try:
+        return read(OPERATIONS[name], rest)
+    except ValueError as error:
+        raise ValueError(f"{label(number, name)}: {error}") from None
+
+
+def _turn(axis: Vector, degrees: float) -> Float[Array, "3"]:
+    """Axis times angle, radians."""
+    return jnp.array(np.deg2rad(degrees) * np.array(axis) / np.linalg.norm(axis))
+
+
+def _arm(layer: Layer, parts: list[int], about: Vector | None) -> Float[Array, "parts 3"] | None:
+    """From the handles of parts to a point of the canonical scene."""
+    return None if about is None else jnp.array(about) - layer.scene.centers[jnp.array(parts)]

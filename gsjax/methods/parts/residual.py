@@ -1,0 +1,72 @@
+"""The stream's loss as residuals of the handles' motions, for Gauss-Newton through `gsjax.optim`."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from gsjax.methods.parts.config import StreamConfig
+from gsjax.methods.parts.screws import pose_of
+from gsjax.methods.parts.stream import FINAL_TEAR, StreamBatch, gaps_between, posed
+from gsjax.methods.parts.trajectory import BACKGROUND
+from gsjax.optim.residuals import block_residual
+from gsjax.scene.handles import HandlePose
+from gsjax.scene.render import render
+
+_LIMIT = 1.0  # of differences of colour: none is left out, as in the loss
+
+
+def pose_residual(
+    motions: jaxlie.SE3,
+    batch: StreamBatch,
+    *,
+    step: Any,
+    key: Any,
+    config: StreamConfig,
+    block: int = 2,
+    softness: float = 0.1,
+) -> tuple[dict[str, Float[Array, "..."]], dict[str, Any]]:
+    """The differences of `stream_loss` by the pose alone, its SSIM left out. Half their squares sum up to the
+    loss for each pixel that counts, but for differences that `block_residual` rounds off.
+
+    Args:
+        motions: of all P handles, `screws.motions_of` their pose; the background's stays.
+        batch: with a plan whose derivative is "forward", for the Jacobian is made by columns, 6 P of them.
+            Its weights are taken as they are, and the past tells nothing of a pose.
+        step: share of the iterations that is done, which `tear_weight` falls over.
+        key: not used; it is part of the residual's form.
+        block, softness: of `block_residual`.
+    """
+    free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]
+    pose = pose_of(motions)
+    pose = jax.tree.map(lambda a: jnp.where(free, a, jax.lax.stop_gradient(a)), pose)
+    drawn = render(
+        posed(batch.canonical, batch.weights, pose, config.blend),
+        batch.now.frame.cameras,
+        batch.plan,
+        roi=batch.now.counts,
+    )
+    frame, counts = batch.now.frame, batch.now.counts.astype(drawn.colors.dtype)[..., None]
+    pixels = counts.sum()
+    residual = partial(block_residual, block=block, softness=softness)
+    residuals = {
+        "color": residual(drawn.colors - frame.images, config.l1_weight / 3 * counts, _LIMIT),
+        "tear": _torn(batch, pose, config) * jnp.sqrt(pixels * FINAL_TEAR**step),
+    }
+    if frame.depths is not None and config.depth_weight:
+        known = counts[..., 0] * (frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
+        share = config.depth_weight / config.depth_limit * pixels / jnp.maximum(known.sum(), 1)
+        gap = (drawn.depths - frame.depths)[..., None]
+        residuals["depth"] = residual(gap, share * known[..., None], config.depth_limit)
+    return residuals, {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
+
+
+def _torn(batch: StreamBatch, pose: HandlePose, config: StreamConfig) -> Float[Array, "M k 3"]:
+    """Half its squares sum up to `tearing`, weighted as a frame's first step does."""
+    gaps = gaps_between(batch.canonical, batch.weights, pose)
+    scale = config.tear_scale * batch.canonical.pixel
+    far = jnp.sqrt(jnp.sum(gaps**2, axis=-1, keepdims=True) + scale**2)
+    return gaps / far * jnp.sqrt(2 * config.tear_weight / (gaps.shape[0] * gaps.shape[1]))

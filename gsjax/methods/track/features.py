@@ -1,0 +1,258 @@
+"""Features of Gaussians from features of pixels (section III-A): in the first frame; then they ride along.
+
+Rendering is linear in what is rendered: F = W f, where W [pixels, N] holds the weight of each Gaussian in
+each pixel. W is never formed: a render applies it, and the render's VJP applies its transpose, exactly. The
+paper names two ways from maps m to features f. *Projection* gives each Gaussian the mean of the pixels that
+it shows in, weighted by how much it shows there:
+
+    f = (W^T m) / (W^T 1)
+
+*Distillation* looks for those features whose render comes closest to the maps:
+
+    min_f  |W f - a m|^2 + damping |f - f_projected|^2
+
+in which a = W 1 is the rendered alpha: what is half transparent shows half a feature. It is a linear least
+squares problem, so conjugate gradients solve it without a rate that somebody would have to choose; W^T 1 is
+the preconditioner, for it bounds what a row of W^T W can add up to. Both give a constant map back as it is.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gsjax.geometry.cameras import Camera
+from gsjax.geometry.neighbors import nearest
+from gsjax.methods.track.motion import Pose, place
+from gsjax.methods.track.scene import TrackedScene
+from gsjax.optim.step import Step, all_finite, keep_if
+from gsjax.rasterize.plan import Plan
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.render import plan_render, render
+
+MIN_WEIGHT = 0.1
+"""A Gaussian with less weight in all pixels together counts as unseen."""
+_CHANNELS = 16  # rendered at a time: hundreds, as foundation models have, compile slowly and fill the memory
+
+
+class FeatureBatch(NamedTuple):
+    """What distillation is given.
+
+    Attributes:
+        gaussians: the scene, frozen.
+        cameras: C of them.
+        maps: the features of each pixel.
+        valid: 1 for each pixel that counts, 0 for the others.
+        prior: features that damping pulls towards.
+        weights: W^T 1 of each Gaussian.
+        damping: in the units of `weights`, pixels.
+        plan: from `plan_render`.
+    """
+
+    gaussians: Gaussians
+    cameras: Camera
+    maps: Float[Array, "c height width d"]
+    valid: Float[Array, "c height width"]
+    prior: Float[Array, "n d"]
+    weights: Float[Array, "n"]
+    damping: Float[Array, ""]
+    plan: Plan
+
+
+class DistillState(NamedTuple):
+    """Conjugate gradients, a solution of its own for each channel."""
+
+    residual: Float[Array, "n d"]
+    direction: Float[Array, "n d"]
+    energy: Float[Array, "d"]
+
+
+def project_features(
+    scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "..."]
+) -> Float[np.ndarray, "n d"]:
+    """Each Gaussian takes the mean of the pixels that it shows in. On the host.
+
+    One that shows nowhere takes the feature of the nearest that does and has its label, for an object's far
+    side is mostly of the kind of its near one; where none of its label shows, it has zeros.
+
+    Args:
+        scene: at the time of `frame`.
+        frame: its cameras see what `maps` describe.
+        maps: a feature for each pixel, [C,H,W,D]; pixels that are not finite do not count.
+
+    Raises:
+        ValueError: maps have another number of cameras or another size than the frame.
+    """
+    maps, valid = _checked(maps, frame)
+    return _project(scene, frame, maps, valid, plan_render(scene.gaussians, frame.cameras))[0]
+
+
+def distill_features(
+    scene: TrackedScene,
+    frame: Frame,
+    maps: Float[Array | np.ndarray, "..."],
+    *,
+    iterations: int = 10,
+    damping: float = 0.1,
+) -> Float[np.ndarray, "n d"]:
+    """The features whose render comes closest to the maps; what shows nowhere stays projected. On the host.
+
+    Args:
+        scene, frame, maps: as for `project_features`.
+        iterations: steps of conjugate gradients; each is one render and its transpose.
+        damping: how strongly a Gaussian holds on to its projected feature, in pixels of weight. Without any,
+            those that hardly show would take whatever values make up for others.
+
+    Raises:
+        ValueError: as `project_features`; or damping is negative.
+    """
+    if not damping >= 0:
+        raise ValueError(f"damping: got {damping}, want 0 or more")
+    maps, valid = _checked(maps, frame)
+    plan = plan_render(scene.gaussians, frame.cameras)
+    prior, weights = _project(scene, frame, maps, valid, plan)
+    known = (jnp.asarray(weights), jnp.asarray(damping, maps.dtype), plan)
+
+    def solve(part: Array, prior: Array) -> Array:
+        batch = FeatureBatch(scene.gaussians, frame.cameras, part, valid, prior, *known)
+        step = feature_distiller(batch)
+        features, state = prior, step.init(prior)
+        for i in range(iterations):
+            features, state, _ = step.update(features, state, batch, step=i, key=None)
+        return features
+
+    return _in_chunks(solve, maps, prior)
+
+
+def feature_distiller(first: FeatureBatch) -> Step:
+    """Conjugate gradients on distillation's normal equations, one iteration an update.
+
+    params: the features [N,D], which begin as `first.prior`. state: `DistillState`. batch: `FeatureBatch`,
+    the same each time. info: `energy` [D], the squared preconditioned residual of each channel.
+    """
+
+    def init(params: Float[Array, "n d"]) -> DistillState:
+        gaussians, cameras, maps, valid, prior, _, damping, plan = first
+        residual = _residual(params, maps, gaussians, cameras, valid, plan)
+        residual += damping * (prior - params)
+        direction = residual / _bound(first)
+        return DistillState(residual, direction, jnp.sum(residual * direction, axis=0))
+
+    def update(params, state: DistillState, batch: FeatureBatch, *, step: Any, key: Any):
+        gaussians, cameras, maps, valid, _, _, damping, plan = batch
+        nothing = jnp.zeros_like(maps)
+        along = -_residual(state.direction, nothing, gaussians, cameras, valid, plan)
+        along += damping * state.direction
+        length = _ratio(state.energy, jnp.sum(state.direction * along, axis=0))
+        features = params + length * state.direction
+        residual = state.residual - length * along
+        scaled = residual / _bound(batch)
+        energy = jnp.sum(residual * scaled, axis=0)
+        direction = scaled + _ratio(energy, state.energy) * state.direction
+        new = (features, DistillState(residual, direction, energy))
+        sound = all_finite(new)
+        params, state = keep_if(sound, new, (params, state))
+        return params, state, {"energy": state.energy, "skipped": ~sound}
+
+    return Step(init, update)
+
+
+def render_features(
+    scene: TrackedScene,
+    pose: Pose,
+    features: Float[Array, "n d"],
+    cameras: Camera,
+    plan: Plan | None = None,
+) -> tuple[Float[Array, "c height width d"], Float[Array, "c height width"]]:
+    """Feature maps of the scene as it stands, from any cameras, and their alphas.
+
+    A pixel's feature is the mean over what it shows, so that it does not fade where alpha does; zero where
+    nothing is drawn.
+
+    Args:
+        plan: from `plan_render(place(scene, pose), cameras)`; needed under jit.
+    """
+    rendered = render(place(scene, pose), cameras, plan, features=features)
+    assert rendered.features is not None
+    alphas = rendered.alphas[..., None]
+    return jnp.where(alphas > 1e-3, rendered.features / jnp.maximum(alphas, 1e-3), 0.0), rendered.alphas
+
+
+@partial(jax.jit, static_argnames="faded")
+def _residual(
+    features: Float[Array, "n d"],
+    maps: Float[Array, "c height width d"],
+    gaussians: Gaussians,
+    cameras: Camera,
+    valid: Float[Array, "c height width"],
+    plan: Plan,
+    faded: bool = True,
+) -> Float[Array, "n d"]:
+    """W^T (a m - W f) over the valid pixels; not `faded` leaves out a. All that is costly happens here."""
+
+    def draw(features):
+        rendered = render(gaussians, cameras, plan, features=features)
+        return rendered.features, rendered.alphas
+
+    drawn, transpose, alphas = jax.vjp(draw, features, has_aux=True)
+    target = alphas[..., None] * maps if faded else maps
+    return transpose(valid[..., None] * (target - drawn))[0]
+
+
+def _project(
+    scene: TrackedScene, frame: Frame, maps: Array, valid: Array, plan: Plan
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n"]]:
+    """Projected features, and W^T 1."""
+
+    def gather(part: Array) -> Array:
+        nothing = jnp.zeros((scene.gaussians.num, part.shape[-1]), part.dtype)
+        return _residual(nothing, part, scene.gaussians, frame.cameras, valid, plan, faded=False)
+
+    sums = _in_chunks(gather, jnp.concatenate([maps, jnp.ones_like(maps[..., :1])], axis=-1))
+    weights, points = sums[:, -1], np.asarray(scene.gaussians.means)
+    features, seen = sums[:, :-1] / np.maximum(weights, 1e-12)[:, None], weights >= MIN_WEIGHT
+    features[~seen] = 0.0
+    labels = np.asarray(scene.labels)
+    for label in np.unique(labels[~seen]):
+        lacking, giving = (np.flatnonzero((labels == label) & rows) for rows in (~seen, seen))
+        found, _ = nearest(points[lacking], points[giving])
+        features[lacking[found >= 0]] = features[giving[found[found >= 0]]]
+    return features, weights
+
+
+def _bound(batch: FeatureBatch) -> Float[Array, "n 1"]:
+    """The preconditioner."""
+    return (batch.weights + batch.damping + 1e-6)[:, None]
+
+
+def _ratio(a: Float[Array, "d"], b: Float[Array, "d"]) -> Float[Array, "d"]:
+    """a / b, and 0 where a channel has converged."""
+    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
+
+
+def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
+    """Finite maps, and 1 for each pixel where they were."""
+    wanted = frame.images.shape[:3]
+    if np.ndim(maps) != 4 or maps.shape[:3] != wanted:
+        raise ValueError(f"maps: got shape {np.shape(maps)}, want {[*wanted, 'D']} as the frame's images")
+    maps = jnp.asarray(maps, frame.images.dtype)
+    valid = jnp.isfinite(maps).all(-1)
+    return jnp.where(valid[..., None], maps, 0.0), valid.astype(maps.dtype)
+
+
+def _in_chunks(function: Callable, *arrays: Array | np.ndarray) -> np.ndarray:
+    """`function` of a few channels at a time, the last axis of each array; its results side by side."""
+    count, results = arrays[0].shape[-1], []
+    size = min(count, _CHANNELS)
+    for start in range(0, count, size):
+        parts = [jnp.asarray(array[..., start : start + size]) for array in arrays]
+        # One shape for all, so that one program serves all.
+        pad = size - parts[0].shape[-1]
+        parts = [jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, pad)]) for part in parts]
+        results.append(np.array(function(*parts)))
+    return np.concatenate(results, axis=-1)[..., :count]

@@ -1,0 +1,85 @@
+"""Photometric optimisation of the first frame's Gaussians, before anything moves."""
+
+from collections.abc import Callable
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from gsjax.losses.photometric import photometric_loss, truncated_l1
+from gsjax.methods.track.scene import TrackedScene
+from gsjax.optim.compiler import host_options
+from gsjax.optim.step import gradient_step, per_field_adam
+from gsjax.scene.frame import Frame
+from gsjax.scene.render import plan_render, render
+
+# Means hardly move: depth has measured them. What is learned is how to blend into the pictures.
+RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
+_DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
+
+
+def fit_loss(gaussians, batch, *, step, key):
+    """L1 and D-SSIM on the images, and a truncated depth difference where depth is known.
+
+    Args:
+        gaussians: what trains.
+        batch: (frame, plan).
+        step, key: not used; they are part of a loss's form.
+    """
+    frame, plan = batch
+    rendered = render(gaussians, frame.cameras, plan)
+    loss = photometric_loss(rendered.colors, frame.images)
+    if frame.depths is not None:
+        known = (frame.depths > 0).astype(loss.dtype) * jax.lax.stop_gradient(rendered.alphas > 0.5)
+        loss += _DEPTH_WEIGHT * truncated_l1(rendered.depths, frame.depths, known, _DEPTH_LIMIT)
+    mse = jnp.square(rendered.colors - frame.images).mean()
+    return loss, {
+        "psnr": -10 * jnp.log10(mse),
+        "overflow": rendered.meta.overflow,
+        "needed": rendered.meta.needed,
+    }
+
+
+def fit_scene(
+    scene: TrackedScene, frame: Frame, iterations: int, headroom: float = 1.5
+) -> tuple[TrackedScene, dict]:
+    """The scene after `iterations` steps of Adam on the first frame; re-plans where splats outgrow the plan.
+
+    Args:
+        scene: as it starts.
+        frame: the first.
+        iterations: of Adam.
+        headroom: of the plan, 1 or more.
+
+    Returns:
+        The scene, and the info of the last step.
+
+    Raises:
+        ValueError: no step had a finite loss.
+    """
+    gaussians, info, skipped = scene.gaussians, {}, 0
+    state = _STEP.init(gaussians)
+    plan = plan_render(gaussians, frame.cameras, headroom=headroom)
+    for i in range(iterations):
+        while True:
+            new, new_state, info = _advance()(gaussians, state, (frame, plan), i)
+            if not info["overflow"].any():
+                break
+            plan = plan.grown(int(info["needed"].max()), headroom)
+        gaussians, state, skipped = new, new_state, skipped + int(info["skipped"])
+    if iterations and skipped == iterations:
+        raise ValueError("the first frame could not be fitted: its loss is not finite, whatever the step")
+    return eqx.tree_at(lambda s: s.gaussians, scene, gaussians), info
+
+
+_STEP = gradient_step(fit_loss, per_field_adam(RATES))
+
+
+@cache
+def _advance() -> Callable:
+    """The jitted step; made late, because its options ask which machine this is."""
+    return jax.jit(
+        lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
+        compiler_options=host_options(),
+    )

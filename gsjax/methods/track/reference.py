@@ -1,0 +1,97 @@
+"""The Gaussians that the first mask named, carried along: what a group has to look like.
+
+What joined it later may be a neighbour's.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from gsjax.geometry.cameras import Camera, camera_centers
+from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.geometry.spherical_harmonics import SH_C0
+from gsjax.methods.track.config import AlignConfig
+from gsjax.methods.track.layers import Shown, seen_from
+from gsjax.methods.track.motion import Pose
+from gsjax.methods.track.points import (
+    Points,
+    Sight,
+    carry,
+    first_members,
+    rotated,
+    sum_of_three,
+    tones,
+)
+from gsjax.methods.track.scene import TrackedScene
+
+
+class ReferencePoints(NamedTuple):
+    """Up to p of each group's, where it is believed to be."""
+
+    means: Float[Array, "*k 3 p"]
+    normals: Float[Array, "*k 3 p"]  # outward; 0 where both sides can be seen
+    tones: Float[Array, "*k 3 p"]
+    real: Bool[Array, "*k p"]  # what is not fills up a row
+
+
+def reference_points(scene: TrackedScene, pose: Pose, config: AlignConfig) -> ReferencePoints:
+    """Those of every group, as many as are aligned."""
+    groups = scene.labels[: scene.num_moving]
+    # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
+    with_normal = jnp.any(scene.normals != 0, axis=-1)
+    named = jnp.where(with_normal | ~with_normal.any(), groups, 0)
+    rows, real = first_members(named, scene.num_objects, min(config.centers, scene.num_moving))
+    normals = jnp.einsum("kpij,kpj->kpi", quats_to_matrices(pose.quats[rows]), scene.normals[rows])
+    colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.shading)
+    return ReferencePoints(*(jnp.swapaxes(a, 1, 2) for a in (pose.means[rows], normals, colors)), real)
+
+
+def radii(reference: ReferencePoints, centers: Float[Array, "k 3"]) -> Float[Array, "k"]:
+    """How far they lie from what their groups turn about, root mean square, metres."""
+    squared = jnp.sum((reference.means - centers[..., None]) ** 2, axis=-2)
+    return jnp.sqrt(jnp.sum(squared * reference.real, axis=-1) / jnp.maximum(reference.real.sum(-1), 1))
+
+
+def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap: float) -> Points:
+    """Those of every group, of which cameras look for what they saw in the last frame.
+
+    Args:
+        reference: of every group.
+        shown: the last scene, as `cameras` saw it.
+        gap: how far depth may be off, metres.
+    """
+    count, _, size = reference.means.shape
+    groups = jnp.repeat(jnp.arange(1, count + 1), size)
+    means = jnp.swapaxes(reference.means, 1, 2).reshape(-1, 3)
+    seen = seen_from(means, groups, shown, cameras, gap).reshape(-1, count, size)
+    in_all = (count, len(seen), 3, size)
+    of_each = (jnp.broadcast_to(a[:, None], in_all) for a in (reference.means, reference.tones))
+    return Points(*of_each, jnp.moveaxis(seen, 0, 1) * reference.real[:, None])
+
+
+def as_facing(reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], sight: Sight) -> Points:
+    """Those of one group after a twist about its centre, of which cameras look for what faces them.
+
+    What hides a group where it is believed to be need not hide it elsewhere.
+
+    Args:
+        reference: of the group.
+        twist: translation in metres, rotation vector.
+        center: about which it turns, metres.
+        sight: of the cameras.
+    """
+    moved = carry(Points(reference.means, reference.tones, reference.real), twist, center)
+    normals = rotated(jaxlie.SO3.exp(twist[3:]).as_matrix(), reference.normals)
+    rays = camera_centers(sight.cameras.viewmat)[:, :, None] - moved.means
+    one_sided = jnp.any(normals != 0, axis=0)
+    toward = sum_of_three(normals * rays, axis=1)
+    faces = reference.real & ((toward > 0) | ~one_sided)
+    of_each = (jnp.broadcast_to(a, (len(rays), *a.shape)) for a in (moved.means, reference.tones))
+    return Points(*of_each, faces.astype(rays.dtype))
+
+
+all_facing = jax.vmap(as_facing, in_axes=(0, 0, 0, None))
+"""`as_facing` of many groups."""

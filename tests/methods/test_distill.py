@@ -1,0 +1,396 @@
+"""A field learns what masks say, whichever way it is drawn, and answers in 3D what it is asked."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.distill import (
+    DistillConfig,
+    DistillState,
+    DistillWeightsConfig,
+    back_projected_cosines,
+    begin_distill,
+    carried,
+    compiled_step,
+    distill,
+    features_of,
+    distill_loss,
+    finished,
+    frozen_views,
+    gaussian_cosines,
+    init_field,
+    label_votes,
+    learned_inverse,
+    majority_labels,
+    pixel_cosines,
+    pixel_features,
+    pixel_mask,
+    pseudo_inverse,
+    relevancy,
+    selection_mask,
+    teacher_of_maps,
+    teacher_of_objects,
+    threshold_for,
+    used_part,
+    whole,
+)
+from gsjax.rasterize.frozen import paint, paint_shown
+from gsjax.scene.feature_grid import FeatureGridConfig, locate
+from gsjax.scene.gaussians import gaussians_from_activated
+from tests.methods.around import cameras_around
+
+WIDTH, HEIGHT, DIMENSION = 48, 36, 24
+GRID = FeatureGridConfig(
+    levels=4, least_resolution=4, most_resolution=16, log2_entries=10, features=4, hidden=16
+)
+QUICK = DistillConfig(iterations=120, channels=12, grid=GRID, contrast_patch=8)
+BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 3)))[0].T.astype(np.float32)
+
+
+def cameras(count: int) -> list[Camera]:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return cameras_around(angles, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def two_balls():
+    """A ball of Gaussians in front of another, their labels 1 and 2, and masks of eight cameras."""
+    random = np.random.default_rng(1)
+    directions = random.normal(size=(160, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    centres = np.repeat([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], 80, axis=0)
+    scene = gaussians_from_activated(
+        centres + 0.35 * directions,
+        random.normal(size=(160, 4)),
+        np.full((160, 3), 0.07),
+        np.full(160, 0.95),
+        random.uniform(size=(160, 3)),
+    )
+    labels = np.repeat([1, 2], 80)
+    masks = []
+    for view, plan in frozen_views(scene, cameras(8)):
+        shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
+        masks.append(np.where(shares.sum(-1) > 0.5, shares.argmax(-1), 0))
+    return scene, labels, masks
+
+
+@pytest.fixture(scope="module")
+def problem(two_balls):
+    scene, _, masks = two_balls
+    return begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), QUICK)
+
+
+@pytest.fixture(scope="module")
+def learned(problem):
+    told, state = problem
+    *_, last = distill(told, jax.tree.map(copied, state))
+    return last.state.field
+
+
+def copied(leaf):
+    """What a step would give away."""
+    return jnp.array(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
+def test_what_is_rendered_of_the_hidden_layer_is_what_features_render_as(problem):
+    told, state = problem
+    batch = told.views[0]
+    parts = carried(state.field, batch.located)
+    image, alphas = paint(batch.view, parts.values, batch.plan)
+    some = carried(state.field, batch.located, batch.view.rows)
+    np.testing.assert_array_equal(paint_shown(batch.view, some.values, batch.plan)[0], image)
+    of_hidden = parts.channels_of(parts.joined(image, alphas))
+    of_features, _ = paint(batch.view, features_of(state.field, batch.located), batch.plan)
+    assert parts.values.shape[1] == 16 != of_features.shape[-1]
+    np.testing.assert_allclose(of_hidden, of_features, atol=1e-5)
+
+
+@pytest.mark.parametrize("teacher", ["codebook", "maps"])
+def test_strips_change_neither_the_loss_nor_its_slope(two_balls, teacher):
+    scene, _, masks = two_balls
+    said = teacher_of_objects(masks, [BOOK] * 8)
+    if teacher == "maps":
+        maps = [np.random.default_rng(v).normal(size=(9, 12, DIMENSION)) for v in range(8)]
+        said = teacher_of_maps(maps, [(HEIGHT, WIDTH)] * 8, said.ids)
+    found = []
+    for megabytes in (256.0, 0.1):
+        config = replace(QUICK, strip_megabytes=megabytes, contrast_after=0.0)
+        told, state = begin_distill(scene, cameras(8), said, config)
+        rows = told.views[0].plan.tiles_y
+        value = jax.value_and_grad(distill_loss(config), has_aux=True)
+        found.append(
+            jax.jit(value, static_argnames="step")(state.field, told.views[0], step=0, key=jax.random.key(0))
+        )
+    assert rows == 5  # which 0.1 MiB do not hold: 28 numbers and more of 384 pixels a row
+    ((one, aux), slope), ((other, other_aux), other_slope) = found
+    assert float(aux["contrast"]) > 0
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+    for name in aux:
+        np.testing.assert_allclose(aux[name], other_aux[name], rtol=1e-4)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), slope, other_slope)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_slope_of_the_whole_loss_is_that_of_central_differences(two_balls):
+    scene, _, masks = two_balls
+    scene = jax.tree.map(lambda a: a.astype(jnp.float64), scene)
+    config = replace(QUICK, contrast_after=0.0)
+    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
+    batch = jax.tree.map(lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, told.views[0])
+    field = jax.tree.map(lambda a: a.astype(jnp.float64), state.field)
+    field = jax.tree.map(
+        lambda a: a + 0.1 * jnp.asarray(np.random.default_rng(1).normal(size=a.shape)), field
+    )
+    loss = jax.jit(lambda f: distill_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
+    slope, random = jax.jit(jax.grad(loss))(field), np.random.default_rng(5)
+    for pick in ("table", "layers", "lift"):
+        along = jax.tree_util.tree_map_with_path(
+            lambda path, a, pick=pick: jnp.asarray(random.normal(size=a.shape)) * (pick in str(path)), field
+        )
+        want = sum((s * d).sum() for s, d in zip(*map(jax.tree.leaves, (slope, along)), strict=True))
+        ahead, behind = (
+            loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
+        )
+        np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
+
+
+def test_only_the_entries_that_are_used_train_and_the_whole_grid_says_the_same(two_balls):
+    scene, *_ = two_balls
+    field, located = init_field(jax.random.key(0), QUICK, scene.means, DIMENSION)
+    small, near, rows = used_part(field, located)
+    assert small.encoding.table.shape[0] < field.encoding.table.shape[0]
+    np.testing.assert_array_equal(features_of(small, near), features_of(field, located))
+    again = whole(small, rows)
+    np.testing.assert_array_equal(
+        features_of(again, locate(again.encoding, scene.means)), features_of(field, located)
+    )
+
+
+def test_it_learns_and_each_gaussian_answers_for_what_it_is(two_balls, learned, problem):
+    _, labels, _ = two_balls
+    cosines = np.asarray(gaussian_cosines(learned, problem[0].views[0].located, jnp.asarray(BOOK)))
+    assert (cosines[:, 1:].argmax(1) + 1 == labels).mean() > 0.97
+    assert np.median(cosines[np.arange(160), labels]) > 0.7
+
+
+def test_2d_and_3d_agree_and_what_is_hidden_is_selected_whole(two_balls, learned, problem):
+    scene, labels, masks = two_balls
+    told = problem[0]
+    # Camera 6 looks along y: one ball is behind the other.
+    hidden = [v for v, mask in enumerate(masks) if (mask == 2).sum() < 0.3 * (mask == 1).sum()]
+    assert hidden
+    query = jnp.asarray(BOOK[[2, 0, 1]])
+    scores = relevancy(gaussian_cosines(learned, told.views[0].located, query))
+    selected = np.asarray(scores > threshold_for(np.asarray(scores), True).value)
+    assert (selected == (labels == 2)).mean() > 0.97
+    for v, (view, plan) in enumerate(frozen_views(scene, cameras(8))):
+        of_pixels, alphas = pixel_cosines(learned, told.views[0].located, view, plan, query)
+        flat = np.asarray(pixel_mask(relevancy(of_pixels), alphas, 0.5))
+        solid = np.asarray(selection_mask(view, plan, jnp.asarray(selected)))
+        true = masks[v] == 2
+        for found in (flat, solid):
+            assert (found & true).sum() >= 0.8 * (found | true).sum() or v in hidden
+        assert (solid & ~true).sum() < 0.1 * true.sum() + 20
+
+
+def test_a_resumed_distillation_is_equal_to_the_bit(two_balls):
+    scene, _, masks = two_balls
+    config = replace(QUICK, iterations=8, contrast_after=0.5)
+    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
+    for now in distill(told, state):
+        if now.state.step == 3:
+            halfway = jax.tree.map(np.asarray, (now.state.field, now.state.optimizer))
+    again = DistillState(*jax.tree.map(jnp.asarray, halfway), 3)
+    *_, last = distill(told, again)
+    jax.tree.map(np.testing.assert_array_equal, last.state.field, now.state.field)
+
+
+def test_views_of_one_size_share_one_program(two_balls):
+    scene, _, masks = two_balls
+    config = replace(QUICK, iterations=9, contrast_after=0.5, seed=3)
+    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
+    assert sum(now.compile_seconds > 0 for now in distill(told, state)) == 1
+    assert compiled_step(config)._cache_size() == 1
+
+
+def test_poison_skips_the_step(problem):
+    told, state = problem
+    state = jax.tree.map(copied, state)
+    sick = DistillState(
+        jax.tree.map(lambda a: a.at[(0,) * a.ndim].set(jnp.nan), state.field), state.optimizer, 0
+    )
+    first = next(distill(told, sick))
+    assert bool(first.info["skipped"])
+    assert np.isfinite(np.asarray(first.state.field.lift)[1:]).all()
+
+
+def test_a_vector_for_each_gaussian_learns_too_and_weights_of_zero_cost_nothing(two_balls):
+    scene, labels, masks = two_balls
+    config = replace(QUICK, encoding="table", weights=DistillWeightsConfig(contrast=0.0, tv=0.0))
+    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
+    *_, last = distill(told, state)
+    assert set(last.info) == {"rec", "cos", "loss", "skipped"}
+    cosines = np.asarray(gaussian_cosines(last.state.field, None, jnp.asarray(BOOK)))
+    seen = np.abs(cosines[np.arange(160), labels]) > 0.5
+    assert seen.mean() > 0.5
+    assert finished(told, last.state) is last.state.field
+
+
+def test_ways_back_rank_gaussians_as_the_exact_one_does(learned, problem):
+    located = problem[0].views[0].located
+    query = jnp.asarray(BOOK[1:])
+    exact = np.asarray(gaussian_cosines(learned, located, query))
+    features = features_of(learned, located)
+    inverse, losses = learned_inverse(learned.lift, features, jax.random.key(0), 300, 256)
+    assert losses[-1] < 0.2 * losses[0]
+    for way in (pseudo_inverse(learned.lift), inverse):
+        found = np.asarray(back_projected_cosines(learned, located, query, way))
+        for of_found, of_exact in zip(found.T, exact.T, strict=True):
+            assert np.corrcoef(of_found, of_exact)[0, 1] > 0.95
+
+
+def test_the_pseudo_inverse_is_exact_up_to_a_factor_where_the_convolution_turns_and_stretches_nothing(
+    learned, problem
+):
+    located, query = problem[0].views[0].located, jnp.asarray(BOOK[1:])
+    turning = jnp.linalg.qr(learned.lift)[0]  # columns of length 1, at right angles
+    field = replace(learned, lift=turning)
+    exact = np.asarray(gaussian_cosines(field, located, query))
+    found = np.asarray(back_projected_cosines(field, located, query, pseudo_inverse(turning)))
+    shown = np.linalg.norm(turning.T @ query.T, axis=0)  # how much of each query the field can show at all
+    np.testing.assert_allclose(found * shown, exact, atol=1e-5)
+
+
+def test_a_threshold_says_its_rule():
+    scores = np.concatenate([np.full(50, 0.1), np.full(10, 0.8)])
+    assert threshold_for(scores, False, 0.3) == (0.3, "given")
+    assert threshold_for(scores, True) == (0.5, "better than each negative")
+    value, rule = threshold_for(scores, False)
+    assert 0.1 <= value < 0.8
+    assert rule == "Otsu"
+    assert threshold_for(np.full(9, 0.4), False).value == np.inf  # nothing tells them apart
+    assert threshold_for(np.full(9, np.nan), False).value == np.inf
+
+
+def test_against_negatives_the_share_is_a_half_where_two_fit_alike():
+    cosines = jnp.array([[0.4, 0.4, 0.1], [0.9, 0.1, 0.2], [0.1, 0.9, 0.9]])
+    shares = relevancy(cosines)
+    np.testing.assert_allclose(shares[0], 0.5)
+    assert shares[1] > 0.99
+    assert shares[2] < 0.01
+    np.testing.assert_array_equal(relevancy(cosines[:, :1]), cosines[:, 0])
+
+
+def mask_of(*labels):
+    return np.array([labels])
+
+
+@pytest.mark.parametrize(
+    ("masks", "embeddings", "says"),
+    [
+        ([], [], "masks: expected those of at least one view, found none"),
+        ([mask_of(0, 1)], [], "embeddings: expected those of 1 views, found 0"),
+        ([mask_of(0.5, 1)], [BOOK], r"masks of view 0: expected integers \[H,W\], found float64 \[1, 2\]"),
+        ([mask_of(0, 3)], [BOOK], "expected a row for each of the labels 0 to 3, found 3 rows"),
+        (
+            [mask_of(0, 1)] * 2,
+            [BOOK, BOOK[:, :7]],
+            r"embeddings of view 1: expected \[labels, 24\] as of view 0",
+        ),
+        ([mask_of(0, 1)], [BOOK * np.nan], "found NaN or infinity in rows"),
+        ([mask_of(0, 0)], [BOOK * 0], "found none that has an embedding"),
+    ],
+)
+def test_teachers_that_cannot_be_are_refused(masks, embeddings, says):
+    with pytest.raises(ValueError, match=says):
+        teacher_of_objects(masks, embeddings)
+
+
+def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
+    rows = np.stack([np.zeros(4), np.eye(4)[0], np.eye(4)[1], np.eye(4)[0]]).astype(np.float32)
+    with pytest.warns(UserWarning, match="views without any mask teach nothing: 1 of 2"):
+        teacher = teacher_of_objects([mask_of(0, 1, 2, 3, -1), mask_of(0, 0, 0, 0, 0)], [rows, rows])
+    one, two = teacher.ids[0][0, 1], teacher.ids[0][0, 2]
+    np.testing.assert_array_equal(teacher.ids[0][0], [-1, one, two, one, -1])
+    np.testing.assert_array_equal(teacher.codebook[one], np.eye(4)[0])
+    assert len(teacher.codebook) == 2
+
+
+@pytest.mark.parametrize(
+    ("maps", "says"),
+    [
+        ([np.zeros((3, 4, 5))], "maps: expected those of 2 views, found 1"),
+        ([np.zeros((3, 4, 5)), np.zeros((3, 4, 6))], r"maps of view 1: expected \[h, w, 5\], found float64"),
+        ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected numbers"),
+        (
+            [np.zeros((30, 40, 5)), np.zeros((40, 30, 5))],
+            "expected a picture of the shape of its view, 48x36",
+        ),
+    ],
+)
+def test_maps_that_do_not_fit_are_refused(maps, says):
+    with pytest.raises(ValueError, match=says):
+        teacher_of_maps(maps, [(HEIGHT, WIDTH)] * 2)
+
+
+def test_a_teacher_of_other_views_is_refused(two_balls):
+    scene, _, masks = two_balls
+    teacher = teacher_of_objects(masks, [BOOK] * 8)
+    with pytest.raises(ValueError, match="expected that of 3 views, found 8"):
+        begin_distill(scene, cameras(3), teacher, QUICK)
+    small = teacher_of_objects([mask[:-1] for mask in masks], [BOOK] * 8)
+    with pytest.raises(ValueError, match="expected 48x36 pixels of view 0 like its camera, found 48x35"):
+        begin_distill(scene, cameras(8), small, QUICK)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"iterations": 0}, "iterations: expected at least 1"),
+        ({"contrast_pool": 3}, r"contrast_pool: expected one of \(1, 2, 4, 8\), found 3"),
+        ({"contrast_after": 1.5}, "contrast_after: expected at least 0 and at most 1"),
+    ],
+)
+def test_settings_without_meaning_are_refused(change, says):
+    with pytest.raises(ValueError, match=says):
+        replace(QUICK, **change)
+
+
+def test_votes_are_the_light_that_gaussians_send_to_labels(two_balls):
+    scene, _, masks = two_balls
+    view, plan = frozen_views(scene, cameras(8))[0]
+    ids = jnp.asarray(masks[0])
+    votes = np.zeros((scene.num, 3))
+    np.add.at(votes, view.rows, np.asarray(label_votes(view, plan, ids, 3)))
+    # One Gaussian at a time: what it alone adds to the picture.
+    for row in (3, 90, 150):
+        own, _ = paint(view, jnp.zeros((scene.num, 1)).at[row].set(1.0), plan)
+        for label in range(3):
+            np.testing.assert_allclose(votes[row, label], own[..., 0][ids == label].sum(), atol=1e-4)
+    none = np.asarray(label_votes(view, plan, jnp.full_like(ids, -1), 3))
+    assert not none.any()
+
+
+def test_a_majority_of_true_masks_is_the_truth(two_balls):
+    scene, labels, masks = two_balls
+    found = majority_labels(frozen_views(scene, cameras(8)), masks, 3, scene.num)
+    seen = found >= 0
+    assert seen.mean() > 0.9
+    assert (found[seen] == labels[seen]).mean() > 0.97
+
+
+def test_pixels_features_are_what_their_cosines_are_of(problem, learned):
+    told, _ = problem
+    batch = told.views[0]
+    cosines, alphas = pixel_cosines(learned, batch.located, batch.view, batch.plan, jnp.asarray(BOOK))
+    y, x = np.unravel_index(int(np.asarray(alphas).argmax()), alphas.shape)
+    features, there = pixel_features(
+        learned, batch.located, batch.view, batch.plan, jnp.array([[int(x), int(y)]])
+    )
+    np.testing.assert_allclose(there[0], alphas[y, x], rtol=1e-6)
+    unit = features[0] / jnp.linalg.norm(features[0])
+    np.testing.assert_allclose(unit @ BOOK.T, cosines[y, x], atol=1e-4)

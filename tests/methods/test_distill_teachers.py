@@ -1,0 +1,217 @@
+"""What teachers say of pixels reaches the loss as it was said, however it is kept."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.distill import (
+    DistillConfig,
+    DistillWeightsConfig,
+    begin_distill,
+    distill,
+    distill_loss,
+    frozen_views,
+    gaussian_cosines,
+    init_field,
+    teacher_of_maps,
+    teacher_of_objects,
+    with_maps,
+)
+from gsjax.methods.distill.update import _stretched, strip_rows
+from gsjax.methods.distill.teacher import most_rows, of_view
+from gsjax.rasterize.frozen import paint
+from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.gaussians import gaussians_from_activated
+from tests.methods.around import cameras_around
+
+WIDTH, HEIGHT, DIMENSION = 48, 36, 24
+GRID = FeatureGridConfig(
+    levels=2, least_resolution=4, most_resolution=8, log2_entries=9, features=4, hidden=16
+)
+QUICK = DistillConfig(iterations=60, channels=12, grid=GRID, contrast_patch=8)
+BOOK = np.linalg.qr(np.random.default_rng(0).normal(size=(DIMENSION, 6)))[0].T.astype(np.float32)
+
+
+def cameras(count: int) -> list[Camera]:
+    return cameras_around(np.linspace(0, 2, count), WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    random = np.random.default_rng(1)
+    return gaussians_from_activated(
+        random.uniform(-0.8, 0.8, (60, 3)),
+        random.normal(size=(60, 4)),
+        np.full((60, 3), 0.15),
+        np.full(60, 0.9),
+        random.uniform(size=(60, 3)),
+    )
+
+
+def halves(one: int, other: int) -> np.ndarray:
+    """Masks of a view: one thing to the left, another to the right, and nothing known above."""
+    mask = np.full((HEIGHT, WIDTH), one, np.int64)
+    mask[:, WIDTH // 2 :], mask[:4] = other, -1
+    return mask
+
+
+def objects():
+    return teacher_of_objects([halves(0, 1), halves(2, 5), halves(3, 4)], [BOOK] * 3)
+
+
+def maps(seed: int = 0):
+    random = np.random.default_rng(seed)
+    return teacher_of_maps([random.normal(size=(9, 12, DIMENSION)) for _ in range(3)], [(HEIGHT, WIDTH)] * 3)
+
+
+def loss_of(config, state, batch, step=0):
+    return distill_loss(config)(state.field, batch, step=step, key=jax.random.key(0))
+
+
+def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
+    teacher = objects()
+    assert most_rows(teacher) == 2
+    for v in range(3):
+        ids, book = of_view(teacher, v, 4)
+        assert book.shape == (4, DIMENSION)
+        np.testing.assert_array_equal(ids < 0, teacher.ids[v] < 0)
+        np.testing.assert_array_equal(book[ids[ids >= 0]], teacher.codebook[teacher.ids[v][ids >= 0]])
+    told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, contrast_after=0.0))
+    whole = told.views[1]._replace(ids=jnp.asarray(teacher.ids[1]), codebook=jnp.asarray(teacher.codebook))
+    assert len(whole.codebook) == 6 > len(told.views[1].codebook) == 2
+    for name, value in loss_of(told.config, state, told.views[1])[1].items():
+        np.testing.assert_allclose(value, loss_of(told.config, state, whole)[1][name], rtol=1e-5)
+
+
+def test_views_that_show_all_or_nothing_of_the_codebook_are_told_apart():
+    full = teacher_of_objects([np.arange(6).reshape(2, 3)], [BOOK])
+    ids, book = of_view(full, 0, 6)
+    np.testing.assert_allclose(book[ids], full.codebook[full.ids[0]])
+    silent = full._replace(ids=[np.full((2, 3), -1)])
+    ids, book = of_view(silent, 0, 2)
+    assert (ids == -1).all()
+    assert not book.any()
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])
+def test_two_teachers_are_the_mean_of_both_by_weight(scene, weight):
+    weights = DistillWeightsConfig(map=weight, contrast=0.0, tv=0.0)
+    config, both, found = replace(QUICK, weights=weights), with_maps(objects(), maps()), []
+    for teacher in (objects(), maps(), both):
+        told, state = begin_distill(scene, cameras(3), teacher, config)
+        found.append(loss_of(config, state, told.views[0])[1])
+    of_objects, of_maps, of_both = found
+    known = (HEIGHT - 4) * WIDTH
+    share = weight * HEIGHT * WIDTH / (known + weight * HEIGHT * WIDTH)
+    for name in ("rec", "cos"):
+        want = (1 - share) * of_objects[name] + share * of_maps[name]
+        np.testing.assert_allclose(of_both[name], want, rtol=1e-5)
+
+
+def test_teachers_that_do_not_go_together_are_refused():
+    with pytest.raises(ValueError, match="expected one of objects and one of maps"):
+        with_maps(maps(), objects())
+    other = teacher_of_maps([np.ones((9, 12, 5))] * 3, [(HEIGHT, WIDTH)] * 3)
+    with pytest.raises(ValueError, match="expected features of 24 numbers as the objects have, found 5"):
+        with_maps(objects(), other)
+    fewer = maps()._replace(maps=maps().maps[:2])
+    with pytest.raises(ValueError, match="expected maps of 3 views, found 2"):
+        with_maps(objects(), fewer)
+
+
+def test_a_teacher_with_maps_of_other_views_is_refused(scene):
+    with pytest.raises(ValueError, match="teacher: expected maps of 3 views, found 2"):
+        begin_distill(scene, cameras(3), with_maps(objects(), maps())._replace(maps=maps().maps[:2]), QUICK)
+
+
+@pytest.mark.parametrize("size", [(9, 12), (5, 7), (36, 48), (50, 70)])
+def test_maps_are_stretched_as_opencv_does(scene, size):
+    told, _ = begin_distill(scene, cameras(3), objects(), QUICK)
+    plan, said = told.views[0].plan, np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
+    want = cv2.resize(said, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    np.testing.assert_allclose(_stretched(jnp.asarray(said), 0, HEIGHT, plan), want, atol=1e-4)
+    np.testing.assert_allclose(_stretched(jnp.asarray(said), 8, 4, plan), want[8:12], atol=1e-4)
+
+
+def test_how_long_an_encoders_vectors_are_does_not_matter(scene):
+    found = []
+    for factor in (1.0, 1e6, 1e-6):
+        teacher = teacher_of_objects(objects().ids, [np.float32(factor) * BOOK] * 3)
+        np.testing.assert_allclose(np.linalg.norm(teacher.codebook, axis=1).mean(), 1, rtol=1e-5)
+        told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, iterations=4))
+        *_, last = distill(told, state)
+        found.append(float(last.info["loss"]))
+    np.testing.assert_allclose(found, found[0], rtol=1e-3)
+    long = teacher_of_maps([1e4 * one for one in maps().maps], [(HEIGHT, WIDTH)] * 3)
+    np.testing.assert_allclose(long.maps[0], maps().maps[0], rtol=1e-5)
+
+
+def test_maps_teach(scene):
+    """A feature a pixel, of three stripes that lie on the scene itself."""
+    labels = np.digitize(np.asarray(scene.means)[:, 2], [-0.25, 0.25])
+    said = []
+    for view, plan in frozen_views(scene, cameras(3)):
+        shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
+        said.append(BOOK[shares.argmax(-1)] + 0.0)
+    teacher = teacher_of_maps(said, [(HEIGHT, WIDTH)] * 3)
+    told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, iterations=150))
+    *_, last = distill(told, state)
+    cosines = np.asarray(gaussian_cosines(last.state.field, told.views[0].located, jnp.asarray(BOOK[:3])))
+    shown = np.unique(np.concatenate([view.view.rows for view in told.views]))
+    assert (cosines.argmax(1) == labels)[shown].mean() > 0.85
+
+
+def test_the_contrast_counts_from_its_step_on(scene):
+    config = replace(QUICK, iterations=10, contrast_after=0.5)
+    told, state = begin_distill(scene, cameras(3), objects(), config)
+    values = [float(loss_of(config, state, told.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
+    assert values[:2] == [0, 0]
+    assert values[2] == values[3] > 0
+
+
+def test_memory_of_what_a_view_says_is_counted(scene):
+    config = replace(QUICK, strip_megabytes=0.4)
+    few, _ = begin_distill(scene, cameras(3), objects(), config)
+    many = few.views[0]._replace(codebook=jnp.zeros((500, DIMENSION)))
+    wide = few.views[0]._replace(map=np.zeros((9, 12, 512), np.float32))
+    assert strip_rows(config, 16, few.views[0]) == few.views[0].plan.tiles_y
+    assert strip_rows(config, 16, many) == strip_rows(config, 16, wide) == 1
+
+
+def test_a_few_gaussians_far_out_do_not_make_cells_coarse():
+    means = np.random.default_rng(0).uniform(-1, 1, (1000, 3)).astype(np.float32)
+    near, _ = init_field(jax.random.key(0), QUICK, jnp.asarray(means), DIMENSION)
+    low, high = np.array(near.encoding.bounds)
+    assert (low < means.min(0)).all()
+    assert (high > means.max(0)).all()
+    means[:5] = [[1e6, 0, 0], [-1e6, 0, 0], [0, 1e6, 0], [0, 0, -1e6], [50, 0, 0]]
+    far, located = init_field(jax.random.key(0), QUICK, jnp.asarray(means), DIMENSION)
+    assert np.ptp(np.array(far.encoding.bounds), axis=0).max() < 4.2  # metres
+    assert np.isfinite(located.weights).all()
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("megabytes", [256.0, 0.1])
+def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megabytes):
+    def wide(tree):
+        return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
+
+    config = replace(QUICK, contrast_after=0.0, strip_megabytes=megabytes)
+    told, state = begin_distill(wide(scene), cameras(3), with_maps(objects(), maps()), config)
+    batch, random = wide(told.views[0]), np.random.default_rng(1)
+    field = jax.tree.map(lambda a: a + 0.1 * jnp.asarray(random.normal(size=a.shape)), wide(state.field))
+    along = jax.tree.map(lambda a: jnp.asarray(random.normal(size=a.shape)), field)
+    loss = jax.jit(lambda f: distill_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
+    want = sum(
+        (s * d).sum()
+        for s, d in zip(*map(jax.tree.leaves, (jax.jit(jax.grad(loss))(field), along)), strict=True)
+    )
+    ahead, behind = (
+        loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
+    )
+    np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
