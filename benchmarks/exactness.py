@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 
 from benchmarks.scenes import case, compare
-from gsjax.cli import machine
+from gsjax.engine import machine
 
 RESULT = Path(__file__).parent / "results" / "exactness.json"
 SCENES = 52

@@ -41,7 +41,7 @@ from benchmarks.poisons import (
     scene_of,
 )
 from benchmarks.scenes import ARRAYS, relative_error
-from gsjax.cli import machine
+from gsjax.engine import machine
 from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gsjax.cli import machine
+from gsjax.engine import machine
 
 DIRECTIONS = ("lower", "higher", "same")
 DIGITS = 6

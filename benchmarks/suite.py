@@ -15,7 +15,7 @@ from benchmarks.pages import LEGEND, STEP_COLUMNS, bottom_line, markdown, print_
 from benchmarks.programs import BACKWARD, FORWARD, JVP
 from benchmarks.steps import STEPS, measure_step
 from benchmarks.workloads import QUICK, SUITE, Workload, choose
-from gsjax.cli import machine
+from gsjax.engine import machine
 from gsjax.io.atomic import atomic_write, write_json
 
 RESULTS = Path(__file__).parent / "results"

@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from gsjax.cli.run.folder import RunFolder
+from gsjax.engine.folder import RunFolder
 from gsjax.io.video import read_video_frames
 
 ROOT = Path(__file__).resolve().parents[1]

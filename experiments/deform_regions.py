@@ -10,7 +10,7 @@ from deforming import Dataset, Reconstructed
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from gsjax.cli.deform.scores import classes_of_pixels, draw
+from gsjax.engine.deform.scores import classes_of_pixels, draw
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
 
@@ -28,9 +28,7 @@ def region_map(data: Dataset, t: int) -> Int[np.ndarray, "h w"]:
     look = data.look(t)
     height, width = look.image.shape[:2]
     high, wide = data.truth["seg"][t].shape
-    seg = data.truth["seg"][t][
-        np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)
-    ]
+    seg = data.truth["seg"][t][np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)]
     y, x = np.nonzero((seg == 1) & (look.depth > 0))
     depth = look.depth[y, x].astype(np.float64)
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(look.K).T

@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float
 from recordings import recorded
 
 import gsjax
-from gsjax.cli.deform.data import unit_times
-from gsjax.cli.deform.scores import draw
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
+from gsjax.engine.deform.data import unit_times
+from gsjax.engine.deform.scores import draw
 from gsjax.geometry.cameras import PixelsOf, pixels_of
 from gsjax.methods.deform import (
-    Look,
     DeformConfig,
     DeformProblem,
     DeformState,
+    Look,
     begin_deform,
     reconstruct,
 )

@@ -12,13 +12,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.cli.fit import command as fit_command
-from gsjax.cli.parts.command import FIT as FIT  # for settings that differ from it in one thing
-from gsjax.cli.parts.command import Options
-from gsjax.cli.parts.command import run as run_parts
-from gsjax.cli.parts.saved import open_parts_run
-from gsjax.cli.parts.views import part_views
+from gsjax.cli import fit as fit_command
+from gsjax.cli.parts import FIT as FIT  # for settings that differ from it in one thing
+from gsjax.cli.parts import Options
+from gsjax.cli.parts import run as run_parts
 from gsjax.data import Sequence
+from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.parts.views import part_views
 from gsjax.methods.parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores
 from gsjax.metrics.tracking import relative_motion

@@ -12,18 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from recordings import recorded
 
-from gsjax.cli.distill.scene import FieldScene, scene_of_run
-from gsjax.cli.distill.scores import ClassScores, class_maps, classes_of
-from gsjax.cli.fit import command as fit_command
-from gsjax.cli.track import command as track_command
+from gsjax.cli import fit as fit_command
+from gsjax.cli import track as track_command
 from gsjax.data.photographs import Photographs
 from gsjax.data.simulated.flawed_masks import Flaws, flawed_masks
+from gsjax.engine.distill.scene import FieldScene, scene_of_run
+from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
 from gsjax.geometry.cameras import project
 from gsjax.methods.distill import (
-    FeatureField,
     DistillConfig,
     DistillProblem,
     DistillState,
+    FeatureField,
     Teacher,
     begin_distill,
     compiled_step,

@@ -9,13 +9,13 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from gsjax.cli.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
-from gsjax.cli.run.scores import Scores
-from gsjax.cli.track.loop import Tracking, begin, follow
-from gsjax.cli.track.results import MOVED_MM
-from gsjax.cli.track.scoring import group_values, metrics, score_motion
-from gsjax.cli.track.views import views
-from gsjax.methods.track import StartConfig, TrackedScene, TrackConfig, start_scene
+from gsjax.engine.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
+from gsjax.engine.scores import Scores
+from gsjax.engine.track.loop import Tracking, begin, follow
+from gsjax.engine.track.results import MOVED_MM
+from gsjax.engine.track.scoring import group_values, metrics, score_motion
+from gsjax.engine.track.views import views
+from gsjax.methods.track import StartConfig, TrackConfig, TrackedScene, start_scene
 from gsjax.scene.frame import Frame
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")

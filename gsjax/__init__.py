@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from gsjax.io.ply import read_ply, write_ply
     from gsjax.methods.track import (
         TrackConfig,
-        track_step,
         scene_from_shapes,
         start_scene,
         track,
+        track_step,
     )
     from gsjax.optim.compiler import host_options, keep_freed_memory, keep_programs
     from gsjax.rasterize.compositing import composite_tile
@@ -68,7 +68,6 @@ __all__ = [
     "host_options",
     "keep_freed_memory",
     "keep_programs",
-    "track_step",
     "open_sequence",
     "plan",
     "plan_render",
@@ -79,6 +78,7 @@ __all__ = [
     "sharded_rasterization",
     "start_scene",
     "track",
+    "track_step",
     "write_ply",
 ]
 

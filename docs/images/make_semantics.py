@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from make_picture import join
 
-from gsjax.cli.track.saved import SavedRun, open_run
-from gsjax.cli.track.views import views
+from gsjax.engine.track.saved import SavedRun, open_run
+from gsjax.engine.track.views import views
 from gsjax.io.video import read_video_frames
 from gsjax.methods.track import distill_features, first_pose, render_features
 from gsjax.perception.gabor import GaborEncoder

@@ -21,6 +21,7 @@ from timing import CALLS, jitted, timed
 import gsjax
 from gsjax.data.photographs import photographs_of
 from gsjax.geometry.cameras import Camera
+from gsjax.methods.deform import GraphConfig, nodes_of
 from gsjax.methods.track import (
     PRESETS,
     StartConfig,
@@ -28,12 +29,11 @@ from gsjax.methods.track import (
     TrackState,
     first_pose,
     first_state,
-    track_step,
     place,
     plan_tracker,
     start_scene,
+    track_step,
 )
-from gsjax.methods.deform import GraphConfig, nodes_of
 from gsjax.metrics.segmentation import LabelOverlap
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.render import plan_render, render

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from gsjax.methods.track import TrackBatch, place
 from gsjax.methods.deform import feature_loss, graph_loss, graph_of, seen_ids
+from gsjax.methods.track import TrackBatch, place
 from gsjax.optim.step import gradient_step
 from gsjax.scene.render import render
 

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
-from gsjax.cli.deform.scores import draw
+from gsjax.engine.deform.scores import draw
 from gsjax.methods.deform import (
-    GraphConfig,
-    Look,
     DeformConfig,
     DeformRatesConfig,
     DeformWeightsConfig,
+    GraphConfig,
+    Look,
     begin_deform,
     reconstruct,
     start_gaussians,

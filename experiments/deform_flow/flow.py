@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from recordings import recorded
 
 from gsjax.data.resizing import blended, picked
-from gsjax.methods.deform import Look, DeformConfig, begin_deform, reconstruct
+from gsjax.methods.deform import DeformConfig, Look, begin_deform, reconstruct
 from gsjax.metrics.image import psnr
 from gsjax.metrics.tracking import carried_points
 from gsjax.perception.optical_flow import DisFlow

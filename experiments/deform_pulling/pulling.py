@@ -15,9 +15,9 @@ from jaxtyping import Bool, UInt8
 from recordings import recorded
 
 import gsjax
-from gsjax.cli.deform.data import unit_times
 from gsjax.data import DataWarning, Sequence
-from gsjax.methods.deform import Look, DeformConfig
+from gsjax.engine.deform.data import unit_times
+from gsjax.methods.deform import DeformConfig, Look
 from gsjax.metrics.image import psnr, ssim
 
 SCALE = 0.25  # of 640x512

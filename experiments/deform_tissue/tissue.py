@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
-from gsjax.methods.deform import GraphConfig, DeformConfig
+from gsjax.methods.deform import DeformConfig, GraphConfig
 
 BASE = DeformConfig(warmup=200, iterations=800, start_pixels=1.8)
 CHANNELS = BASE.channels

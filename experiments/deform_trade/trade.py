@@ -23,7 +23,7 @@ from deforming import (
     track_errors,
 )
 
-from gsjax.methods.deform import GraphConfig, DeformConfig
+from gsjax.methods.deform import DeformConfig, GraphConfig
 from gsjax.scene.deformation import DeformationConfig
 
 BASE = DeformConfig(warmup=100, iterations=300, start_pixels=1.8)

@@ -15,7 +15,7 @@ import numpy as np
 from autoencoder import trained
 from fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
-from gsjax.cli.distill.scene import FieldScene, scaled
+from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.methods.distill import DistillConfig, DistillWeightsConfig, Teacher, features_of
 from gsjax.methods.distill.field import FeatureField
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from fields import codebook_of, fitted, flawed_teacher, true_labels
 
-from gsjax.cli.distill.scene import FieldScene, scaled
+from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.methods.distill import (
     DistillConfig,
     DistillRatesConfig,

@@ -13,7 +13,7 @@ import numpy as np
 from fields import codebook_of, fitted, flawed_teacher, learned, scored
 from timing import jitted, median_ms, timed
 
-from gsjax.cli.distill.scene import scaled
+from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import (
     DistillConfig,
     back_projected_cosines,

@@ -18,7 +18,7 @@ from fields import (
     scored,
 )
 
-from gsjax.cli.distill.scene import FieldScene
+from gsjax.engine.distill.scene import FieldScene
 from gsjax.methods.distill import DistillConfig
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
 from timing import jitted, median_ms
 
-from gsjax.cli.distill.scene import FieldScene
 from gsjax.data.photographs import Photographs
+from gsjax.engine.distill.scene import FieldScene
 from gsjax.methods.distill import DistillConfig, Teacher, gaussian_cosines
 from gsjax.scene.gaussians import concatenate
 

@@ -12,12 +12,12 @@ import numpy as np
 from fields import NO_FLAWS, codebook_of, flawed_teacher, learned, of_field
 from recordings import recorded
 
-from gsjax.cli.distill.scene import scene_of_run
-from gsjax.cli.distill.scores import ClassScores, class_maps
-from gsjax.cli.track import command as track_command
-from gsjax.cli.track.saved import open_run
+from gsjax.cli import track as track_command
 from gsjax.data.simulated.flawed_masks import Flaws
-from gsjax.methods.distill import FeatureField, DistillConfig, features_of, frozen_views
+from gsjax.engine.distill.scene import scene_of_run
+from gsjax.engine.distill.scores import ClassScores, class_maps
+from gsjax.engine.track.saved import open_run
+from gsjax.methods.distill import DistillConfig, FeatureField, features_of, frozen_views
 from gsjax.methods.track import place
 from gsjax.scene.gaussians import Gaussians
 

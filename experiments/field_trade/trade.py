@@ -8,7 +8,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 
 from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
-from gsjax.cli.distill.scene import scaled
+from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import DistillConfig
 from gsjax.scene.feature_grid import FeatureGridConfig
 

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the benchmarks' 
 
 from benchmarks.workloads import ball
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.fit import Batch, FitConfig, Observation, fit_loss, grow, fit_step
+from gsjax.methods.fit import Batch, FitConfig, Observation, fit_loss, fit_step, grow
 from gsjax.methods.fit.model import model_of, with_degree
 from gsjax.optim.compiler import host_options
 from gsjax.scene.gaussians import gaussians_from_activated

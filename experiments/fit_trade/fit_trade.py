@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 from recordings import recorded
 from static_fit.static_fit import SCENES
 
-from gsjax.cli.fit.loop import Budget
-from gsjax.cli.fit.results import Curve, judge, living, look
-from gsjax.cli.photographs import split
 from gsjax.data import open_photographs
+from gsjax.engine.fit.loop import Budget
+from gsjax.engine.fit.results import Curve, judge, living, look
+from gsjax.engine.photographs import split
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.fit import (
     FitConfig,

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 import gsjax
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp, score_grasp
-from gsjax.methods.track import PRESETS, TrackedScene
 from gsjax.methods.planning import straight_line
+from gsjax.methods.track import PRESETS, TrackedScene
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]

@@ -15,11 +15,11 @@ from recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
 from scipy.spatial.transform import Rotation
 from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
-from gsjax.cli.recording import Recording, draw_ahead, first_mask, remembered
-from gsjax.cli.track.loop import Tracking
-from gsjax.cli.track.scoring import lost_over_frames, score_motion, turn_unknown
 from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
+from gsjax.engine.recording import Recording, draw_ahead, first_mask, remembered
+from gsjax.engine.track.loop import Tracking
+from gsjax.engine.track.scoring import lost_over_frames, score_motion, turn_unknown
 from gsjax.methods.track import PRESETS, TrackConfig, start_scene
 
 START = TrackConfig(start=replace(PRESETS["fast"].start, iterations=40))  # colours hardly matter here

@@ -23,7 +23,7 @@ from jax.sharding import PartitionSpec as P
 from matplotlib.figure import Figure
 
 import gsjax
-from gsjax.cli import machine
+from gsjax.engine import machine
 from gsjax.geometry.cameras import intrinsics, look_at
 
 HERE = Path(__file__).resolve().parent

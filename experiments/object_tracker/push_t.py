@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import gsjax
-from gsjax.cli import machine
+from gsjax.engine import machine
 from gsjax.methods.track import Pose, first_pose, render_labels, scene_from_shapes, track
 from gsjax.metrics.segmentation import iou_of_masks
 

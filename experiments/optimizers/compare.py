@@ -16,7 +16,7 @@ from one_update import Update, scene_at, update_of
 from recordings import MASK_CAMERA, recorded
 from timing import median_ms
 
-from gsjax.cli.recording import open_recording
+from gsjax.engine.recording import open_recording
 
 RECORDINGS = {  # with the frames that updates begin at
     "built-in": ("simulated:tabletop", (12,)),

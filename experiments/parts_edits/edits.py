@@ -14,7 +14,7 @@ import numpy as np
 from discoveries import Options, canonical_of, run_parts
 from recordings import recorded
 
-from gsjax.cli.parts.saved import PartsRun, open_parts_run, read_parts
+from gsjax.engine.parts.saved import PartsRun, open_parts_run, read_parts
 from gsjax.geometry.cameras import Camera
 from gsjax.io.video import VideoWriter
 from gsjax.methods.parts import Moment, gaussians_at, moment

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from recordings import recorded
 from timing import jitted, median_ms, timed
 
-from gsjax.cli.recording import open_recording
+from gsjax.engine.recording import open_recording
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import (
     BACKGROUND,

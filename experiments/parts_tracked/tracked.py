@@ -19,8 +19,8 @@ from recordings import recorded
 from scipy.ndimage import map_coordinates
 from trimesh.registration import procrustes
 
-from gsjax.cli.recording import open_recording
 from gsjax.data import Sequence
+from gsjax.engine.recording import open_recording
 from gsjax.geometry.cameras import project
 from gsjax.geometry.flow import seen_in_both
 from gsjax.io.ply import read_ply

@@ -9,10 +9,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 
 from recordings import recorded
 
-from gsjax.cli.fit.command import Options
-from gsjax.cli.fit.command import run as run_fit
-from gsjax.cli.machine import resident_mb
+from gsjax.cli.fit import Options
+from gsjax.cli.fit import run as run_fit
 from gsjax.data import ReadOptions
+from gsjax.engine.machine import resident_mb
 from gsjax.methods.fit import FitConfig
 
 GOAL_DB = 25.0

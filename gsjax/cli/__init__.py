@@ -13,30 +13,30 @@ from rich.console import Console
 
 GROUPS = {
     "Look at data": {
-        "info": ("gsjax.cli.info.command", "say what is understood of a recording or of photographs"),
+        "info": ("gsjax.cli.info", "say what is understood of a recording or of photographs"),
         "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for fit"),
     },
     "Reconstruct": {
-        "track": ("gsjax.cli.track.command", "follow the objects of a recording from RGB-D cameras"),
-        "live": ("gsjax.cli.track.live", "follow objects while frames arrive, at a rate you name"),
-        "fit": ("gsjax.cli.fit.command", "fit a static scene to posed photographs"),
-        "parts": ("gsjax.cli.parts.command", "find the parts of a moving scene, and their joints"),
-        "deform": ("gsjax.cli.deform.command", "reconstruct what deforms, from an endoscope say"),
+        "track": ("gsjax.cli.track", "follow the objects of a recording from RGB-D cameras"),
+        "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
+        "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs"),
+        "parts": ("gsjax.cli.parts", "find the parts of a moving scene, and their joints"),
+        "deform": ("gsjax.cli.deform", "reconstruct what deforms, from an endoscope say"),
     },
     "Give a meaning, and ask": {
-        "distill": ("gsjax.cli.distill.command", "give the Gaussians of a run or a PLY file a meaning"),
-        "query": ("gsjax.cli.query.command", "find what a text means: objects of a run, or Gaussians"),
-        "ask": ("gsjax.cli.deform.ask", "answer a question on a scene that deforms"),
-        "grasp": ("gsjax.cli.track.grasp", "find the best grasp of what a text means, in every frame"),
+        "distill": ("gsjax.cli.distill", "give the Gaussians of a run or a PLY file a meaning"),
+        "query": ("gsjax.cli.query", "find what a text means: objects of a run, or Gaussians"),
+        "ask": ("gsjax.cli.ask", "answer a question on a scene that deforms"),
+        "grasp": ("gsjax.cli.grasp", "find the best grasp of what a text means, in every frame"),
     },
     "See and change": {
-        "view": ("gsjax.cli.view.command", "look at a run or a PLY file in a browser"),
-        "edit": ("gsjax.cli.parts.edit", "change when, where and how parts move, and film it"),
+        "view": ("gsjax.cli.view", "look at a run or a PLY file in a browser"),
+        "edit": ("gsjax.cli.edit", "change when, where and how parts move, and film it"),
     },
     "Judge and measure": {
-        "eval": ("gsjax.cli.fit.evaluate", "score a scene that was fitted, again or in more ways"),
-        "compare": ("gsjax.cli.compare.command", "set runs side by side: scores, curves, pictures"),
-        "experiment": ("gsjax.cli.experiment.command", "sweep what a claim rests on, and collect tables"),
+        "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),
+        "compare": ("gsjax.cli.compare", "set runs side by side: scores, curves, pictures"),
+        "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect tables"),
         "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step here"),
     },
 }
@@ -84,11 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         told = f"no command {command!r}; " + (f"did you mean {meant[0]}? There are" if meant else "there are")
         Console(stderr=True).print(f"[bold red]error:[/] {told}: {known}")
         return 2
-    from gsjax.cli.interrupts import heard_interrupts
+    from gsjax.engine.interrupts import heard_interrupts
 
     try:
         with heard_interrupts():
-            from gsjax.cli.messages import run_politely
+            from gsjax.cli.program import run_politely
 
             return run_politely(command, rest, COMMANDS[command])
     except KeyboardInterrupt:

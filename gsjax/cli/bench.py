@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from gsjax.cli.options import Common
+from gsjax.engine.options import Common
 
 SUITE = Path("benchmarks", "suite.py")
 

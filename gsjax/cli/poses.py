@@ -15,8 +15,6 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from gsjax.cli.messages import Notes, stage
-from gsjax.cli.options import Common, Overwriting
 from gsjax.data import Photographs, open_photographs, read_colmap
 from gsjax.data.alignment import align_cameras
 from gsjax.data.stills import write_stills
@@ -27,6 +25,8 @@ from gsjax.data.structure_from_motion import (
     list_photographs,
     place_photographs,
 )
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import Common, Overwriting
 from gsjax.io.atomic import write_json
 
 REPORT = "poses.json"

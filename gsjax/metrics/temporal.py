@@ -164,7 +164,7 @@ def along_flow(
     """The mean over t of compare(frame t + 1 brought to t along the flow, frame t), where `flow_warp_error`
     compares: warped LPIPS and warped SSIM (papers/003, section 4), which discount motion that is explained.
 
-    Relocation both pictures show frame t, so that a window or network that reaches there finds no difference.
+    Elsewhere both pictures show frame t, so that a window or network that reaches there finds no difference.
 
     Args:
         compare: a score of two pictures under a mask.

@@ -10,16 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli import main
-from gsjax.cli.distill.file import StoredField, write_field
-from gsjax.cli.distill.scene import SceneOptions
-from gsjax.cli.distill.source import Source
-from gsjax.cli.run.folder import RunFolder, plain
-from gsjax.cli.run.records import digest
-from gsjax.cli.track import command as track
-from gsjax.cli.track import loop
+from gsjax.cli import main, track
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
+from gsjax.engine.distill.file import StoredField, write_field
+from gsjax.engine.distill.scene import SceneOptions
+from gsjax.engine.distill.source import Source
+from gsjax.engine.folder import RunFolder, plain
+from gsjax.engine.records import digest
+from gsjax.engine.track import loop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.methods.distill import FeatureField
 from gsjax.methods.track import Tracked, first_pose, start_scene

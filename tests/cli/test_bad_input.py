@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-import gsjax.cli.recording
+import gsjax.engine.recording
 from gsjax.data import Sequence, open_sequence
 
 
@@ -214,7 +214,7 @@ def test_pixels_that_are_not_finite(sound, pristine, still, monkeypatch):
 
         return Sequence(**{**vars(found), "load_image": load, "float_images": True})
 
-    monkeypatch.setattr(gsjax.cli.recording, "open_sequence", with_nan)
+    monkeypatch.setattr(gsjax.engine.recording, "open_sequence", with_nan)
     said, found = sound(pristine)
     assert said.count("9 pixels are not finite") == 1
     assert found["cameras"]["0"]["psnr"] > 10

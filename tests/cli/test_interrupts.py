@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from gsjax.cli.interrupts import hear, heard_interrupts, undisturbed
+from gsjax.engine.interrupts import hear, heard_interrupts, undisturbed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from gsjax.cli.machine import describe, in_words, keep_to_cores, name, peak_memory_mb, resident_mb
+from gsjax.engine.machine import describe, in_words, keep_to_cores, name, peak_memory_mb, resident_mb
 
 needs_affinity = pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores"
@@ -17,8 +17,8 @@ KEPT = """
 import os
 import threading
 import jax
-import gsjax.cli.track.live
-from gsjax.cli.machine import describe, keep_to_cores
+import gsjax.cli.live
+from gsjax.engine.machine import describe, keep_to_cores
 
 before = os.sched_getaffinity(0)
 done = threading.Event()

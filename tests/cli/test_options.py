@@ -12,7 +12,7 @@ import pytest
 import tyro
 
 from gsjax.cli import COMMANDS
-from gsjax.cli.options import (
+from gsjax.engine.options import (
     Common,
     HeldOutFrames,
     SamWeights,
@@ -61,7 +61,7 @@ def test_what_commands_share_is_declared_once(command):
         assert issubclass(kind, Common)
         for group, name in product(groups_of(kind), SHARED):
             if (command, name) not in OWN and name in {f.name for f in dataclasses.fields(group)}:
-                assert home_of(group, name).__module__ == "gsjax.cli.options", f"gsjax {command}: {name}"
+                assert home_of(group, name).__module__ == "gsjax.engine.options", f"gsjax {command}: {name}"
 
 
 @dataclass(frozen=True)

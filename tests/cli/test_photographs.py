@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsjax.cli.photographs import choose_photographs, photographs_of_run, split
+from gsjax.engine.photographs import choose_photographs, photographs_of_run, split
 
 RECORDING = "simulated:tabletop?width=32&height=24&frames=4"  # cameras 0, 1 and 2
 NINE = "simulated:tabletop?width=32&height=24&frames=3"

@@ -14,17 +14,17 @@ import pytest
 from jaxtyping import Array, Int
 
 from gsjax.geometry.cameras import unproject
+from gsjax.methods.deform import GraphConfig, graph_of, nodes_of, seen_ids
 from gsjax.methods.track import (
     PRESETS,
     AlignConfig,
     TrackBatch,
     first_pose,
     first_state,
-    track_step,
     place,
     plan_tracker,
+    track_step,
 )
-from gsjax.methods.deform import GraphConfig, graph_of, nodes_of, seen_ids
 from gsjax.scene.deformation import Nodes
 from gsjax.scene.render import plan_render
 

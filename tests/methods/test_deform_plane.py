@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import intrinsics, look_at
-from gsjax.methods.deform import Look, DeformConfig, begin_deform, reconstruct
+from gsjax.methods.deform import DeformConfig, Look, begin_deform, reconstruct
 from gsjax.methods.deform.start import on_plane
 from gsjax.scene.initialize import points_from_rgbd
 

@@ -12,14 +12,14 @@ import gsjax
 from gsjax.geometry.cameras import project
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.deform import (
-    DeformingScene,
     DeformConfig,
+    DeformingScene,
     DeformRatesConfig,
     begin_deform,
+    deform_loss,
     of_step,
     reconstruct,
     refined_viewmats,
-    deform_loss,
 )
 from gsjax.methods.twisted import twisted
 from gsjax.scene.deformation import DeformationConfig

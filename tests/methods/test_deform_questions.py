@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from gsjax.geometry.cameras import Camera, intrinsics
-from gsjax.methods.protocols import Answerer, LanguageModel
 from gsjax.methods.deform import (
     QUESTIONS,
     DeformingScene,
@@ -20,6 +19,7 @@ from gsjax.methods.deform import (
     scene_facts,
 )
 from gsjax.methods.deform.answers import main_direction, part_of_picture
+from gsjax.methods.protocols import Answerer, LanguageModel
 from gsjax.scene.initialize import gaussians_from_points
 
 WIDTH, HEIGHT = 64, 48

@@ -22,8 +22,8 @@ from gsjax.methods.distill import (
     teacher_of_objects,
     with_maps,
 )
-from gsjax.methods.distill.update import _stretched, strip_rows
 from gsjax.methods.distill.teacher import most_rows, of_view
+from gsjax.methods.distill.update import _stretched, strip_rows
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.gaussians import gaussians_from_activated

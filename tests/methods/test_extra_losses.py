@@ -11,6 +11,16 @@ import numpy as np
 import pytest
 
 from gsjax.losses.extra import extra_terms
+from gsjax.methods.deform import (
+    DeformConfig,
+    Look,
+    begin_deform,
+    deform_loss,
+    reconstruct,
+    with_field,
+)
+from gsjax.methods.fit import Batch, FitConfig, StartConfig, begin, fit, fit_loss
+from gsjax.methods.fit.method import _observe
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.refine import RefineBatch as PartsBatch
 from gsjax.methods.parts.refine import RefineParams, refine_step
@@ -19,16 +29,6 @@ from gsjax.methods.track import AlignConfig, track
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
 from gsjax.methods.track.refine import refine, refine_loss
-from gsjax.methods.fit import Batch, FitConfig, StartConfig, begin, fit, fit_loss
-from gsjax.methods.fit.method import _observe
-from gsjax.methods.deform import (
-    Look,
-    DeformConfig,
-    begin_deform,
-    reconstruct,
-    deform_loss,
-    with_field,
-)
 from gsjax.scene.deformation import DeformationConfig
 from gsjax.scene.handles import at_rest
 from gsjax.scene.render import plan_render

@@ -15,19 +15,26 @@ from gsjax.geometry.cameras import camera_centers
 from gsjax.methods.track import GrowConfig, RefineConfig, first_pose, track
 from gsjax.methods.track.align import coarse_shifts
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.reference import ReferencePoints, all_facing, as_facing, as_last_seen, reference_points, radii
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import FOUND, LOST, confidence, is_found
 from gsjax.methods.track.motion import facing
 from gsjax.methods.track.points import Points, carry, pixels_of_groups, sight_of
 from gsjax.methods.track.recover import (
-    SearchContext,
     Relocation,
+    SearchContext,
     depths_of_others,
     guesses,
     recover,
     since,
     with_unexplained,
+)
+from gsjax.methods.track.reference import (
+    ReferencePoints,
+    all_facing,
+    as_facing,
+    as_last_seen,
+    radii,
+    reference_points,
 )
 from gsjax.methods.track.update import in_search_round
 
@@ -124,7 +131,9 @@ def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera
     for k in range(count):
         np.testing.assert_array_equal(asked.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
     about = jnp.array([0.0, 0.0, 0.1])
-    around = as_facing(jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight)
+    around = as_facing(
+        jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight
+    )
     assert float((around.seen != asked.seen[0]).sum()) > 0  # what turns away faces them no more
 
 
@@ -181,7 +190,9 @@ def test_guesses_bring_points_to_strangers_or_stay_near(one):
     np.testing.assert_array_equal(drawn[0][2::4, :3], shifts[2::4, :3])
     places = np.asarray(unexplained_pixels.means).transpose(0, 2, 1)[np.asarray(unexplained_pixels.seen) > 0]
     for twist in drawn[0][1:20:2]:
-        reached = np.asarray(as_facing(reference, twist, center, sight).means)[0].T[np.asarray(reference.real)]
+        reached = np.asarray(as_facing(reference, twist, center, sight).means)[0].T[
+            np.asarray(reference.real)
+        ]
         assert np.linalg.norm(reached[:, None] - places, axis=-1).min() < 1e-5
     nowhere = unexplained_pixels._replace(seen=jnp.zeros_like(unexplained_pixels.seen))
     np.testing.assert_array_equal(draw(0, nowhere)[1::2, :3], shifts[1::2, :3])

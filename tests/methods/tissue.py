@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 import gsjax
-from gsjax.methods.deform import GraphConfig, Look, DeformConfig, DeformRatesConfig
+from gsjax.methods.deform import DeformConfig, DeformRatesConfig, GraphConfig, Look
 from gsjax.scene.deformation import DeformationConfig
 
 CODES = np.eye(2, 4)

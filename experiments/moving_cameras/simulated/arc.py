@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.cli.track.results import MOVED_MM
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
+from gsjax.engine.track.results import MOVED_MM
 from gsjax.methods.track import (
     PRESETS,
+    TrackConfig,
     Tracked,
     TrackedScene,
-    TrackConfig,
     first_pose,
     start_scene,
     track,

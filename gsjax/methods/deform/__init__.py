@@ -30,20 +30,6 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.nodes import nodes_of
-from gsjax.methods.deform.poses import refined_viewmats
-from gsjax.methods.deform.query import prompt_probabilities
-from gsjax.methods.deform.questions import QUESTIONS, Question, QuestionType, parse_question, rows_of
-from gsjax.methods.deform.start import Look, begins, start_gaussians
-from gsjax.methods.deform.update import (
-    Batch,
-    DeformingScene,
-    Moving,
-    feature_loss,
-    on_grid,
-    deform_loss,
-    deform_step,
-)
 from gsjax.methods.deform.method import (
     Advanced,
     DeformProblem,
@@ -55,6 +41,20 @@ from gsjax.methods.deform.method import (
     reconstruct,
     with_field,
 )
+from gsjax.methods.deform.nodes import nodes_of
+from gsjax.methods.deform.poses import refined_viewmats
+from gsjax.methods.deform.query import prompt_probabilities
+from gsjax.methods.deform.questions import QUESTIONS, Question, QuestionType, parse_question, rows_of
+from gsjax.methods.deform.start import Look, begins, start_gaussians
+from gsjax.methods.deform.update import (
+    Batch,
+    DeformingScene,
+    Moving,
+    deform_loss,
+    deform_step,
+    feature_loss,
+    on_grid,
+)
 
 __all__ = [
     "PRESETS",
@@ -62,6 +62,11 @@ __all__ = [
     "Advanced",
     "Answer",
     "Batch",
+    "DeformConfig",
+    "DeformProblem",
+    "DeformRatesConfig",
+    "DeformState",
+    "DeformWeightsConfig",
     "DeformingScene",
     "FrameGraph",
     "GraphConfig",
@@ -72,16 +77,13 @@ __all__ = [
     "QuestionType",
     "SceneFacts",
     "Sight",
-    "DeformConfig",
-    "DeformProblem",
-    "DeformRatesConfig",
-    "DeformState",
-    "DeformWeightsConfig",
     "TemplatedAnswerer",
     "begin_deform",
     "begins",
     "compiled_step",
     "counted_ids",
+    "deform_loss",
+    "deform_step",
     "facts_of_sights",
     "feature_loss",
     "frame_graphs",
@@ -100,7 +102,5 @@ __all__ = [
     "scene_facts",
     "seen_ids",
     "start_gaussians",
-    "deform_loss",
-    "deform_step",
     "with_field",
 ]

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.methods.protocols import LanguageModel
 from gsjax.methods.deform.facts import SceneFacts
 from gsjax.methods.deform.questions import STILL, TOUCH, Question, parse_question, rows_of
+from gsjax.methods.protocols import LanguageModel
 
 
 class Answer(NamedTuple):

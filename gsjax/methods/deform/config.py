@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from gsjax.methods.settings import expect
 from gsjax.methods.deform.graph import GraphConfig
+from gsjax.methods.settings import expect
 from gsjax.scene.deformation import DeformationConfig
 
 

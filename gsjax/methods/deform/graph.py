@@ -27,8 +27,8 @@ from gsjax.losses.edges import (
     temporal_edges,
 )
 from gsjax.losses.graph import node_loss, similarity_loss, structure_loss
-from gsjax.methods.settings import expect
 from gsjax.methods.deform.start import Look, known_depth
+from gsjax.methods.settings import expect
 
 _NEAR = 0.05  # share of the depth by which what is seen may lie before or behind a node
 

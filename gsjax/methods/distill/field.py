@@ -105,7 +105,7 @@ def init_field(
 
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
-    """SearchContext all points, but for those of a few that would make its cells much larger for all others."""
+    """Around all points, but for those of a few that would make its cells much larger for all others."""
     low, high = np.quantile(points, [_MOST, 1 - _MOST], axis=0).astype(np.float32)
     room = _FAR_OUT * max((high - low).max(), 1e-3)
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])

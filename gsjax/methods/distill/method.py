@@ -13,9 +13,9 @@ from jaxtyping import Array, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill.config import DistillConfig
-from gsjax.methods.distill.update import DistillBatch, distill_step
 from gsjax.methods.distill.field import FeatureField, init_field, used_part, whole
 from gsjax.methods.distill.teacher import Teacher, most_rows, of_view
+from gsjax.methods.distill.update import DistillBatch, distill_step
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.frozen import FrozenView, freeze_views

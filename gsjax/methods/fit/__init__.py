@@ -21,7 +21,7 @@ from gsjax.methods.fit.method import FitState, Fitted, Problem, as_found, begin,
 from gsjax.methods.fit.model import Model
 from gsjax.methods.fit.pruning import light_of, needed
 from gsjax.methods.fit.start import Extent, View, extent_of
-from gsjax.methods.fit.update import Batch, Observation, fit_loss, grow, fit_step
+from gsjax.methods.fit.update import Batch, Observation, fit_loss, fit_step, grow
 
 __all__ = [
     "PRESETS",
@@ -43,8 +43,8 @@ __all__ = [
     "extent_of",
     "fit",
     "fit_loss",
+    "fit_step",
     "grow",
     "light_of",
     "needed",
-    "fit_step",
 ]

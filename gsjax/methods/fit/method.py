@@ -20,8 +20,8 @@ from gsjax.methods.fit.start import Extent, View, extent_of, in_slots, start_poi
 from gsjax.methods.fit.update import (
     Batch,
     Observation,
-    grow,
     fit_step,
+    grow,
     slots_wanted,
     split,
 )

@@ -27,8 +27,8 @@ from gsjax.methods.track.plan import TrackPlan, plan_tracker
 from gsjax.methods.track.query import Match, find_object
 from gsjax.methods.track.scene import TrackedScene
 from gsjax.methods.track.shapes import scene_from_shapes
-from gsjax.methods.track.update import TrackBatch, TrackState, track_step
 from gsjax.methods.track.tracking import Tracked, first_state, start_scene, track
+from gsjax.methods.track.update import TrackBatch, TrackState, track_step
 
 __all__ = [
     "EMPTY",
@@ -42,18 +42,17 @@ __all__ = [
     "Pose",
     "RefineConfig",
     "StartConfig",
-    "Tracked",
-    "TrackedScene",
     "TrackBatch",
     "TrackConfig",
     "TrackPlan",
     "TrackState",
+    "Tracked",
+    "TrackedScene",
     "distill_features",
     "feature_distiller",
     "find_object",
     "first_pose",
     "first_state",
-    "track_step",
     "place",
     "plan_tracker",
     "project_features",
@@ -62,5 +61,6 @@ __all__ = [
     "scene_from_shapes",
     "start_scene",
     "track",
+    "track_step",
     "with_slots",
 ]

@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gsjax.methods.track.align import align, coarse_shifts, compose, turned, widened
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.reference import ReferencePoints, as_facing
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.lost import COLOR_SCALE, Confidence, confidence
 from gsjax.methods.track.points import Points, Sight, sum_of_three
+from gsjax.methods.track.reference import ReferencePoints, as_facing
 
 _LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
 _NEAR_HUNCH = 0.3  # radians; how a guess that goes on from a guess is turned

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.track.config import TrackConfig
-from gsjax.methods.track.reference import all_facing, as_last_seen, reference_points, radii
 from gsjax.methods.track.layers import (
     Backdrop,
     Shown,
@@ -42,14 +41,15 @@ from gsjax.methods.track.points import (
     sight_of,
 )
 from gsjax.methods.track.recover import (
-    SearchContext,
     Relocation,
+    SearchContext,
     depths_of_others,
     evidence,
     recover,
     since,
     with_unexplained,
 )
+from gsjax.methods.track.reference import all_facing, as_last_seen, radii, reference_points
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.region import near_background, near_scene, shift_background, spread
 from gsjax.methods.track.scene import TrackedScene
@@ -72,7 +72,9 @@ class TrackState(NamedTuple):
     pixels: Points  # what showed each group in the last frame
     keyframe: Keyframe  # and in an earlier one
     unexplained_pixels: Points  # pixels of the last frame that no group explains
-    relocation_guesses: Float[Array, "k 6"]  # where what may be elsewhere is then, from where it is believed to be
+    relocation_guesses: Float[
+        Array, "k 6"
+    ]  # where what may be elsewhere is then, from where it is believed to be
     watch: Watch
     count: Int[Array, ""]  # frames so far
     shown: Shown | None  # of the last frame, and what it was drawn over; where only what moves is redrawn
@@ -314,9 +316,13 @@ def track_step(
         keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
         told = memory(shown, backdrop, frame)
         watch = state.watch.after(residual, sought, counts, sure, elsewhere, retaken)
-        relocation_guesses = of_groups(watch.doubtful & ~retaken, since(relocation_guesses, kept.twists), still)
+        relocation_guesses = of_groups(
+            watch.doubtful & ~retaken, since(relocation_guesses, kept.twists), still
+        )
         going = _select(retaken, jax.tree.map(jnp.zeros_like, kept), kept, groups)  # a find is no velocity
-        new_state = TrackState(going, pixels, keyframe, unexplained_pixels, relocation_guesses, watch, state.count + 1, *told)
+        new_state = TrackState(
+            going, pixels, keyframe, unexplained_pixels, relocation_guesses, watch, state.count + 1, *told
+        )
         pose, new_state = keep_if(sound, (pose, new_state), (params, state))
         kept, watch = keep_if(sound, kept, jax.tree.map(jnp.zeros_like, kept)), new_state.watch
         info |= {

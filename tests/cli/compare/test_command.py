@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.cli.compare.comparison import labels
-from gsjax.cli.fit.results import PANELS
-from gsjax.cli.run.records import digest
+from gsjax.engine.compare.comparison import labels
+from gsjax.engine.fit.results import PANELS
+from gsjax.engine.records import digest
 from gsjax.viz.colors import side_by_side
 
 MACHINE = {"processor": "A", "cores": 2, "device": "cpu", "devices": 1}
@@ -203,7 +203,7 @@ def test_runs_of_the_tracker_are_compared_and_kinds_not_mixed(
     metrics["tracked"]["psnr"] += 1
     (second / "metrics.json").write_text(json.dumps(metrics))
     settings = yaml.safe_load((first / "config.yml").read_text())
-    settings["tracker"]["match"]["patch"] = 1
+    settings["track"]["match"]["patch"] = 1
     (second / "config.yml").write_text("# gsjax run\n" + yaml.safe_dump(settings))
     code, said, found = gsjax_compare(first, second)
     assert code == 0, said
@@ -211,7 +211,7 @@ def test_runs_of_the_tracker_are_compared_and_kinds_not_mixed(
     assert found["groups"][0]["best"] == {"psnr": ["better"]}
     assert by_run(found, "frames") == {"run": 4, "better": 4}
     assert by_run(found, "iou")["run"] == min(metrics["iou"].values())
-    assert list(found["options"]) == ["tracker.match.patch"]
+    assert list(found["options"]) == ["track.match.patch"]
     code, said, _ = gsjax_compare(first, make("a"))
     assert code == 2
     assert "expected runs of one command, found those of `gsjax track`" in said

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli.deform.file import NAME, StoredDeformation, write_deformation
-from gsjax.cli.deform.teacher import Meaning
-from gsjax.cli.distill.source import Source
+from gsjax.engine.deform.file import NAME, StoredDeformation, write_deformation
+from gsjax.engine.deform.teacher import Meaning
+from gsjax.engine.distill.source import Source
 from gsjax.geometry.cameras import intrinsics
 from gsjax.methods.deform import QUESTIONS, DeformingScene
 from gsjax.scene.initialize import gaussians_from_points

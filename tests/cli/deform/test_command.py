@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
-from gsjax.cli.deform.file import read_deformation
-from gsjax.cli.deform.scores import OVER_TIME
-from gsjax.cli.run import learning
+from gsjax.engine import learning
+from gsjax.engine.deform.file import read_deformation
+from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.io.ply import read_ply
 
 SCENE = "simulated:tissue?width=64&height=52&frames=10"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gsjax.cli.deform.data import deform_data
-from gsjax.cli.distill.choice import TeacherChoice
-from gsjax.cli.messages import Notes
 from gsjax.data import open_sequence
+from gsjax.engine.deform.data import deform_data
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.messages import Notes
 
 KIDNEY, SHAFT = 4, 7
 NAMES = {0: "background-tissue", KIDNEY: "kidney-parenchyma", SHAFT: "instrument-shaft"}

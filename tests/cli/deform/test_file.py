@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli.deform.file import StoredDeformation, read_deformation, write_deformation
-from gsjax.cli.deform.teacher import Meaning
-from gsjax.cli.distill.source import Source
+from gsjax.engine.deform.file import StoredDeformation, read_deformation, write_deformation
+from gsjax.engine.deform.teacher import Meaning
+from gsjax.engine.distill.source import Source
 from gsjax.io.checkpoints import load_checkpoint, load_metadata, save_checkpoint
 from gsjax.methods.deform import DeformingScene, nodes_of
 from gsjax.scene.deformation import DeformationConfig, init_deformation

@@ -14,14 +14,14 @@ import pytest
 from rich.console import Console
 
 from gsjax.cli import main
-from gsjax.cli.deform.command import Options, write_scene
-from gsjax.cli.deform.data import deform_data
-from gsjax.cli.deform.file import read_deformation, write_deformation
-from gsjax.cli.distill.choice import TeacherChoice
-from gsjax.cli.messages import Notes
-from gsjax.cli.run.folder import RunFolder
-from gsjax.cli.view.viewables import open_viewable
+from gsjax.cli.deform import Options, write_scene
 from gsjax.data import open_sequence
+from gsjax.engine.deform.data import deform_data
+from gsjax.engine.deform.file import read_deformation, write_deformation
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import Notes
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 from gsjax.methods.deform import DeformConfig, DeformState, begin_deform, with_field

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli.deform.scores import OVER_TIME, classes_of_pixels, over_time
+from gsjax.engine.deform.scores import OVER_TIME, classes_of_pixels, over_time
 from gsjax.methods.deform import Look
 
 HEIGHT, WIDTH = 40, 48

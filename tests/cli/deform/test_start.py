@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gsjax.cli.deform.depth import with_depth
-from gsjax.cli.messages import Notes
 from gsjax.data import DataError, DataWarning, open_photographs, open_sequence
 from gsjax.data.ordered import in_order
+from gsjax.engine.deform.depth import with_depth
+from gsjax.engine.messages import Notes
 from gsjax.io.video import VideoWriter
 
 EYES = "simulated:tissue?width=96&height=80&frames=4"

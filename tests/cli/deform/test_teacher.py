@@ -14,15 +14,15 @@ from hypothesis import given, settings
 from rich.console import Console
 
 from gsjax.cli import main
-from gsjax.cli.deform.data import deform_data
-from gsjax.cli.deform.file import read_deformation, write_deformation
-from gsjax.cli.deform.prompts import wanted_like, wanted_text
-from gsjax.cli.deform.teacher import GROUPS, Meaning, basis_of, groups_of
-from gsjax.cli.distill.choice import TeacherChoice
-from gsjax.cli.distill.source import Source
-from gsjax.cli.messages import Notes
-from gsjax.cli.run import learning
 from gsjax.data import open_sequence
+from gsjax.engine import learning
+from gsjax.engine.deform.data import deform_data
+from gsjax.engine.deform.file import read_deformation, write_deformation
+from gsjax.engine.deform.prompts import wanted_like, wanted_text
+from gsjax.engine.deform.teacher import GROUPS, Meaning, basis_of, groups_of
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.distill.source import Source
+from gsjax.engine.messages import Notes
 from gsjax.methods.deform import DeformConfig, begin_deform, counted_ids
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401

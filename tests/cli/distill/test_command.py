@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.cli.distill import command as distill
-from gsjax.cli.distill import teacher as field_teacher
-from gsjax.cli.distill.choice import TeacherChoice
-from gsjax.cli.distill.command import Options
-from gsjax.cli.run import learning
+from gsjax.cli import distill
+from gsjax.cli.distill import Options
+from gsjax.engine import learning
+from gsjax.engine.distill import teacher as field_teacher
+from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import SMALL, metrics
 

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli.distill import pictures as field_pictures
-from gsjax.cli.distill import scores as field_scores
-from gsjax.cli.distill.results import draw_features, feature_colors
-from gsjax.cli.distill.saved import short_names
-from gsjax.cli.distill.scores import class_maps, classes_of, one_by_one
+from gsjax.engine.distill import pictures as field_pictures
+from gsjax.engine.distill import scores as field_scores
+from gsjax.engine.distill.results import draw_features, feature_colors
+from gsjax.engine.distill.saved import short_names
+from gsjax.engine.distill.scores import class_maps, classes_of, one_by_one
 from gsjax.geometry.cameras import Camera
 from gsjax.io.ply import read_ply
 from gsjax.methods.distill import (

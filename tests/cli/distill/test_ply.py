@@ -11,7 +11,14 @@ import yaml
 
 from gsjax.cli import main
 
-SMALL = ("--distill.grid.levels", "4", "--distill.grid.most-resolution", "32", "--distill.grid.log2-entries", "12")
+SMALL = (
+    "--distill.grid.levels",
+    "4",
+    "--distill.grid.most-resolution",
+    "32",
+    "--distill.grid.log2-entries",
+    "12",
+)
 SMALL += ("--distill.grid.hidden", "16", "--distill.channels", "16", "--distill.contrast-patch", "8")
 SMALL += ("--distill.rates.table", "0.1", "--distill.rates.layers", "0.01", "--distill.rates.lift", "0.02")
 TABLE = ("--distill.encoding", "table")  # learns in fewer steps
@@ -23,7 +30,7 @@ def cache(tmp_path_factory):
     """A cache of features for these tests alone."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("cache")
-        patch.setattr("gsjax.cli.distill.cache.user_cache_dir", lambda *a, **k: str(folder))
+        patch.setattr("gsjax.engine.distill.cache.user_cache_dir", lambda *a, **k: str(folder))
         yield folder
 
 
@@ -81,7 +88,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 
 @pytest.mark.slow
 def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
-    from gsjax.cli.run import learning
+    from gsjax.engine import learning
 
     steps, heard = ("--distill.iterations", STEPS, *TABLE), []
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)

@@ -10,8 +10,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from gsjax.cli.distill import pictures as field_pictures
-from gsjax.cli.distill.source import Source
+from gsjax.engine.distill import pictures as field_pictures
+from gsjax.engine.distill.source import Source
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.closed_vocabulary import ClosedVocabulary
 from gsjax.perception.codebook import ClassCodebook

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gsjax.cli.distill import teacher as field_teacher
-from gsjax.cli.distill.cache import FeatureCache
-from gsjax.cli.distill.choice import TeacherChoice
-from gsjax.cli.distill.teacher import Teaching
 from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
+from gsjax.engine.distill import teacher as field_teacher
+from gsjax.engine.distill.cache import FeatureCache
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.distill.teacher import Teaching
 
 QUIET = Console(quiet=True)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gsjax.cli import machine
-from gsjax.cli.experiment import script as scripts
+from gsjax.engine import machine
+from gsjax.engine.experiments import script as scripts
 from tests.cli.experiment.toys import SCRIPT, calls, cell_files, markdown_table, results
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from gsjax.cli.experiment.cluster import slurm_cluster
+from gsjax.engine.experiments.cluster import slurm_cluster
 from tests.cli.experiment.toys import SCRIPT, calls, cell_files, results
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
@@ -264,7 +264,7 @@ def test_nothing_is_forgotten_where_no_scheduler_answers(toy, gsjax, monkeypatch
     toy()
     gsjax("run", "toy")
     before = cell_files()
-    monkeypatch.setattr("gsjax.cli.experiment.cluster.CONNECT_S", 1)
+    monkeypatch.setattr("gsjax.engine.experiments.cluster.CONNECT_S", 1)
     elsewhere = ("--executor", "dask", "--scheduler", "tcp://127.0.0.1:1")
     code, _, err = gsjax("run", "toy", "--fresh", *elsewhere)
     assert code == 2

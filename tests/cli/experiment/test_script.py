@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gsjax.cli.experiment.script import forget_scripts
-from gsjax.cli.experiment.sweep import experiment_names, read_experiment
+from gsjax.engine.experiments.script import forget_scripts
+from gsjax.engine.experiments.sweep import experiment_names, read_experiment
 from tests.cli.experiment.toys import SCRIPT, calls, results
 
 
@@ -48,7 +48,7 @@ def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
 
 
 GSJAX_IMPORTS = """
-from gsjax.cli.recording import open_recording
+from gsjax.engine.recording import open_recording
 from gsjax.scene import (  # several
     Gaussians,
     Tags,

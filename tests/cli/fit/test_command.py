@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.fit.command
-import gsjax.cli.photographs
+import gsjax.cli.fit
+import gsjax.engine.photographs
 from gsjax.cli import main
-from gsjax.cli.fit.loop import Budget
-from gsjax.cli.fit.results import Curve
-from gsjax.cli.fit.worth import parts_of_time
 from gsjax.data.video import describe_video
+from gsjax.engine.fit.loop import Budget
+from gsjax.engine.fit.results import Curve
+from gsjax.engine.fit.worth import parts_of_time
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import PRESETS
 
@@ -186,7 +186,7 @@ def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
     def stopped(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(gsjax.cli.fit.command, what, stopped)
+    monkeypatch.setattr(gsjax.cli.fit, what, stopped)
     code, said = gsjax_fit(*QUICK, "--fit.steps", "8")
     assert code == 0, said
     lacks = {"parts": "looking at", "write_orbit": "drawing a video", "judge": "scoring"}[what]
@@ -296,7 +296,7 @@ def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_
     old.mkdir()
     (old / "config.yml").write_text("# gsjax run\n")
     (old / "scene.ply").write_text("of before")
-    monkeypatch.setattr(gsjax.cli.photographs, "available_mb", lambda: 0.1)
+    monkeypatch.setattr(gsjax.engine.photographs, "available_mb", lambda: 0.1)
     code, said = gsjax_fit(*QUICK, "--overwrite")
     assert code == 2
     assert "9 photographs need some 0.0 GB, and 0.0 GB are free; try --scale" in said

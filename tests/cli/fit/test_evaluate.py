@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.fit.command
+import gsjax.cli.fit
 from gsjax.cli import main
-from gsjax.cli.run.records import read_record
+from gsjax.engine.records import read_record
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def fitted(photographs, tmp_path_factory):
     run = tmp_path_factory.mktemp("fitted") / "run"
     options = ("--fit.cap", "120", "--fit.start.count", "100", "--test-every", "4")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gsjax.cli.fit.command, "follow", lambda problem, state, *_, **how: (state, None))
+        patch.setattr(gsjax.cli.fit, "follow", lambda problem, state, *_, **how: (state, None))
         assert main(["fit", str(photographs), "--out", str(run), *options]) == 0
     return run
 
@@ -119,8 +119,8 @@ def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, r
 
 
 def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
-    from gsjax.cli.fit.evaluate import scores
-    from gsjax.cli.fit.results import Seen
+    from gsjax.cli.evaluate import scores
+    from gsjax.engine.fit.results import Seen
     from gsjax.methods.fit import View
 
     rng = np.random.default_rng(0)
@@ -191,7 +191,7 @@ def test_what_cannot_be_scored_is_said(gsjax_eval, run, tmp_path, weights):
     config.write_text("# gsjax run\n" + yaml.safe_dump(settings | {"test_every": 0}))
     assert "the fit held out no photograph; score those it saw by --views train" in gsjax_eval()[1]
     (run / "metrics.json").unlink()  # that of another command looks otherwise
-    config.write_text("# gsjax run\n" + yaml.safe_dump({"tracker": {}, "eval_cameras": []}))
+    config.write_text("# gsjax run\n" + yaml.safe_dump({"track": {}, "eval_cameras": []}))
     assert "expected a run of `gsjax fit`, found one of `gsjax track`" in gsjax_eval()[1]
     config.write_text("# gsjax run\nsource: camera:0\n")
     assert "settings of another command (source)" in gsjax_eval()[1]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.cli.fit.tensorboard import TensorBoard
+from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.extras import MissingExtra
 
 pytest.importorskip("tensorboardX")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
-from gsjax.cli.info.picture import by_camera, by_split, scene_points
 from gsjax.data import DataWarning, open_photographs, open_sequence, photographs_of
+from gsjax.engine.info_picture import by_camera, by_split, scene_points
 from gsjax.viz.cameras import cameras_and_points
 
 

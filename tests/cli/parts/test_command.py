@@ -7,11 +7,11 @@ from html import unescape
 import numpy as np
 import pytest
 
-import gsjax.cli.parts.command
-import gsjax.cli.parts.loop
+import gsjax.cli.parts
+import gsjax.engine.parts.loop
 from gsjax.cli import main
-from gsjax.cli.recording import chosen_recording
 from gsjax.data.video import describe_video
+from gsjax.engine.recording import chosen_recording
 from gsjax.io.ply import read_ply
 from gsjax.viz.colors import label_color
 
@@ -102,13 +102,13 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
 
     def stop_in(name):
         """After the first step of that loop."""
-        loop = getattr(gsjax.cli.parts.loop, name)
+        loop = getattr(gsjax.engine.parts.loop, name)
 
         def stopped(*arguments):
             yield next(loop(*arguments))
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(gsjax.cli.parts.loop, name, stopped)
+        monkeypatch.setattr(gsjax.engine.parts.loop, name, stopped)
 
     def resumed(name):
         monkeypatch.undo()
@@ -170,7 +170,7 @@ def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
         recording = chosen_recording(options)
         return replace(recording, tracked=replace(recording.tracked, load_mask=None))
 
-    monkeypatch.setattr(gsjax.cli.parts.command, "chosen_recording", maskless)
+    monkeypatch.setattr(gsjax.cli.parts, "chosen_recording", maskless)
     code, said = gsjax_parts("--frames", "0:24:8", "--masks", "files")
     assert code == 2
     assert "--masks files: expected a mask of frame" in said

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.cli.parts import films
-from gsjax.cli.parts.films import shots
-from gsjax.cli.parts.results import write_parts
-from gsjax.cli.parts.saved import open_parts_run
 from gsjax.data.video import describe_video
+from gsjax.engine.parts import films
+from gsjax.engine.parts.films import shots
+from gsjax.engine.parts.results import write_parts
+from gsjax.engine.parts.saved import open_parts_run
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
 from gsjax.methods.parts import PartScene, gaussians_at, moment, trajectory_of

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsjax.cli.parts.saved import blend_of, read_parts
+from gsjax.engine.parts.saved import blend_of, read_parts
 from tests.cli.parts.test_edit import write_run
 
 AGAIN = "; run gsjax parts again with this version of gsjax, or name another folder"

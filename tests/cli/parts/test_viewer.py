@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from gsjax.cli.messages import Notes
-from gsjax.cli.parts.films import new_folder
-from gsjax.cli.parts.saved import open_parts_run
-from gsjax.cli.parts.viewer import script_of
-from gsjax.cli.view.viewables import open_viewable
+from gsjax.engine.messages import Notes
+from gsjax.engine.parts.films import new_folder
+from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.parts.viewer import script_of
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.video import read_video_frames
 from gsjax.methods.parts.film import film_gaussians
 from gsjax.methods.parts.operations import OPERATIONS

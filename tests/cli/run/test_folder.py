@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.cli.run.folder import RunFolder, fresh_folder, replaced_folder
+from gsjax.engine.folder import RunFolder, fresh_folder, replaced_folder
 
 
 class Mode(enum.Enum):

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gsjax.cli.messages import Notes
-from gsjax.cli.run.learning import Course, Learning, say_if_cut_short
+from gsjax.engine.learning import Course, Learning, say_if_cut_short
+from gsjax.engine.messages import Notes
 
 
 @pytest.mark.parametrize(

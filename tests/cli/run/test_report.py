@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from gsjax.cli.run.report import Media, Table, format_number, write_report
+from gsjax.engine.report import Media, Table, format_number, write_report
 
 VOID = {"meta", "img", "br"}
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.track.loop
-from gsjax.cli.recording import parse_frames
+import gsjax.engine.track.loop
 from gsjax.data import Sequence
+from gsjax.engine.recording import parse_frames
 from gsjax.io.ply import read_ply
 from gsjax.io.video import read_video_frames
 
@@ -26,7 +26,7 @@ CAMERAS = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
 def opened(monkeypatch):
     """(frame, camera) of each mask that is opened, and when tracking had ended, None."""
     log = []
-    mask, follow = Sequence.mask, gsjax.cli.track.loop.follow
+    mask, follow = Sequence.mask, gsjax.engine.track.loop.follow
 
     def watched(sequence, t, c):
         log.append((sequence.frame_ids[t], sequence.camera_ids[c]))
@@ -38,7 +38,7 @@ def opened(monkeypatch):
         return result
 
     monkeypatch.setattr(Sequence, "mask", watched)
-    monkeypatch.setattr("gsjax.cli.track.command.follow", followed)
+    monkeypatch.setattr("gsjax.cli.track.follow", followed)
     return log
 
 
@@ -96,7 +96,7 @@ def test_a_run_from_end_to_end(pristine, tmp_path, gsjax_track, opened):
 
     config = yaml.safe_load((run / "config.yml").read_text())
     assert config["cameras"] == [0, 1]
-    assert config["tracker"]["start"]["iterations"] == 2
+    assert config["track"]["start"]["iterations"] == 2
     for camera in (0, 1, 2):
         assert len(read_video_frames(run / f"video_{camera}.mp4")) == 4
         assert len(list((run / "renders" / str(camera)).glob("*.png"))) == 4
@@ -201,7 +201,7 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
             known[ids.index(CARTON)] = t < 2
             yield update._replace(info=update.info | {"lost": lost, "turn_known": known})
 
-    monkeypatch.setattr(gsjax.cli.track.loop, "track", flagged)
+    monkeypatch.setattr(gsjax.engine.track.loop, "track", flagged)
     assert gsjax_track(pristine, "--cameras", "1")[0] == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [

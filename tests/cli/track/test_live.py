@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import gsjax.cli.track.live
+import gsjax.cli.live
 import gsjax.data.stream
 from gsjax.cli import main
 from gsjax.methods.track import Tracked, first_pose, start_scene
@@ -33,8 +33,8 @@ def unfitted(frame, mask, camera, config):
 @pytest.fixture
 def live(tmp_path, capfd, monkeypatch):
     """Runs `gsjax live` in this process; returns the exit code, what was said, and the run's folder."""
-    monkeypatch.setattr(gsjax.cli.track.live, "track", standing_still)
-    monkeypatch.setattr(gsjax.cli.track.live, "start_scene", unfitted)
+    monkeypatch.setattr(gsjax.cli.live, "track", standing_still)
+    monkeypatch.setattr(gsjax.cli.live, "start_scene", unfitted)
 
     def call(source, *options: str):
         code = main(["live", str(source), "--out", str(tmp_path / "run"), *options])
@@ -75,7 +75,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
 
 def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     """Its own middle shifts with what joins: by 2 cm here, while it turns by 90 degrees and moves by 1 m."""
-    log = gsjax.cli.track.live.Log((0, 5), {})
+    log = gsjax.cli.live.Log((0, 5), {})
     still, turn = np.zeros((1, 6)), np.array([[1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]])
     start, joined, moved = (np.array([[x, 0.0, 0.0]]) for x in (0.1, 0.12, 1.12))
     places = [
@@ -112,7 +112,7 @@ def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatc
         yield from gsjax.data.stream.replay(frames, hz, 0.2)
         raise OSError("the camera was unplugged")
 
-    monkeypatch.setattr(gsjax.cli.track.live, "replay", failing)
+    monkeypatch.setattr(gsjax.cli.live, "replay", failing)
     code, said, folder = live(pristine, "--cameras", "0", "--hz", "20")
     assert code == 2
     assert "unplugged" in said

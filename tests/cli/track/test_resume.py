@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import gsjax.cli.run.saving
-import gsjax.cli.track.loop
-import gsjax.cli.track.resume
+import gsjax.engine.saving
+import gsjax.engine.track.loop
+import gsjax.engine.track.resume
 import gsjax.methods.track
-from gsjax.cli.track.loop import Tracking
+from gsjax.engine.track.loop import Tracking
 from gsjax.methods.track import Pose, Tracked, track
 
 OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--track.start.iterations", "5")
@@ -38,10 +38,10 @@ def test_a_stopped_run_goes_on_and_ends_alike_to_the_bit(pristine, gsjax_track, 
     whole = np.load(tmp_path / "run" / "trajectory.npz")
     (tmp_path / "run").rename(tmp_path / "whole")
 
-    monkeypatch.setattr(gsjax.cli.track.loop, "track", interrupted(1))
+    monkeypatch.setattr(gsjax.engine.track.loop, "track", interrupted(1))
     assert gsjax_track(pristine, *OPTIONS)[0] == 130
     assert (tmp_path / "run" / "resume" / "state.npz").exists()
-    monkeypatch.setattr(gsjax.cli.track.loop, "track", track)
+    monkeypatch.setattr(gsjax.engine.track.loop, "track", track)
     code, said = gsjax_track(pristine, *OPTIONS, "--resume")
     assert code == 0, said
     resumed = np.load(tmp_path / "run" / "trajectory.npz")
@@ -74,8 +74,8 @@ def test_a_full_disk_is_said_and_tracking_goes_on(pristine, gsjax_track, still, 
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(gsjax.cli.run.saving, "EVERY_S", -1.0)
-    monkeypatch.setattr(gsjax.cli.track.resume, "write_npz", full)
+    monkeypatch.setattr(gsjax.engine.saving, "EVERY_S", -1.0)
+    monkeypatch.setattr(gsjax.engine.track.resume, "write_npz", full)
     code, said = gsjax_track(pristine, "--cameras", "0")
     assert code == 0, said
     assert "could not save what --resume needs" in said
@@ -94,14 +94,18 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     update = Mock(spec=Tracked, scene=None, pose=None, state=None, chosen=None)
-    monkeypatch.setattr(gsjax.cli.track.resume, "_shapes", lambda scene: {})
-    monkeypatch.setattr(gsjax.cli.track.resume, "_chosen_metadata", lambda chosen: None)
-    saver, written = gsjax.cli.track.resume.Saver(tmp_path), []
+    monkeypatch.setattr(gsjax.engine.track.resume, "_shapes", lambda scene: {})
+    monkeypatch.setattr(gsjax.engine.track.resume, "_chosen_metadata", lambda chosen: None)
+    saver, written = gsjax.engine.track.resume.Saver(tmp_path), []
     for frames, save in ((10, written.append), (20, full), (30, written.append)):
-        monkeypatch.setattr(gsjax.cli.track.resume, "save_checkpoint", lambda path, *_, save=save: save(path))
+        monkeypatch.setattr(
+            gsjax.engine.track.resume, "save_checkpoint", lambda path, *_, save=save: save(path)
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             saver(tracked_up_to(frames), update, last=True)
     assert len(written) == 2
-    saved = gsjax.cli.track.resume._saved_poses(tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0]))
+    saved = gsjax.engine.track.resume._saved_poses(
+        tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0])
+    )
     assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))

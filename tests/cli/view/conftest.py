@@ -9,15 +9,15 @@ import pytest
 from rich.console import Console
 
 from gsjax.cli import main
-from gsjax.cli.fit.command import Options as FitOptions
-from gsjax.cli.messages import Notes
-from gsjax.cli.run.folder import RunFolder
-from gsjax.cli.track.command import Options as TrackOptions
-from gsjax.cli.track.loop import Tracking
-from gsjax.cli.track.outputs import write_tracking
+from gsjax.cli.fit import Options as FitOptions
+from gsjax.cli.track import Options as TrackOptions
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import Notes
+from gsjax.engine.track.loop import Tracking
+from gsjax.engine.track.outputs import write_tracking
 from gsjax.io.ply import write_ply
-from gsjax.methods.track import Pose, TrackedScene
 from gsjax.methods.fit import FitConfig
+from gsjax.methods.track import Pose, TrackedScene
 from gsjax.scene.gaussians import gaussians_from_activated
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from gsjax.cli.distill.saved import Whereabouts
-from gsjax.cli.view.viewables import open_viewable
+from gsjax.engine.distill.saved import Whereabouts
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.methods.parts import gaussians_at, moment
 from tests.cli.parts.test_edit import scene_and_trajectory
@@ -236,7 +236,7 @@ def test_a_port_in_use(view, ply, monkeypatch):
         code, said = view(ply, "--port", port)
         assert code == 2
         assert f"port {port}: cannot listen there on 127.0.0.1" in said
-        for module in ("gsjax.viz.viewer.server", "gsjax.cli.view.command"):
+        for module in ("gsjax.viz.viewer.server", "gsjax.cli.view"):
             monkeypatch.setattr(f"{module}.PORT", port)
         code, said = view(ply)
         assert code == 130

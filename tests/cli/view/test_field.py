@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsjax.cli.distill.saved import Whereabouts
-from gsjax.cli.distill.source import Source
-from gsjax.cli.view.viewables import open_viewable
+from gsjax.engine.distill.saved import Whereabouts
+from gsjax.engine.distill.source import Source
+from gsjax.engine.viewables import open_viewable
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.perception.codebook import ClassCodebook
 from tests.cli.conftest import write_made_field
@@ -44,7 +44,7 @@ def test_a_fit_is_asked_by_its_field(fitted, asked, notes):
 
 def test_a_scene_is_read_once(fitted, asked, notes, monkeypatch):
     read = []
-    monkeypatch.setattr("gsjax.cli.run.files.read_ply", lambda file: read.append(file) or read_ply(file))
+    monkeypatch.setattr("gsjax.engine.files.read_ply", lambda file: read.append(file) or read_ply(file))
     open_viewable(fitted, notes)
     assert read == [fitted / "scene.ply"]
 
@@ -80,7 +80,7 @@ def test_what_was_found_is_kept_and_nothing_written_over(fitted, asked, notes, m
     def full(*args, **options):
         raise OSError("no space")
 
-    monkeypatch.setattr("gsjax.cli.query.selected.write_ply", full)
+    monkeypatch.setattr("gsjax.engine.selected.write_ply", full)
     with pytest.raises(OSError, match="no space"):
         asking.save(selected, "x", 0)
     assert sorted(asked.joinpath("extracted").iterdir()) == paths

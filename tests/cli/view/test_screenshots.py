@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.cli.view.command import screenshots
+from gsjax.cli.view import screenshots
 
 
 def test_screenshots_are_numbered_and_none_is_written_over(tmp_path):
@@ -41,7 +41,7 @@ def test_a_screenshot_that_fails_leaves_nothing(tmp_path, monkeypatch):
     def full(path, picture):
         raise OSError("no space")
 
-    monkeypatch.setattr("gsjax.cli.view.command.write_png", full)
+    monkeypatch.setattr("gsjax.cli.view.write_png", full)
     with pytest.raises(OSError, match="no space"):
         screenshots(tmp_path)("render", np.zeros((4, 6, 3), np.uint8))
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,130 @@
+"""`gsjax ask`: questions on a deforming scene in plain English, answered by what is measured of it."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation, warn_of_partial
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import Common
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.deform import (
+    QUESTIONS,
+    Question,
+    SceneFacts,
+    TemplatedAnswerer,
+    parse_question,
+    rows_of,
+    scene_facts,
+)
+
+HELP = (
+    ' As in `gsjax ask RUN "how far is the tool from the tissue in frame 12?"`; without a question it says '
+    "what can be asked. The run is to know what is what: `gsjax deform DATASET --tools draw --out RUN`."
+)
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """What `gsjax ask` is told."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of a run of `gsjax deform`."""
+    question: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUESTION]")] = None
+    """In plain English. Unless given, what can be asked is listed."""
+    json: bool = False
+    """Print JSON: the answer, its value and unit, and the facts that it rests on."""
+
+
+def run(options: Options) -> int:
+    """Answer a question, or say what can be asked; returns the exit code.
+
+    Raises:
+        ValueError, OSError: there is no such run, it has no meaning, or the question cannot be answered.
+    """
+    path = options.run / NAME
+    stored = read_deformation(path)
+    if stored.meaning is None:
+        raise ValueError(
+            f"{path}: expected a scene that knows what is what, found none; reconstruct it with two classes "
+            "or more among the pixels that count (gsjax deform DATASET --tools draw), or with --features"
+        )
+    if len(stored.names) < 2:
+        found = ", ".join(stored.names)
+        raise ValueError(f"{path}: expected two things or more to ask about, found {found} alone")
+    console = Console(stderr=True, highlight=False)
+    warn_of_partial(options.run, Notes(console))
+    if options.question is None:
+        _list(stored)
+        return 0
+    asked = parse_question(options.question, stored.names)
+    rows = rows_of(asked, stored.frame_ids.tolist())
+    with stage(console, f"looking at {_in_words(stored, rows)}"):
+        facts = facts_of_run(stored, rows)
+    answer = TemplatedAnswerer()(options.question, facts)
+    if options.json:
+        told = {
+            "question": options.question,
+            "type": asked.kind,
+            **answer._asdict(),
+            "facts": _used(asked, facts),
+        }
+        print(json.dumps(told, indent=1))
+    else:
+        print(answer.text)
+    return 0
+
+
+def facts_of_run(stored: StoredDeformation, rows: list[int]) -> SceneFacts:
+    """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
+
+    Args:
+        stored: a scene with a meaning.
+        rows: of its frames, 0 to T - 1.
+    """
+    assert stored.meaning is not None
+    if not stored.metric and 0 not in rows:
+        rows = [0, *rows]
+    viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (stored.viewmats, stored.Ks))
+    cameras = Camera(viewmats, Ks, *stored.size, stored.near)
+    frames = stored.frame_ids[rows].tolist()
+    times = stored.times[rows]
+    told = (times, cameras, stored.meaning.codebook, stored.names, frames)
+    return scene_facts(stored.scene, stored.moving, *told, metric=stored.metric)
+
+
+def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
+    """The facts that an answer rests on."""
+    steps = zip(range(len(facts.frames)), range(1, len(facts.frames)), strict=False)
+    return {
+        "unit": facts.unit,
+        "gaussians": dict(zip(facts.names, facts.gaussians.tolist(), strict=True)),
+        "frames": [facts.of_frame(row) for row in range(len(facts.frames))],
+        "motion": [facts.of_motion(*pair) for pair in steps] if len(asked.frames) != 1 else [],
+    }
+
+
+def _in_words(stored: StoredDeformation, rows: list[int]) -> str:
+    """Which frames are looked at."""
+    frames = [str(stored.frame_ids[row]) for row in rows]
+    if len(rows) == 1:
+        return f"frame {frames[0]}"
+    return "frames " + (f"{frames[0]} to {frames[-1]}" if len(rows) > 2 else " and ".join(frames))
+
+
+def _list(stored: StoredDeformation) -> None:
+    """Prints what can be asked."""
+    console = Console(highlight=False)
+    frames = stored.frame_ids
+    console.print(f"X and Y are of: [bold]{', '.join(stored.names)}[/]", soft_wrap=True)
+    console.print(f"F and G are frames: [bold]{frames.min()} to {frames.max()}[/]\n", soft_wrap=True)
+    table = Table("type", "question", "answer", box=None, padding=(0, 3, 0, 0))
+    for kind in QUESTIONS:
+        table.add_row(f"[bold cyan]{kind.name}[/]", kind.example, kind.gives)
+    console.print(table)

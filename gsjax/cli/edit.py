@@ -1,0 +1,139 @@
+"""`gsjax edit`: changes when, where and how parts of a run move, and films it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import Common, Overwriting
+from gsjax.engine.parts.films import SCRIPT, VIDEO, Shot, edited, new_folder, telling_camera, write_film
+from gsjax.engine.parts.saved import open_parts_run
+from gsjax.methods.parts.operation import Edit
+from gsjax.methods.parts.operations import OPERATIONS, Composite
+from gsjax.methods.parts.timeline import Names, Script, parse_op, parse_script
+
+HELP = (
+    f" Operations: {', '.join(OPERATIONS)}. A script is a YAML file, `edits: [{{op: speed, parts: [door], "
+    "factor: 2}]`, which may also have fps and length (seconds)."
+)
+_UNNAMED = "ops"
+
+
+@dataclass(frozen=True)
+class Options(Common, Overwriting):
+    """What `gsjax edit` is told."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of a run of `gsjax parts`."""
+    script: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCRIPT]")] = None
+    """A YAML file of edits."""
+    op: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OP:KEY=VALUE,...")] = ()
+    """One edit, after those of the script: "speed:parts=drawer,factor=2". Can be given again and again."""
+    out: Path | None = None
+    """Folder for the film. RUN/edit/NAME unless given, NAME being the script's, or without one "ops", "ops_2"
+    and so on."""
+    camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
+    """Id of the camera to film from. The one to which the edits change most, unless given."""
+    ply: bool = False
+    """Write the Gaussians of each frame of the film too, as ply/000000.ply and so on."""
+
+
+def run(options: Options) -> int:
+    """Edit, and film what comes of it; returns the exit code. Of a film that Ctrl-C stops, what there is
+    can be watched.
+
+    Raises:
+        ValueError, OSError: there is no such run or part, or the edits cannot be read or done.
+    """
+    console = Console(stderr=True, highlight=False)
+    with Notes(console) as notes:
+        script = read_script(options)
+        saved = open_parts_run(options.run)
+        given = None if options.camera is None else saved.camera(options.camera)
+        with stage(console, "editing"):
+            film, doubts = edited(script, saved)
+            camera = telling_camera(film, saved, script) if given is None else given
+        folder = _folder(options)
+        for doubt in doubts:
+            notes.warn(doubt)
+
+        def watch(frames: Iterable[Shot], asked: int) -> Iterable[Shot]:
+            return track(frames, "rendering", asked, console=console, transient=True)
+
+        found = write_film(folder, script, film, saved, camera, notes, watch=watch, ply=options.ply)
+    asked, stopped = len(film[0].trajectory.times), not found["complete"]
+    part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
+    pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
+    print(f"{found['seconds']:.2f} s, {found['frames']} frames{part}, seen by camera {camera}{pace}")
+    print(f"edits   {'; '.join(_said(edit, saved.names) for edit in script.edits)}")
+    print(f"film    {folder / VIDEO}")
+    return 130 if stopped else 0
+
+
+def _said(edit: Edit, names: Names) -> str:
+    """An edit in short, "freeze: drawer (2)"; parts of another run as the script has them."""
+    if isinstance(edit, Composite):
+        return f"{edit.operation()}: {', '.join(map(str, edit.parts))} of {edit.from_run}"
+    called = {number: name for name, number in names.items()}
+    each = [names.get(part, part) if isinstance(part, str) else part for part in edit.parts]
+    parts = [f"{called[part]} ({part})" if part in called else str(part) for part in each]
+    return f"{edit.operation()}: {', '.join(parts)}"
+
+
+def read_script(options: Options) -> Script:
+    """The edits that are asked for.
+
+    Raises:
+        ValueError: there are none, or they are not as they should be; the message names the file or option.
+        OSError: the script cannot be read.
+    """
+    if options.script is None and not options.op:
+        raise ValueError(
+            'SCRIPT: expected a YAML file of edits, or --op "speed:parts=1,factor=2"; found neither'
+        )
+    script = Script()
+    if options.script is not None:
+        try:
+            script = parse_script(options.script.read_text(encoding="utf-8"))
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{options.script}: expected a YAML file of edits, found no text") from error
+        except ValueError as error:
+            raise ValueError(f"{options.script}: {error}") from error
+    edits = []
+    for number, text in enumerate(options.op, len(script.edits) + 1):
+        try:
+            edits.append(parse_op(text, number))
+        except ValueError as error:
+            raise ValueError(f"--op {text!r}: {error}") from error
+    return replace(script, edits=(*script.edits, *edits))
+
+
+def _folder(options: Options) -> Path:
+    """Where the film goes.
+
+    Raises:
+        FileExistsError: something is there that is no film, or one that may not be replaced.
+        NotADirectoryError: it is a file.
+    """
+    if options.out is None and options.script is None and not options.overwrite:
+        return new_folder(options.run / "edit", _UNNAMED)
+    name = _UNNAMED if options.script is None else options.script.stem
+    folder = options.run / "edit" / name if options.out is None else options.out
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: expected a folder, found a file; name another --out")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not (folder / SCRIPT).is_file():
+            raise FileExistsError(
+                f"{folder}: expected a new folder, an empty one or one of an earlier film (which has "
+                f"{SCRIPT}), found other files; name another --out"
+            )
+        if not options.overwrite:
+            raise FileExistsError(
+                f"{folder}: holds an earlier film; name another --out, or replace it with --overwrite"
+            )
+    return folder

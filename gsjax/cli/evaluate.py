@@ -1,0 +1,299 @@
+"""`gsjax eval`: scores a scene that `gsjax fit` left, again or in more ways."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import tyro
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table as Grid
+from rich.text import Text
+
+from gsjax.data.errors import DataError
+from gsjax.data.photographs import Photographs
+from gsjax.engine.fit.results import Seen, look, write_panel
+from gsjax.engine.folder import replaced_folder
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.machine import in_words
+from gsjax.engine.messages import Notes
+from gsjax.engine.options import Common
+from gsjax.engine.photographs import photographs_of_run, read_views, split
+from gsjax.engine.records import EVALUATION, Record, digest, read_record
+from gsjax.engine.report import Media, Table, format_number, write_report
+from gsjax.engine.scores import mean_scores
+from gsjax.engine.tables import Column
+from gsjax.io.atomic import write_json
+from gsjax.io.ply import read_ply
+from gsjax.methods.fit import View
+from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim
+from gsjax.metrics.perceptual import LpipsWeights, fingerprint, load_lpips, lpips
+from gsjax.scene.gaussians import Gaussians
+
+NO_LPIPS = (
+    "LPIPS: absent, for no weights were given (--lpips-weights PATH; docs/scores.md says what they are)."
+)
+COLUMNS = (
+    Column("PSNR", "psnr", "dB", 2),
+    Column("PSNR, colours matched", "psnr_matched", "dB", 2),
+    Column("SSIM", "ssim", "", 3),
+    Column("MS-SSIM", "ms_ssim", "", 3),
+    Column("LPIPS", "lpips", "", 3),
+    Column("depth", "depth_mm", "mm", 1),
+)
+Color = tuple[float, float, float]
+_WRITTEN = (EVALUATION.name, "report.html", "renders")
+_PICTURES = 12  # in the report, at most
+_HELD_OUT, _TRAIN = "held out", "train"
+_PER_PHOTOGRAPH = {"exposure": "an exposure", "refine_poses": "a pose"}
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """What `gsjax eval` is told."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of a run of `gsjax fit`, finished or stopped."""
+    views: Literal["held-out", "train", "all"] = "held-out"
+    """Which photographs to score: those that the fit never saw, those that it was fitted to, or both."""
+    images: str | None = None
+    """Where the photographs are now; where they were for the fit, unless given."""
+    lpips_weights: Path | None = None
+    """Weights of LPIPS, a .npz or .safetensors file or a folder of them; without, there is no LPIPS."""
+
+
+class Chosen(NamedTuple):
+    """Photographs to score.
+
+    Attributes:
+        photographs: in the size in which they were fitted.
+        indices: which of them.
+        held_out: whether each of these was.
+    """
+
+    photographs: Photographs
+    indices: Int[np.ndarray, "n"]
+    held_out: list[bool]
+
+
+def run(options: Options) -> int:
+    """Score the views, and write eval/ into the run's folder; returns the exit code.
+
+    Raises:
+        ValueError, OSError: there is no such run, or its photographs or the weights cannot be read.
+    """
+    console = Console(stderr=True, highlight=False)
+    with Notes(console) as notes:
+        record = read_record(options.run)
+        _check(record)
+        weights = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
+        gaussians, _ = read_ply(record.path / "scene.ply")
+        photographs, indices, held_out = _choose(options, record)
+        views = read_views(photographs.select(indices.tolist()), console)
+        folder, rows = record.path / EVALUATION.parent, []
+        with replaced_folder(folder, _WRITTEN) as new:
+            exposed = bool(record.config["fit"].get("exposure"))
+            looks = _looks(record, gaussians, views, photographs.background)
+            for seen in track(looks, "scoring", len(views), console=console, transient=True):
+                picture, i = Path("renders", f"{len(rows):06d}.png"), len(rows)
+                write_panel(new / picture, seen)
+                row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
+                rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
+            _say_what_is_missing(notes, record, rows, views, weights)
+            known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
+            found = {
+                "kind": "eval",
+                "dataset": photographs.name,
+                "complete": record.complete,
+                "scene_sha256": digest(record.path / "scene.ply"),
+                "num_gaussians": gaussians.num,
+                "lpips": known or {"absent": NO_LPIPS},
+                "mean": {
+                    kind: mean_scores([row for row in rows if row["split"] == kind], [c.key for c in COLUMNS])
+                    for kind in dict.fromkeys(row["split"] for row in rows)
+                },
+                "views": rows,
+                "machine": describe_machine(),
+                "notes": notes.all,
+            }
+            _write_page(new, record, found)
+            write_json(new / EVALUATION.name, found)
+    _print(found, folder)
+    return 0
+
+
+def scores(seen: Seen, weights: LpipsWeights | None, exposed: bool = False) -> dict[str, float | None]:
+    """How a view is seen, by the keys of `COLUMNS`; None where the picture is too small for a score, or the
+    photographs or the user lack what it takes.
+
+    Args:
+        seen: the view.
+        weights: of LPIPS.
+        exposed: the fit learned an exposure for each photograph, so PSNR is taken with colours matched too.
+    """
+    pair, side = (seen.image, seen.truth, seen.view.mask), min(seen.covered.shape)
+    perceived = weights is not None and side >= weights.least_side
+    return {
+        "psnr": seen.psnr(),
+        "psnr_matched": seen.psnr_matched() if exposed else None,
+        "ssim": seen.ssim(),
+        "ms_ssim": ms_ssim(*pair) if side >= MS_SSIM_LEAST_SIDE else None,
+        "lpips": lpips(weights, *pair) if weights is not None and perceived else None,
+        "depth_mm": seen.depth_mm(),
+    }
+
+
+def _check(record: Record) -> None:
+    """Raises a ValueError where the run is no fit, or has no scene."""
+    if record.kind != "fit":
+        raise ValueError(
+            f"{record.path}: expected a run of `gsjax fit`, found one of `gsjax {record.kind}`, whose frames "
+            "were scored when it ended; they stand in its metrics.json"
+        )
+    if not (record.path / "scene.ply").is_file():
+        raise ValueError(
+            f"{record.path}: expected a scene.ply to score, found none: the run goes on still, or was "
+            "killed; gsjax fit --resume finishes it"
+        )
+
+
+def _choose(options: Options, record: Record) -> Chosen:
+    """The photographs of the fit, and which of them are to be scored.
+
+    Raises:
+        ValueError: they cannot be read, are others than those of the fit, or none is held out.
+    """
+    config, dataset = record.config, options.images or str(record.config.get("dataset"))
+    try:
+        photographs = photographs_of_run(config, dataset)
+    except DataError as error:
+        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
+    train, held_out = split(photographs, config["test_every"])
+    names = [photographs.names[i] for i in held_out]
+    known = (record.metrics or {}).get("views")
+    if known and len(held_out) and names != [row["view"] for row in known]:
+        raise ValueError(
+            f"{dataset}: expected the photographs of the fit, which held out "
+            f"{_listed(row['view'] for row in known)}, found others ({_listed(names)} would be held out); "
+            "--images says where they are"
+        )
+    if options.views == "held-out" and not len(held_out):
+        raise ValueError(
+            f"{record.path}: the fit held out no photograph; score those it saw by --views train"
+        )
+    parts = {"held-out": (held_out,), "train": (train,), "all": (held_out, train)}[options.views]
+    return Chosen(photographs, np.concatenate(parts), np.isin(np.concatenate(parts), held_out).tolist())
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+
+
+def _looks(record: Record, gaussians: Gaussians, views: list[View], behind: Color | None) -> Iterator[Seen]:
+    """Each view as it is drawn; those of one size share a plan."""
+    fit, plans = record.config["fit"], {}
+    background = {"data": behind, "white": (1.0, 1.0, 1.0)}.get(fit.get("background", "data"))
+    for view in views:
+        size = view.image.shape
+        seen, plans[size] = look(
+            gaussians, view, background, bool(fit.get("antialiased", False)), plans.get(size)
+        )
+        yield seen
+
+
+def _say_what_is_missing(
+    notes: Notes, record: Record, rows: list[dict[str, Any]], views: list[View], weights: LpipsWeights | None
+) -> None:
+    """Notes why scores are absent, and what training views are scored without."""
+
+    def small(key: str, least: int, name: str) -> None:
+        count = sum(row[key] is None for row in rows)
+        if count:
+            notes.add(
+                f"{name}: absent for {count} of {len(rows)} views, which have a side below {least} pixels."
+            )
+
+    small("ms_ssim", MS_SSIM_LEAST_SIDE, "MS-SSIM")
+    if weights is None:
+        notes.add(NO_LPIPS)
+    else:
+        small("lpips", weights.least_side, "LPIPS")
+        notes.add(f"LPIPS 0.1 with {weights.network} (weights {fingerprint(weights)}).")
+    if all(view.depth is None for view in views):
+        notes.add("Depth: not scored, for the photographs have none.")
+    learned = [words for name, words in _PER_PHOTOGRAPH.items() if record.config["fit"].get(name)]
+    if learned and any(row["split"] == _TRAIN for row in rows):
+        notes.add(
+            f"The fit learned {' and '.join(learned)} for each photograph, which scene.ply does not hold: "
+            "training views are scored without."
+        )
+
+
+def _write_page(folder: Path, record: Record, found: dict[str, Any]) -> None:
+    """Writes report.html."""
+    rows, cards = found["views"], {}
+    for kind, means in found["mean"].items():
+        for column in COLUMNS:
+            if means[column.key] is not None:
+                value = format_number(means[column.key], column.decimals)
+                cards[f"{column.head}, {kind}"] = (value, column.unit)
+    shown = _shown(rows)
+    several = len(found["mean"]) > 1
+    every = max(1, -(-len(rows) // _PICTURES))
+    write_report(
+        folder / "report.html",
+        title=f"Scores of {record.path.resolve().name}",
+        subtitle=f"{found['dataset']}: {len(rows)} views, {found['num_gaussians']:,} Gaussians"
+        + ("" if found["complete"] else ", of a run that was not finished"),
+        summary=cards,
+        strips=[Media(folder / row["picture"], f"{row['view']}, {row['split']}") for row in rows[::every]],
+        tables=[
+            Table(
+                "Scores",
+                ("view", *([""] if several else []), *(column.head for column in shown)),
+                [
+                    [
+                        row["view"],
+                        *([row["split"]] if several else []),
+                        *(row[column.key] for column in shown),
+                    ]
+                    for row in rows
+                ],
+                ("", *([""] if several else []), *(column.unit for column in shown)),
+                decimals=(None, *([None] if several else []), *(column.decimals for column in shown)),
+            )
+        ],
+        notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
+    )
+
+
+def _shown(rows: list[dict[str, Any]]) -> list[Column]:
+    """The columns in which something stands."""
+    return [column for column in COLUMNS if any(row[column.key] is not None for row in rows)]
+
+
+def _print(found: dict[str, Any], folder: Path) -> None:
+    """The table, the means below it, and what is absent."""
+    console, rows = Console(highlight=False), found["views"]
+    grid, shown = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold"), _shown(rows)
+    grid.add_column("view")
+    for column in shown:
+        grid.add_column(
+            f"{column.head} [dim]{column.unit}[/]" if column.unit else column.head, justify="right"
+        )
+    for kind, means in found["mean"].items():
+        for row in (row for row in rows if row["split"] == kind):
+            grid.add_row(Text(row["view"]), *(format_number(row[c.key], c.decimals) for c in shown))
+        numbers = (format_number(means[c.key], c.decimals) for c in shown)
+        count = sum(row["split"] == kind for row in rows)
+        grid.add_row(f"mean of {count} {kind}", *numbers, style="bold", end_section=True)
+    console.print()
+    console.print(grid)
+    for note in found["notes"]:
+        console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
+    console.print(f"[bold]scores[/]  {folder / 'metrics.json'}", soft_wrap=True)
+    console.print(f"[bold]report[/]  {folder / 'report.html'}", soft_wrap=True)

@@ -1,0 +1,89 @@
+"""How a command is run: its options are parsed, and a user's mistake becomes one sentence."""
+
+import select
+import sys
+from dataclasses import fields
+from importlib import import_module
+from typing import Any
+
+from gsjax.engine.machine import keep_to_cores
+from gsjax.engine.messages import describe, say_error
+from gsjax.extras import MissingExtra
+
+# ValueError covers DataError and PlyError, and whatever an argument is checked for.
+USER_ERRORS = (ValueError, OSError, MissingExtra)
+_COMPILE_ANEW = ("bench", "experiment")  # they measure how long that takes
+
+
+def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
+    """Parse the options of a command and run it. A user's mistake becomes a sentence and exit code 2.
+
+    Args:
+        command: its name.
+        arguments: what stands behind the name.
+        entry: its module, and what it does.
+    """
+    try:
+        options = parse_options(command, arguments, entry)
+        keep_to_cores(getattr(options, "cores", None))  # before JAX looks how many there are
+        compiler = import_module("gsjax.optim.compiler")
+        compiler.keep_freed_memory()
+        if command not in _COMPILE_ANEW:
+            compiler.keep_programs()
+        return import_module(entry[0]).run(options)
+    except Exception as error:
+        if "--debug" in arguments or (isinstance(error, BrokenPipeError) and is_unread()):
+            raise
+        if isinstance(error, USER_ERRORS):
+            say_error(describe(error))
+            return 2
+        told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
+        say_error(f"{told}. Please report it with what --debug shows")
+        return 1
+
+
+def is_unread() -> bool:
+    """Whether what is printed goes into a pipe that nobody reads any more, as after `| head`."""
+    if not hasattr(select, "poll"):
+        return False
+    output = select.poll()
+    output.register(sys.__stdout__, select.POLLOUT)
+    return any(events & select.POLLERR for _, events in output.poll(0))
+
+
+def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) -> Any:
+    """The options of a command, without running it.
+
+    Args:
+        command: its name.
+        arguments: what stands behind the name.
+        entry: its module, and what it does.
+
+    Raises:
+        ValueError: a list was begun and left empty.
+        SystemExit: the arguments were not understood, or ask for help; what there is to say is printed.
+    """
+    import tyro
+
+    module, does = entry
+    chosen = import_module(module)
+    options_for = getattr(chosen, "options_for", lambda given: (chosen.Options, given))
+    kind, arguments = options_for(arguments)
+    options = tyro.cli(
+        kind,
+        prog=f"gsjax {command}",
+        description=f"{does[0].upper()}{does[1:]}." + getattr(chosen, "HELP", ""),
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    _expect_values(options, arguments)
+    return options
+
+
+def _expect_values(options: Any, arguments: list[str]) -> None:
+    """Raises a ValueError for a list that was begun and left empty, where that would mean all there is."""
+    given = {argument.replace("_", "-") for argument in arguments}
+    for field in fields(options):
+        flag = "--" + field.name.replace("_", "-")
+        if getattr(options, field.name) == field.default == () and flag in given:
+            raise ValueError(f"{flag}: expected one value or more, found none")

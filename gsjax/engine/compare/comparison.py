@@ -1,0 +1,376 @@
+"""What several runs have in common and where they differ: the numbers behind `gsjax compare`."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gsjax.engine.machine import name as machine_name
+from gsjax.engine.records import Kind, Record
+from gsjax.engine.report import format_number
+from gsjax.engine.track.results import MOVED_MM
+
+_NOT_COMPARED = (
+    "out",
+    "resume",
+    "overwrite",
+    "debug",
+    "tensorboard",
+)  # settings that say nothing of a result
+
+
+class Aspect(NamedTuple):
+    """What runs are compared by.
+
+    Attributes:
+        head, unit, decimals: of its column.
+        key: in comparison.json.
+        better: which of two numbers is; None where neither.
+        of: what must be the same for two numbers to be compared: the views, the data, or the machine too.
+    """
+
+    head: str
+    key: str
+    unit: str
+    decimals: int | None
+    better: Literal["more", "less"] | None
+    of: Literal["views", "data", "machine"]
+
+
+ASPECTS: dict[Kind, tuple[Aspect, ...]] = {
+    "fit": (
+        Aspect("PSNR", "psnr", "dB", 2, "more", "views"),
+        Aspect("SSIM", "ssim", "", 3, "more", "views"),
+        Aspect("MS-SSIM", "ms_ssim", "", 3, "more", "views"),
+        Aspect("LPIPS", "lpips", "", 3, "less", "views"),
+        Aspect("depth", "depth_mm", "mm", 1, "less", "views"),
+        Aspect("Gaussians", "num_gaussians", "", None, "less", "data"),
+        Aspect("time", "minutes", "min", 1, "less", "machine"),
+        Aspect("steps", "steps", "", None, None, "data"),
+    ),
+    "track": (
+        Aspect("centroid error", "centroid_error_mm", "mm", 2, "less", "data"),
+        Aspect("lowest IoU", "iou", "", 3, "more", "data"),
+        Aspect("PSNR", "psnr", "dB", 2, "more", "data"),
+        Aspect("PSNR held out", "psnr_held_out", "dB", 2, "more", "data"),
+        Aspect("SSIM held out", "ssim_held_out", "", 3, "more", "data"),
+        Aspect("rate", "update_hz", "Hz", 2, "more", "machine"),
+        Aspect("Gaussians", "num_gaussians", "", None, "less", "data"),
+        Aspect("frames", "frames", "", None, None, "data"),
+    ),
+}
+_OF_VIEWS = [aspect.key for aspect in ASPECTS["fit"] if aspect.of == "views"]
+
+
+@dataclass
+class Group:
+    """Runs of the same data, at the same size.
+
+    Attributes:
+        dataset: its name.
+        labels: of the runs.
+        views: held-out views that all of them were judged by; their scores are means over these.
+        best: of each aspect, the runs that are best; an aspect that cannot be compared is not there.
+    """
+
+    dataset: str
+    labels: list[str]
+    views: list[str] = field(default_factory=list)
+    best: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass
+class Comparison:
+    """What came of it.
+
+    Attributes:
+        kind: the command whose runs these are.
+        records: the runs, by their labels, group by group.
+        scores: of each run, by the keys of `ASPECTS`; what is not known is None.
+        groups: runs that can be compared with each other.
+        options: settings that all runs have, and not the same, of each run.
+        notes: what was not compared, and why.
+    """
+
+    kind: Kind
+    records: dict[str, Record]
+    scores: dict[str, dict[str, float | None]]
+    groups: list[Group]
+    options: dict[str, dict[str, Any]]
+    notes: list[str]
+
+    @property
+    def aspects(self) -> list[Aspect]:
+        """Those of which any run has something."""
+        return [a for a in ASPECTS[self.kind] if any(s[a.key] is not None for s in self.scores.values())]
+
+
+def compare(records: Sequence[Record], same_views: Callable[[list[Record], str], bool]) -> Comparison:
+    """Set runs side by side.
+
+    Args:
+        records: two or more.
+        same_views: whether a held-out view of this name shows the same in all of these runs.
+
+    Raises:
+        ValueError: they are of different commands.
+    """
+    kinds = {record.kind: [str(r.path) for r in records if r.kind == record.kind] for record in records}
+    if len(kinds) > 1:
+        listed = " and ".join(f"`gsjax {kind}` ({', '.join(names)})" for kind, names in kinds.items())
+        raise ValueError(f"expected runs of one command, found those of {listed}; compare them apart")
+    labelled = dict(zip(labels([record.path for record in records]), records, strict=True))
+    kind, notes = records[0].kind, [note for record in records for note in record.notes]
+    groups: dict[Any, Group] = {}
+    for label, record in labelled.items():
+        key = _data(record, records)
+        groups.setdefault(key, Group(key[0], [])).labels.append(label)
+    if len(groups) > 1:
+        apart = "; ".join(f"{_in_words(key)}: {', '.join(g.labels)}" for key, g in groups.items())
+        notes.append(f"Only runs of the same data are compared with each other: {apart}.")
+    scores: dict[str, dict[str, float | None]] = {}
+    for group in groups.values():
+        members = {label: labelled[label] for label in group.labels}
+        if kind == "fit":
+            group.views = _common_views(members, same_views, notes)
+            scores |= _fit_scores(members, group.views)
+            comparable = _comparable_fits(members, group.views, notes)
+        else:
+            scores |= {label: _track_scores(record) for label, record in members.items()}
+            comparable = {aspect.key for aspect in ASPECTS["track"]}
+        if len(members) > 1 and len({_machine(record) for record in members.values()} - {None}) > 1:
+            notes.append(f"{', '.join(members)}: run on different machines; time is not compared.")
+            comparable -= {aspect.key for aspect in ASPECTS[kind] if aspect.of == "machine"}
+        group.best = _best(kind, members, scores, comparable)
+    for label, record in labelled.items():
+        if not record.complete:
+            words = "was stopped" if record.metrics else "goes on still, or was killed"
+            notes.append(f"{label} {words}: it is shown, and not among the best.")
+    if kind == "fit":
+        notes += _what_eval_adds(labelled)
+    ordered = {label: labelled[label] for group in groups.values() for label in group.labels}
+    options = _differing(ordered, notes)
+    return Comparison(kind, ordered, scores, list(groups.values()), options, notes)
+
+
+def labels(paths: Sequence[Path]) -> list[str]:
+    """A short name of each folder: as many of the last parts of its path as tell it from the others.
+
+    Raises:
+        ValueError: a folder is named twice.
+    """
+    parts = [path.resolve().parts for path in paths]
+    for i, part in enumerate(parts):
+        if part in parts[:i]:
+            raise ValueError(f"{paths[i]}: named twice; name each run once")
+    names = []
+    for part in parts:
+        count = next(
+            n for n in range(1, len(part) + 1) if sum(other[-n:] == part[-n:] for other in parts) == 1
+        )
+        names.append("/".join(part[-count:]))
+    return names
+
+
+def _data(record: Record, records: Sequence[Record]) -> tuple[str, Any]:
+    """What runs must share to be compared. One that is not finished is of the data of which another was that
+    was begun with the same words."""
+    found = record.metrics
+    if found is None and record.kind == "fit":
+        named = _words(record)
+        same = next((r for r in records if r.metrics is not None and _words(r) == named), None)
+        found = None if same is None else same.metrics
+    if found is None:
+        return Path(str(record.config.get("dataset"))).name, None
+    if record.kind == "fit":
+        return found["dataset"], tuple(found["size"])
+    image, frames = found["image"], found["frames"]
+    cameras = tuple(found["tracked_cameras"]), tuple(found["held_out_cameras"])
+    of_frames = frames["first_id"], frames["last_id"], frames["tracked"]
+    return found["dataset"], (image["width"], image["height"], of_frames, cameras)
+
+
+def _words(record: Record) -> tuple[Any, ...]:
+    return tuple(str(record.config.get(name)) for name in ("dataset", "scale", "read"))
+
+
+def _in_words(key: tuple[str, Any]) -> str:
+    dataset, more = key
+    if more is None:
+        return dataset
+    size = f"{dataset} at {more[0]}x{more[1]}"
+    if len(more) == 2:
+        return size
+    (first, last, count), (tracked, held_out) = more[2:]
+    by = f", judged by {[*held_out]}" if held_out else ""
+    return f"{size}, {count} frames {first} to {last}, cameras {[*tracked]}{by}"
+
+
+def _held_out(record: Record) -> dict[str, dict[str, Any]]:
+    """What a fit and its evaluation found of each held-out view, by its name."""
+    found = record.metrics
+    if found is None or not found["photographs"]["held_out"]:
+        return {}
+    rows = {row["view"]: dict(row) for row in found["views"]}
+    for row in (record.evaluation or {}).get("views", ()):
+        if row["split"] == "held out" and row["view"] in rows:
+            rows[row["view"]] |= {key: row[key] for key in ("ms_ssim", "lpips")}
+    return rows
+
+
+def _common_views(
+    members: Mapping[str, Record], same: Callable[[list[Record], str], bool], notes: list[str]
+) -> list[str]:
+    """Held-out views that all runs that were judged have; none where there is nothing to compare."""
+    judged = {label: _held_out(record) for label, record in members.items()}
+    judged = {label: rows for label, rows in judged.items() if rows}
+    if len(judged) < 2:
+        return []
+    of, first = ", ".join(judged), next(iter(judged.values()))
+    views = [view for view in first if all(view in rows for rows in judged.values())]
+    if not views:
+        notes.append(
+            f"{of}: no held-out view in common; their scores are of different views and not compared."
+        )
+        return []
+    if any(len(rows) > len(views) for rows in judged.values()):
+        notes.append(
+            f"{of}: different views were held out; scores are means over the {len(views)} in common."
+        )
+    runs = [members[label] for label in judged]
+    shown = views[:: max(1, len(views) // 4)]
+    if other := [view for view in shown if not same(runs, view)]:
+        notes.append(f"{of}: {', '.join(other)} show different photographs in them; scores are not compared.")
+        return []
+    return views
+
+
+def _fit_scores(members: Mapping[str, Record], views: list[str]) -> dict[str, dict[str, float | None]]:
+    """Of each run; scores of views are over those in common, where there are any, else over its own."""
+    judged = {label: _held_out(record) for label, record in members.items()}
+    scores: dict[str, dict[str, float | None]] = {}
+    for label, record in members.items():
+        found, last = record.metrics, record.curve[-1] if record.curve else {}
+        seconds = last.get("seconds")
+        if found is not None:
+            seconds = found["seconds"]["fit"] + found["seconds"]["compile"]
+        scores[label] = {
+            "num_gaussians": last.get("alive") if found is None else found["num_gaussians"],
+            "minutes": None if seconds is None else seconds / 60,
+            "steps": last.get("step") if found is None else found["steps"],
+        }
+    for key in _OF_VIEWS:
+        known = {
+            label: {v for v, row in rows.items() if _is_known(row.get(key))} for label, rows in judged.items()
+        }
+        having = [known[label] for label in members if known[label]]
+        common = set(views).intersection(*having) if having else set()
+        for label, rows in judged.items():
+            over = (common if views else known[label]) & known[label]
+            values = [rows[view][key] for view in rows if view in over]
+            scores[label][key] = float(np.mean(values)) if values else None
+    return scores
+
+
+def _is_known(value: Any) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: list[str]) -> set[str]:
+    """Keys of the aspects in which these runs can be compared."""
+    keys = {aspect.key for aspect in ASPECTS["fit"] if views or aspect.of != "views"}
+    weights = {
+        label: (record.evaluation or {}).get("lpips", {}).get("weights") for label, record in members.items()
+    }
+    if len({*weights.values()} - {None}) > 1:
+        notes.append(f"{', '.join(members)}: LPIPS is of different weights and not compared.")
+        keys -= {"lpips"}
+    return keys
+
+
+def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
+    """Says for which fits there is no MS-SSIM or LPIPS, and how to have them."""
+    judged = [label for label, record in records.items() if _held_out(record)]
+    never = [label for label in judged if records[label].evaluation is None]
+    blind = [label for label in judged if "absent" in (records[label].evaluation or {}).get("lpips", {})]
+    notes = []
+    if never:
+        words = "gsjax eval RUN adds them (LPIPS with --lpips-weights PATH; see docs/scores.md)"
+        notes.append(f"MS-SSIM and LPIPS are absent for {', '.join(never)}: {words}.")
+    if blind:
+        words = "gsjax eval RUN --lpips-weights PATH adds it (docs/scores.md)"
+        notes.append(f"LPIPS is absent for {', '.join(blind)}, evaluated without weights: {words}.")
+    return notes
+
+
+def _track_scores(record: Record) -> dict[str, float | None]:
+    """Of a run of the tracker, as the cards of its report have them."""
+    found = record.metrics
+    if found is None:
+        return {aspect.key: None for aspect in ASPECTS["track"]}
+    errors = [
+        scored["centroid_error_mm"]
+        for scored in found["objects"].values()
+        if scored["centroid_error_mm"] is not None and scored["moved_mm"] > MOVED_MM
+    ]
+    overlaps = [value for value in found["iou"].values() if value is not None]
+    return {
+        "centroid_error_mm": max(errors, default=None),
+        "iou": min(overlaps, default=None),
+        "psnr": found["tracked"]["psnr"],
+        "psnr_held_out": found["held_out"]["psnr"],
+        "ssim_held_out": found["held_out"]["ssim"],
+        "update_hz": found["update_hz"],
+        "num_gaussians": found["gaussians"]["all"],
+        "frames": found["frames"]["tracked"],
+    }
+
+
+def _machine(record: Record) -> str | None:
+    return None if record.metrics is None else machine_name(record.metrics["machine"])
+
+
+def _best(
+    kind: Kind, members: Mapping[str, Record], scores: Mapping[str, Mapping[str, Any]], comparable: set[str]
+) -> dict[str, list[str]]:
+    """Of each aspect, the finished runs that are best as far as the digits shown tell; none where all are."""
+    best = {}
+    for aspect in ASPECTS[kind]:
+        if aspect.better is None or aspect.key not in comparable:
+            continue
+        values = {label: scores[label][aspect.key] for label, record in members.items() if record.complete}
+        values = {label: value for label, value in values.items() if value is not None}
+        texts = {label: format_number(value, aspect.decimals) for label, value in values.items()}
+        if len({*texts.values()}) > 1:
+            pick = max if aspect.better == "more" else min
+            winner = pick(values, key=lambda label: values[label])
+            best[aspect.key] = [label for label, text in texts.items() if text == texts[winner]]
+    return best
+
+
+def _differing(records: Mapping[str, Record], notes: list[str]) -> dict[str, dict[str, Any]]:
+    """Settings that all runs have, and not the same."""
+    flat = {label: dict(_flat(record.config)) for label, record in records.items()}
+    names = [n for n in dict.fromkeys(n for s in flat.values() for n in s) if n not in _NOT_COMPARED]
+    lacking: dict[tuple[str, ...], list[str]] = {}
+    for label, settings in flat.items():
+        lacking.setdefault(tuple(name for name in names if name not in settings), []).append(label)
+    notes += [
+        f"Another version of gsjax made {', '.join(labels)}: no setting {', '.join(missing)} there."
+        for missing, labels in lacking.items()
+        if missing
+    ]
+    shared = [name for name in names if all(name in settings for settings in flat.values())]
+    found = {name: {label: settings[name] for label, settings in flat.items()} for name in shared}
+    return {name: values for name, values in found.items() if len({*map(repr, values.values())}) > 1}
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

@@ -1,0 +1,119 @@
+"""Where the depth comes from that `gsjax deform` begins with: the data, two eyes, or nowhere."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gsjax.data import Sequence
+from gsjax.engine.messages import Notes
+from gsjax.perception.stereo import stereo_depth
+
+Depth = Literal["auto", "data", "stereo", "plane"]
+
+
+@dataclass(frozen=True, eq=False)
+class Deep:
+    """A recording and its depth.
+
+    Attributes:
+        sequence: camera 0 has depth, unless `source` is "plane".
+        source: where it comes from.
+    """
+
+    sequence: Sequence
+    source: Literal["data", "stereo", "plane"]
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres, as far as the data's are."""
+        return self.source != "plane"
+
+    @property
+    def found(self) -> dict[str, object]:
+        """What metrics.json says of it."""
+        return {"source": self.source, "metric": self.metric}
+
+
+def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> Deep:
+    """The recording with depth of camera 0: its own, else by matching it with camera 1, else none, and then
+    the scene begins on a plane, `plane` before the first camera.
+
+    Args:
+        sequence: camera 0 is learned from.
+        wanted: what is told; "auto" takes the first of the three that there is.
+        plane: in the unit of the poses.
+        notes: told which it is.
+
+    Raises:
+        ValueError: what is told is not there.
+    """
+    two = sequence.num_cameras > 1
+    if wanted == "data" and not sequence.has_depth:
+        raise ValueError(
+            f"--depth data: {sequence.name} has none; leave it at auto, or put depth of a network beside the "
+            "frames, as EndoNeRF has it (docs/data.md)"
+        )
+    if wanted == "stereo" and not two:
+        raise ValueError(
+            f"--depth stereo: {sequence.name} has one camera, {sequence.camera_ids[0]}; expected a second "
+            "one beside it, as EndoNeRF's folders have in right/ (docs/data.md)"
+        )
+    if wanted == "data" or (wanted == "auto" and sequence.has_depth):
+        return Deep(sequence, "data")
+    if wanted == "stereo" or (wanted == "auto" and two):
+        return _of_two_eyes(sequence, notes)
+    return _of_a_plane(sequence, plane, notes)
+
+
+def _of_two_eyes(sequence: Sequence, notes: Notes) -> Deep:
+    def load(t: int, c: int) -> np.ndarray | None:
+        if c != 0:
+            return None
+        pictures = (sequence.image(t, eye) for eye in (0, 1))
+        return stereo_depth(*pictures, sequence.viewmats[t, :2], sequence.Ks[t, :2])
+
+    try:
+        first = load(0, 0)
+    except ValueError as error:
+        raise ValueError(
+            f"{sequence.name}: cameras {sequence.camera_ids[0]} and {sequence.camera_ids[1]} cannot be "
+            f"matched: {error}; --depth plane begins without them"
+        ) from error
+    assert first is not None
+    covered = float((first > 0).mean())
+    if covered < 0.2:
+        notes.warn(
+            f"{sequence.name}: matching both eyes found depth in {covered:.0%} of the first frame's pixels; "
+            "are poses right, and pictures taken at the same time? --depth plane begins without it"
+        )
+    notes.add(
+        f"Depth is matched between cameras {sequence.camera_ids[0]} and {sequence.camera_ids[1]} (in "
+        f"{covered:.0%} of the first frame's pixels): what is judged as depth is how far the scene is from "
+        "what was matched, and the other camera has been seen in the frames that were learned from."
+    )
+    return Deep(replace(sequence, load_depth=load), "stereo")
+
+
+def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> Deep:
+    """Nothing that is known in metres is kept, as the scene's unit is another."""
+    notes.add(
+        f"There is no depth: the scene began on a plane {plane:g} before the first camera. Its depth is of "
+        "no metric unit, nothing but pictures teaches it, and it is not judged."
+    )
+    rotations, shifts = sequence.viewmats[:, 0, :3, :3], sequence.viewmats[:, 0, :3, 3]
+    centers = -np.einsum("tji,tj->ti", rotations, shifts)
+    moved = float(np.linalg.norm(centers - centers[0], axis=1).max())
+    if moved == 0:
+        notes.add(
+            "The camera has one pose in all frames; if it moved, that passes as the scene's motion. gsjax "
+            "poses finds poses of a video, where most of what is seen stands still."
+        )
+    else:
+        notes.warn(
+            f"{sequence.name}: the camera moves by {moved:.3g}, and how far the scene is, nothing says; tell "
+            f"about how far with --deform.plane-depth (now {plane:g}), in the unit of the poses"
+        )
+    alone = sequence.select(cameras=[sequence.camera_ids[0]])
+    names = alone.names_of_labels  # some of which truth may have told
+    return Deep(replace(alone, load_depth=None, truth=None, label_names=names), "plane")

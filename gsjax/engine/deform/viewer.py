@@ -1,0 +1,114 @@
+"""A run of `gsjax deform` in the viewer: over time, and how it is asked."""
+
+import threading
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gsjax.data.ordered import open_in_time
+from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation
+from gsjax.engine.deform.pictures import probabilities_of
+from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
+from gsjax.engine.files import reopen
+from gsjax.engine.messages import Notes, describe
+from gsjax.engine.selected import EXTRACTED, keep_part
+from gsjax.methods.deform.query import most_likely
+from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
+
+_AGAIN = "reconstruct it again with this version of gsjax"
+
+
+def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) -> Viewable:
+    """The scene of a run of `gsjax deform` over time, with its photographs where its recording still is; it
+    can be asked if it knows what is what.
+
+    Args:
+        path: of the run.
+        notes: told of what is odd.
+        weights: of CLIP, where they are now.
+
+    Raises:
+        ValueError: the file of the scene is damaged, or there are weights that it has no use for.
+    """
+    stored = read_deformation(path / NAME)
+    kind = None if stored.meaning is None else stored.meaning.source.kind
+    if weights is not None and kind in (None, "classes", "closed"):
+        raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
+    first, labels = stored.at(0.0), None
+    if stored.meaning is not None and first.features is not None:
+        said = probabilities_of(first.features, jnp.asarray(stored.meaning.codebook, jnp.float32))
+        labels = 1 + most_likely(np.asarray(said))
+    return Viewable(
+        path.absolute().name,
+        first,
+        labels,
+        dict(enumerate(stored.names, 1)),
+        motion=Motion(len(stored.times), first.num, lambda frame: stored.at(stored.times[frame])),
+        times=stored.times * stored.seconds,
+        shots=_shots(path, stored, notes),
+        unit="m" if stored.metric else "",
+        asking=None if labels is None else asking_of(path, stored, weights),
+    )
+
+
+def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None) -> Asking:
+    """How the page asks it; what it saves goes to `extracted/` in the run's folder. Where features change
+    over time, an answer is of the frame that is looked at.
+
+    Args:
+        path: of the run.
+        stored: what it learned.
+        weights: folder of CLIP's, where they are no longer where they were.
+    """
+    assert stored.meaning is not None
+    meaning = stored.meaning
+
+    def features_in(frame: int) -> jax.Array:
+        features = stored.at(stored.times[frame] if stored.meaning_changes else 0.0).features
+        assert features is not None
+        return features
+
+    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Found:
+        jax.block_until_ready(wanted.scores(features))  # what compiles is no answer's time
+        begun = perf_counter()
+        scores = np.asarray(wanted.scores(features))
+        seconds = perf_counter() - begun
+        return Found(words, scores, *wanted.threshold(scores), seconds)
+
+    one_by_one, encoder = threading.Lock(), cache(lambda: meaning.source.encoder(weights))
+
+    def ask(text: str, frame: int) -> Found:
+        with one_by_one:  # several pages may ask before the encoder is loaded
+            wanted = wanted_text(meaning, text, encoder=encoder)
+        return answer(text, wanted, features_in(frame))
+
+    def like(row: int, frame: int) -> Found:
+        features = features_in(frame)
+        wanted = wanted_like(meaning, np.asarray(features[row], np.float64))
+        return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
+
+    def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
+        there, called = stored.at(stored.times[frame]), f"{name} frame {stored.frame_ids[frame]}"
+        return keep_part(path / EXTRACTED, called, there, selected)
+
+    return Asking(meaning.hint(weights), ask, like, save)
+
+
+def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
+    """The cameras of all frames, with what they saw if that is still there."""
+    load = None
+    try:
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_in_time)[0].judged
+        found = (sequence.num_frames, sequence.width, sequence.height)
+        if found != (wanted := (len(stored.times), *stored.size)):
+            raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
+        load = lambda t, _: sequence.image(t, 0)  # noqa: E731
+    except (ValueError, OSError) as error:
+        notes.warn(f"its photographs are not shown: {describe(error)}")
+    sizes = np.array([stored.size])
+    return Shots(("camera",), stored.viewmats[:, None], stored.Ks[:, None], sizes, load_image=load)

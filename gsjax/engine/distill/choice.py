@@ -1,0 +1,106 @@
+"""Whose masks and features teach a scene its meaning, as it is told on the command line."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from gsjax.engine.distill.source import KINDS
+from gsjax.engine.options import ClipWeights, SamWeights
+from gsjax.engine.recording import located
+
+Masks = Literal["auto", "files", "segment"]
+Second = Literal["none", "maskclip"]
+Level = Literal["default", "small", "medium", "large"]
+OF_CLIP = ("clip", "maskclip")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeacherOptions(SamWeights, ClipWeights):
+    """Who teaches."""
+
+    features: str = "auto"
+    """What is to be learned: classes (a code for each class of the mask files), closed (colour and outline of
+    each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
+    (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the pictures, or by frame number). auto:
+    classes if there are mask files, else closed. Of gsjax deform also none, which is its auto where masks
+    have fewer than two classes among the pixels that count."""
+    masks: Masks = "auto"
+    """Whose masks: the recording's own, or a segmenter's that needs no weights. auto: files if there are."""
+    level: Level = "default"
+    """Of LangSplat's files, which size of objects."""
+
+
+@dataclass(frozen=True)
+class TeacherChoice:
+    """Whose masks and features.
+
+    Attributes:
+        features: an encoder (`KINDS`), a folder of files, or "auto".
+        masks: those of files, those of a segmenter, or "auto".
+        sam: folder of SAM's weights; a segmenter without weights unless given.
+        weights: folder of CLIP's.
+        level: of LangSplat's files.
+        second: who teaches beside CLIP's vectors of masks.
+        snap: pixels within which outlines of masks are put on the picture's edges.
+    """
+
+    features: str = "auto"
+    masks: Masks = "auto"
+    sam: Path | None = None
+    weights: Path | None = None
+    level: Level = "default"
+    second: Second = "none"
+    snap: int = 0
+
+    @property
+    def of_files(self) -> bool:
+        """Whether features are those of a folder of files."""
+        return self.features not in ("auto", *KINDS)
+
+    def located(self) -> dict[str, Any]:
+        """Its paths as they are found from elsewhere, by the options that name them."""
+        paths = {"sam": self.sam, "weights": self.weights}
+        found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
+        return found | ({"features": located(self.features)} if self.of_files else {})
+
+    def check(self, also: tuple[str, ...] = ()) -> None:
+        """Raises ValueError where these contradict each other, FileNotFoundError for files not there.
+        `also`: what else --features may be, to say so."""
+        if self.of_files and not Path(self.features).is_dir():
+            known = ", ".join(("auto", *KINDS, *also))
+            raise FileNotFoundError(
+                f"--features {self.features}: expected {known}, or a folder of feature files, "
+                f"found {_what_is(Path(self.features), 'none of these')}"
+            )
+        for option, folder, model in (("weights", self.weights, "CLIP"), ("sam", self.sam, "SAM")):
+            if folder is not None and not folder.is_dir():
+                raise FileNotFoundError(
+                    f"--{option} {folder}: expected a folder of {model}'s weights, in the layout of Hugging "
+                    f"Face, found {_what_is(folder, 'nothing there')}"
+                )
+        if self.features in OF_CLIP and self.weights is None:
+            raise ValueError(
+                f"--features {self.features}: expected --weights PATH too, a folder of CLIP's "
+                "weights; closed needs none"
+            )
+        if self.features not in OF_CLIP and self.weights is not None:
+            raise ValueError(
+                f"--weights: expected --features {' or '.join(OF_CLIP)}, which have them, found "
+                f"{self.features}"
+            )
+        if self.snap < 0:
+            raise ValueError(f"--snap: expected 0 or more pixels, found {self.snap}")
+        if self.level != "default" and not self.of_files:
+            raise ValueError(
+                f"--level {self.level}: expected --features FOLDER, with LangSplat's files, found "
+                f"{self.features}"
+            )
+        if self.second != "none" and self.features != "clip":
+            raise ValueError(
+                f"--second {self.second}: expected --features clip, whose second teacher it is, found "
+                f"{self.features}"
+            )
+
+
+def _what_is(path: Path, nothing: str) -> str:
+    return "a file" if path.exists() else nothing

@@ -1,0 +1,183 @@
+"""The scene that a field is distilled for, and the photographs of it: those of a run, or of a PLY file that
+others made."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from gsjax.data.errors import DataError
+from gsjax.data.open import ReadOptions
+from gsjax.data.photographs import Photographs, photographs_of
+from gsjax.engine.files import read_arrays, reopen
+from gsjax.engine.folder import expect_run
+from gsjax.engine.options import HeldOutFrames, Selection
+from gsjax.engine.photographs import choose_photographs, photographs_of_run, smaller, split
+from gsjax.engine.records import read_record
+from gsjax.io.ply import read_ply
+from gsjax.scene.gaussians import Gaussians
+
+_AGAIN = "run it again with this version of gsjax"
+_OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  # a run has chosen these
+
+
+@dataclass(frozen=True)
+class SceneAndImages:
+    """A scene that stands, and where its photographs are."""
+
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
+    """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
+    or a PLY file that anybody made, with --images and --out."""
+    images: str | None = None
+    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`, of which --frames,
+    --cameras, --eval-cameras and --test-every choose. Of a run, which has chosen: where they are now."""
+
+
+@dataclass(frozen=True)
+class SceneOptions(HeldOutFrames, Selection, SceneAndImages):
+    """Which scene, and which photographs of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldScene:
+    """What stands still while a field learns.
+
+    Attributes:
+        file: the PLY file.
+        gaussians: the scene.
+        photographs: of it, posed as the scene was fitted.
+        taught: which of them may teach.
+        held_out: which of them only judge.
+        rasterize_mode: as the scene was fitted.
+    """
+
+    file: Path
+    gaussians: Gaussians
+    photographs: Photographs
+    taught: list[int]
+    held_out: list[int]
+    rasterize_mode: str = "classic"
+
+
+def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> FieldScene:
+    """The scene and its photographs.
+
+    Args:
+        options: which.
+        gaussians: the scene's, where they were read already.
+
+    Raises:
+        ValueError, OSError: they are not there, or options are given that a run has chosen itself.
+    """
+    path = options.scene
+    if path.is_file():
+        if options.images is None:
+            raise ValueError(f"{path}: a PLY file has no photographs; --images names a folder of them")
+        chosen = {name: getattr(options, name) for name in ("frames", "cameras", "eval_cameras")}
+        scene = scene_of_file(path, options.images, options.read, options.test_every, gaussians, **chosen)
+    else:
+        expect_run(path, "`gsjax fit`, `gsjax track` or `gsjax parts`, or a PLY file")
+        given = [n for n in _OF_PHOTOGRAPHS if getattr(options, n) != getattr(SceneOptions(path), n)]
+        if given:
+            flag = f"--{given[0].replace('_', '-')}"
+            raise ValueError(
+                f"{flag}: {path} is a run, which has its photographs chosen and split; leave it out"
+            )
+        scene = scene_of_run(path, options.images, gaussians)
+    if not scene.gaussians.num:
+        raise ValueError(f"{scene.file}: expected Gaussians to give a meaning to, found none")
+    return scaled(scene, options.scale)
+
+
+def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | None = None) -> FieldScene:
+    """That of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame).
+
+    Args:
+        path: the run's folder.
+        images: where its photographs are now; where they were, unless given.
+        gaussians: the scene's, where they were read already.
+
+    Raises:
+        FileNotFoundError, ValueError: there is no such run, or it has no scene, or no photographs that can be
+            read.
+    """
+    if (path / "canonical" / "scene.ply").is_file():
+        return scene_of_run(path / "canonical", images, gaussians)
+    record = read_record(path)
+    file = path / "scene.ply"
+    if not file.is_file():
+        raise FileNotFoundError(f"{path}: expected a scene.ply, found none: the run goes on still, or failed")
+    gaussians = _read(file) if gaussians is None else gaussians
+    if record.kind == "track":
+        if images is not None:
+            raise ValueError("--images: a run of `gsjax track` knows its recording; leave it out")
+        recording, _ = reopen(path / "config.yml", _AGAIN)
+        first = recording.judged.select(frames=slice(0, 1))
+        indices, count = list(range(first.num_cameras)), recording.tracked.num_cameras
+        return FieldScene(file, gaussians, photographs_of(first), indices[:count], indices[count:])
+    try:
+        photographs = photographs_of_run(record.config, images)
+    except DataError as error:
+        raise ValueError(f"{error} It was read for the fit; --images says where it is now") from error
+    photographs = _as_learned(photographs, path / "cameras.npz")
+    mode = "antialiased" if record.config["fit"].get("antialiased") else "classic"
+    return FieldScene(file, gaussians, photographs, *_split(photographs, record.config["test_every"]), mode)
+
+
+def scene_of_file(
+    file: Path,
+    images: str,
+    read: ReadOptions,
+    test_every: int,
+    gaussians: Gaussians | None = None,
+    **chosen,
+) -> FieldScene:
+    """A PLY file with photographs of the same world.
+
+    Args:
+        file: the scene.
+        images: a dataset.
+        read: what its layout leaves open.
+        test_every: hold out every so-manieth photograph where the data has no split.
+        gaussians: the scene's, where they were read already.
+        **chosen: as `choose_photographs` has them.
+
+    Raises:
+        PlyError, DataError, ValueError: one of them cannot be read.
+    """
+    photographs = choose_photographs(images, read, **chosen)
+    gaussians = _read(file) if gaussians is None else gaussians
+    return FieldScene(file, gaussians, photographs, *_split(photographs, test_every))
+
+
+def scaled(scene: FieldScene, scale: float) -> FieldScene:
+    """With smaller photographs.
+
+    Raises:
+        ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of them.
+    """
+    return replace(scene, photographs=smaller(scene.photographs, scale))
+
+
+def _split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
+    chosen, held_out = split(photographs, every)
+    return chosen.tolist(), held_out.tolist()
+
+
+def _read(file: Path) -> Gaussians:
+    return jax.tree.map(jnp.asarray, read_ply(file)[0])
+
+
+def _as_learned(photographs: Photographs, file: Path) -> Photographs:
+    """With the poses that a fit found for its photographs, where it looked for them."""
+    if not file.is_file():
+        return photographs
+    arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)
+    found = dict(zip(arrays["names"].tolist(), arrays["viewmats"], strict=True))
+    posed = zip(photographs.names, photographs.viewmats, strict=True)
+    viewmats = [found.get(name, viewmat) for name, viewmat in posed]
+    return replace(photographs, viewmats=np.stack(viewmats).astype(np.float64))

@@ -1,0 +1,345 @@
+"""Running cells on the workers of a Dask cluster: processes here, those at an address, or jobs of SLURM.
+
+A worker has a checkout of its own and is told which cell to run. It runs it as it is run here, in a folder of
+its own, and sends all that the cell left: record and files. So no disk need be shared, and what stands in the
+experiment's folder afterwards is what a run here would have left.
+"""
+
+import io
+import logging
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache, lru_cache
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import sleep
+from types import ModuleType
+from typing import Any
+from zipfile import ZipFile
+
+from gsjax import extras
+from gsjax.engine.experiments.local import run_cell
+from gsjax.engine.experiments.records import now
+from gsjax.engine.experiments.script import forget_scripts
+from gsjax.engine.experiments.sweep import Cell, Experiment, read_experiment
+from gsjax.engine.machine import keep_to, usable_cores
+from gsjax.engine.messages import counted
+from gsjax.io.atomic import write_json
+from gsjax.optim.compiler import keep_freed_memory
+
+PROCESSES, SLURM = "processes", "slurm"
+CONNECT_S = 10
+_POLL_S, _COLLECTED_S = 1, 60
+_KEYS = "gsjax-"
+# A terminal sends Ctrl-C to them too, but who ends them is this process. What a cell starts gets it as ever.
+_UNDISTURBED = "import signal; signal.signal(signal.SIGINT, lambda *_: None)"
+
+
+def run_on_cluster(
+    experiment: Experiment,
+    cells: Sequence[Cell],
+    scheduler: str,
+    workers: int | None,
+    say: Callable[[str], Any],
+    connected: Callable[[], Any],
+    debug: bool = False,
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Run cells on workers and give each with its record, which is on disk by then, as they finish.
+
+    A cell whose worker dies is run by another. One that lost more workers than Dask allows it to
+    (`distributed.scheduler.allowed-failures`) waits until all others are done: it may only have waited for
+    its turn on a worker that another one killed. If it then loses one more, it has failed.
+
+    Args:
+        scheduler: `processes`, `slurm`, or the address of one, such as tcp://HOST:8786.
+        workers: how many processes or jobs to start. As many processes as there are cores, unless given.
+        say: is told how many workers there are.
+        connected: is called when there is a scheduler, before any cell is asked for.
+        debug: let through what a cell raises.
+
+    Raises:
+        ValueError: there is no such scheduler, or a worker is not as this process is.
+        OSError: the scheduler does not answer, or no longer.
+    """
+    killed_worker = _package("distributed").KilledWorker
+    if scheduler == PROCESSES:
+        workers = workers or usable_cores()
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
+    with _client(scheduler, workers) as client, _said_if_gone(scheduler):
+        connected()
+        sharing = workers if scheduler == PROCESSES else None
+        under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
+        suspects, alone = [], False
+        while under_way:
+            for future in _finished(client, list(under_way), say):
+                cell = under_way.pop(future)
+                try:
+                    record = _unpack(experiment, cell, future.result())
+                except killed_worker as error:
+                    if not alone:
+                        suspects.append((future, cell))
+                        continue
+                    record = _killed(experiment, cell, error.allowed_failures + 2)
+                except ImportError as error:
+                    if debug:  # a script's own
+                        raise
+                    raise ValueError(
+                        f"a worker cannot load what runs a cell: {error}; start workers where gsjax "
+                        f"{experiment.made_with} is installed, as here"
+                    ) from error
+                future.release()  # before its worker can die, for then Dask would compute it again
+                yield cell, record
+            if not under_way and suspects:
+                future, cell = suspects.pop(0)
+                client.retry([future])
+                under_way, alone = {future: cell}, True
+
+
+@contextmanager
+def _said_if_gone(scheduler: str) -> Iterator[None]:
+    """Raises what says so where the scheduler is gone, and all that it was asked for with it."""
+    try:
+        yield
+    except CancelledError as error:
+        raise OSError(
+            f"--scheduler {scheduler}: expected it to stay, found it gone; what was done is kept, and the "
+            "same command goes on from there"
+        ) from error
+
+
+def _submit(client: Any, experiment: Experiment, cell: Cell, sharing: int | None, debug: bool) -> Any:
+    """Ask for a cell; returns its future. What is asked again while a worker is still at it joins it."""
+    about = (f"{experiment.root}", experiment.name, experiment.fingerprint, experiment.made_with)
+    arguments = (*about, cell.options, cell.seed, sharing, debug)
+    key = f"{_KEYS}{import_module('dask.base').tokenize(arguments)}"
+    # By its name, and with plain arguments: a worker without this module fails to load it and says so. It
+    # would break over a message that holds what it cannot load.
+    module = __name__
+    return client.submit(lambda: import_module(module).run_there(*arguments), key=key)
+
+
+def run_there(
+    root: str,
+    name: str,
+    script: str,
+    made_with: str,
+    options: dict[str, Any],
+    seed: int,
+    sharing: int | None,
+    debug: bool,
+) -> bytes:
+    """Run a cell; what a worker does.
+
+    Args:
+        root: the folder of the experiments, from where the worker was started.
+        name: of the experiment.
+        script: the fingerprint that it must have here too.
+        made_with: the gsjax that must be here too.
+        options: those of the cell.
+        seed: that of the cell.
+        sharing: how many workers share this machine's cores; None leaves it to them.
+        debug: let through what the cell raises.
+
+    Returns:
+        a zip of the cell's record, ID.json, and of its folder, ID.
+
+    Raises:
+        ValueError: the worker has several threads, or another gsjax, script or folder than the client.
+    """
+    worker = import_module("distributed").get_worker()
+    if worker.state.nthreads != 1:
+        raise ValueError(
+            f"worker {worker.address}: expected one thread, for cells share what a script has loaded, found "
+            f"{worker.state.nthreads}; start it with --nthreads 1"
+        )
+    _wait_until_collected(worker)
+    # JAX keeps memory that it has freed. A worker that Dask pauses for that would never go on.
+    worker.memory_manager.memory_pause_fraction = False
+    if sharing is not None:
+        _keep_to_share(worker.name, sharing)
+    keep_freed_memory()
+    try:
+        experiment, script_run = _loaded(root, name, script, made_with)
+    except ValueError as error:
+        raise ValueError(f"worker {worker.address}: {error}") from error
+    with TemporaryDirectory(dir=worker.local_directory, prefix="gsjax-") as temporary:
+        left = Path(temporary) / "left"
+        run_cell(experiment, Cell(options, seed), script_run, left, debug)
+        return Path(shutil.make_archive(f"{temporary}/sent", "zip", left)).read_bytes()
+
+
+def _wait_until_collected(worker: Any) -> None:
+    """Until what this worker computed before is on the disk of who asked: the next cell may end it. Whoever
+    asked may have gone, so not for ever."""
+    for _ in range(int(_COLLECTED_S / 0.01)):
+        if not any(str(key).startswith(_KEYS) for key in list(worker.data)):
+            return
+        sleep(0.01)
+
+
+@lru_cache(maxsize=1)
+def _loaded(root: str, name: str, script: str, made_with: str) -> tuple[Experiment, Callable]:
+    """An experiment, and `run` of its script, which serves all cells; of the one that was run last.
+
+    Raises:
+        ValueError: it is not what `script` and `made_with` say, or cannot be loaded.
+    """
+    forget_scripts(Path(root))  # another experiment may have helpers of the same name, or they were edited
+    experiment = read_experiment(Path(root), name, Path())
+    if experiment.made_with != made_with:
+        raise ValueError(
+            f"expected gsjax {made_with}, as where the run was started, found {experiment.made_with}; bring "
+            "its checkout to the same state and start the worker again"
+        )
+    if experiment.fingerprint != script:
+        raise ValueError(
+            f"{experiment.script}: expected the script as it is where the run was started, found another; "
+            "bring this checkout to the same state"
+        )
+    return experiment, experiment.load()[0]
+
+
+@cache
+def _keep_to_share(index: int, sharing: int) -> None:
+    """Keep this process to its part of the cores, so that what it measures is not what others are at.
+
+    More processes than cores share them.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        first, end = (n * len(cores) // sharing for n in (index % sharing, index % sharing + 1))
+        keep_to(cores[first : max(end, first + 1)])
+
+
+def _finished(client: Any, futures: list[Any], say: Callable[[str], Any]) -> list[Any]:
+    """Those that are, as soon as one is."""
+    while True:
+        with suppress(OSError):  # the client is trying to reach it again, and gives up after a while
+            workers = len(client.nthreads())
+            say(f"cells on {counted(workers, 'worker')}" if workers else "waiting for a worker")
+        with suppress(TimeoutError):
+            wait = import_module("distributed").wait
+            return list(wait(futures, timeout=_POLL_S, return_when="FIRST_COMPLETED").done)
+
+
+def _unpack(experiment: Experiment, cell: Cell, sent: bytes) -> dict[str, Any]:
+    """Put what a worker sent where a run here would have left it, the record last; returns the record."""
+    experiment.cells_folder.mkdir(parents=True, exist_ok=True)
+    folder, path = experiment.cells_folder / cell.id, experiment.path(cell)
+    with TemporaryDirectory(dir=experiment.cells_folder, prefix=".partial-") as temporary:
+        with ZipFile(io.BytesIO(sent)) as archive:
+            archive.extractall(temporary)
+        shutil.rmtree(folder, ignore_errors=True)
+        if (Path(temporary) / folder.name).is_dir():
+            os.replace(Path(temporary) / folder.name, folder)
+        os.replace(Path(temporary) / path.name, path)
+    found = experiment.own(cell)
+    assert found is not None
+    return found
+
+
+def _killed(experiment: Experiment, cell: Cell, workers: int) -> dict[str, Any]:
+    """Keep the record of a cell that no worker lives to tell of; returns it."""
+    record = {
+        "options": cell.options,
+        "seed": cell.seed,
+        "result": None,
+        "error": f"KilledWorker: {workers} workers died with this cell, the last one while it ran no other: "
+        "perhaps there is too little memory; what ended them is in their logs",
+        "traceback": [],
+        "seconds": None,
+        "finished": now(),
+        "script": experiment.fingerprint,
+        "machine": None,
+        "gsjax": experiment.made_with,
+    }
+    write_json(experiment.path(cell), record)
+    return record
+
+
+@contextmanager
+def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
+    """A client of the scheduler, which is started where it is not an address, and ended with its workers."""
+    distributed, config = _package("distributed"), _package("dask.config")
+    with ExitStack() as stack:
+        # Cells take long: none is to wait for a worker while another one is idle.
+        stack.enter_context(config.set({"distributed.scheduler.worker-saturation": 1.0}))
+        place = scheduler
+        if scheduler == PROCESSES:
+            place = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    memory_limit=0,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                    preload=[*config.get("distributed.worker.preload"), _UNDISTURBED],
+                )
+            )
+        elif scheduler == SLURM:
+            place = stack.enter_context(slurm_cluster())
+            place.adapt(minimum_jobs=workers, maximum_jobs=workers)  # starts another for one that ended
+        try:
+            client = distributed.Client(place, timeout=CONNECT_S)
+        except OSError as error:
+            raise OSError(
+                f"--scheduler {scheduler}: expected one of Dask, found none that answers in {CONNECT_S} s"
+            ) from error
+        yield stack.enter_context(client)
+
+
+def slurm_cluster() -> Any:
+    """Dask's cluster of SLURM jobs, of which none is submitted yet. A job is one worker, with all its cores.
+
+    What a job is stands in Dask's own configuration: `jobqueue.slurm` of ~/.config/dask/*.yaml.
+
+    Raises:
+        MissingExtra: dask-jobqueue is not installed.
+        ValueError: the configuration lacks what a job must have.
+    """
+    jobqueue, config = _package("dask_jobqueue"), _package("dask.config")
+    cores = config.get("jobqueue.slurm.job-cpu") or config.get("jobqueue.slurm.cores")
+    if cores is None or config.get("jobqueue.slurm.memory") is None:
+        raise ValueError(
+            "--scheduler slurm: expected jobqueue.slurm.cores and .memory in Dask's settings, a .yaml in "
+            f"{config.PATH}, found no {'cores' if cores is None else 'memory'}"
+        )
+    # What Dask calls cores are threads of its own, and would be as many cells at once.
+    free_port = {"dashboard_address": ":0", **config.get("jobqueue.slurm.scheduler-options")}
+    return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores, scheduler_options=free_port)
+
+
+def check_scheduler(scheduler: str, workers: int | None) -> None:
+    """Raises a ValueError where these cannot be, and MissingExtra where what they need is not installed."""
+    _package("distributed")
+    if workers is not None and workers < 1:
+        raise ValueError(f"--workers: expected 1 or more, found {workers}")
+    if "://" in scheduler:
+        if workers is not None:
+            raise ValueError(f"--workers: expected none given, for {scheduler} has its own, found {workers}")
+    elif scheduler == SLURM:
+        if workers is None:
+            raise ValueError("--workers: expected how many jobs to submit to SLURM, found none given")
+        if shutil.which("sbatch") is None:
+            raise ValueError("--scheduler slurm: expected SLURM's sbatch on this machine, found none")
+    elif scheduler != PROCESSES:
+        known = f"{PROCESSES}, {SLURM} or an address such as tcp://HOST:8786"
+        raise ValueError(f"--scheduler: expected {known}, found {scheduler!r}")
+
+
+def _package(name: str) -> ModuleType:
+    """A package of the extra `cluster`, or a module of one; Ctrl-C stays with who heard it.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    heard_by = signal.getsignal(signal.SIGINT)
+    module = extras.load(name, "cluster", "--executor dask")
+    if signal.getsignal(signal.SIGINT) is not heard_by:  # dask-jobqueue takes it as it is imported
+        signal.signal(signal.SIGINT, heard_by)
+    return module

@@ -1,0 +1,94 @@
+"""Running cells in this process, one after the other."""
+
+import contextlib
+import copy
+import json
+import shutil
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from gsjax.engine import machine
+from gsjax.engine.experiments.records import now, read_record
+from gsjax.engine.experiments.sweep import RESERVED, Cell, Experiment
+from gsjax.engine.messages import describe
+from gsjax.io.atomic import write_json
+from gsjax.optim.compiler import forget_programs
+
+
+def run_here(
+    experiment: Experiment,
+    cells: Sequence[Cell],
+    script_run: Callable,
+    say: Callable[[str], Any],
+    debug: bool = False,
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Run cells in order and give each with its record, which is on disk by then.
+
+    Args:
+        script_run: `run(options, seed, folder)` of the script.
+        say: is told what is under way.
+        debug: let through what a cell raises.
+    """
+    for cell in cells:
+        say(str(cell))
+        yield cell, run_cell(experiment, cell, script_run, experiment.cells_folder, debug)
+
+
+def run_cell(
+    experiment: Experiment, cell: Cell, script_run: Callable, cells_folder: Path, debug: bool = False
+) -> dict[str, Any]:
+    """Run one cell and keep its record, also if it fails; only Ctrl-C leaves none. Returns the record.
+
+    Args:
+        script_run: `run(options, seed, folder)` of the script. The folder is the cell's own, and new.
+        cells_folder: gets the record, ID.json, and the cell's folder, ID.
+        debug: let through what it raises.
+    """
+    folder, path = cells_folder / cell.id, cells_folder / f"{cell.id}.json"
+    shutil.rmtree(folder, ignore_errors=True)  # a run that was stopped may have left half of something
+    folder.mkdir(parents=True, exist_ok=True)
+    made_with = experiment.made_with
+    forget_programs()  # of earlier cells
+    result, error, trace, begun = None, None, [], perf_counter()
+    try:
+        result = script_run(copy.deepcopy(cell.options), cell.seed, folder)
+        _check_result(result, cell)
+    except (Exception, SystemExit) as failure:
+        if debug:
+            raise
+        kind = type(failure).__name__
+        result, error = None, f"{kind}: {describe(failure)}".removesuffix(f": {kind}")
+        trace = traceback.format_exc().splitlines()
+    record = {
+        "options": cell.options,
+        "seed": cell.seed,
+        "result": result,
+        "error": error,
+        "traceback": trace,
+        "seconds": perf_counter() - begun,
+        "finished": now(),
+        "script": experiment.fingerprint,
+        "machine": machine.describe(),  # asked after the script ran, which may configure JAX first
+        "gsjax": made_with,
+    }
+    write_json(path, record)
+    with contextlib.suppress(OSError):  # files of the script's are in it
+        folder.rmdir()
+    return read_record(path)  # as a later run will see it: arrays are lists, NaN is null
+
+
+def _check_result(result: Any, cell: Cell) -> None:
+    """Raises a TypeError unless it is a dict of what JSON can hold, by names that are not taken."""
+    if not isinstance(result, Mapping):
+        raise TypeError(f"run() returned {type(result).__name__}, expected a dict of figures by name")
+    for key, value in result.items():
+        if not isinstance(key, str) or key in (*RESERVED, *cell.options):
+            raise TypeError(f"run() returned {key!r}, expected a name that is no option, seed or seconds")
+        try:
+            json.dumps(value, default=lambda array: array.tolist())
+        except (TypeError, ValueError, AttributeError) as error:
+            found = f"{key!r} of type {type(value).__name__}"
+            raise TypeError(f"run() returned {found}, expected numbers, text, or lists of them") from error

@@ -1,0 +1,186 @@
+"""One experiment: the cells of its sweep, and what is known of each."""
+
+import hashlib
+import itertools
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from gsjax.engine.experiments.config import (
+    CONFIG,
+    Column,
+    Config,
+    Figure,
+    expect,
+    expect_unlike,
+    read_config,
+)
+from gsjax.engine.experiments.records import RESULTS, committed_rows, read_record
+from gsjax.engine.experiments.script import fingerprint_of, load_script, made_with_of
+
+RESERVED = ("seed", "seconds")
+"""What a row holds beside options and figures, so neither may have these names."""
+# YAML 1.1 takes these for text, which nobody means who sweeps a rate.
+_LOOKS_LIKE_A_NUMBER = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the script."""
+
+    options: dict[str, Any]
+    seed: int
+
+    @property
+    def id(self) -> str:
+        """Names the cell's file: the same for the same options in any order, and on any machine."""
+        text = json.dumps([self.options, self.seed], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Options and seed as tables show them."""
+        return {key: in_words(value) for key, value in {**self.options, "seed": self.seed}.items()}
+
+    def __str__(self) -> str:
+        return " ".join(f"{key}={text}" for key, text in self.words.items())
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment, checked."""
+
+    name: str
+    root: Path  # the folder of all experiments
+    cells_folder: Path  # ID.json and the folder ID/ of each cell
+    config: Config
+    columns: tuple[Column, ...]
+    figure: Figure
+    cells: tuple[Cell, ...]  # in order; seeds change fastest
+    text: str  # the script
+
+    @property
+    def folder(self) -> Path:
+        """Where its config is, and its collected results."""
+        return self.root / self.name
+
+    @property
+    def script(self) -> Path:
+        """What a cell runs."""
+        return self.folder / self.config.script
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of its script: what was made under another one is stale."""
+        return fingerprint_of(self.script, self.text, self.config.version)
+
+    @property
+    def made_with(self) -> str:
+        """Which gsjax this is, and what the experiments share."""
+        return made_with_of(self.root)
+
+    def load(self) -> tuple[Callable, Callable | None]:
+        """The script's `run`, and its `figure` or None."""
+        return load_script(self.name, self.script, self.text, bool(self.config.figure))
+
+    def path(self, cell: Cell) -> Path:
+        """The file of a cell that was run from this machine."""
+        return self.cells_folder / f"{cell.id}.json"
+
+    def own(self, cell: Cell) -> dict[str, Any] | None:
+        """The record of a cell that was run from this machine, or None."""
+        path = self.path(cell)
+        return read_record(path) if path.is_file() else None
+
+    def is_done(self, record: dict[str, Any] | None) -> bool:
+        """Whether nothing is left to do: it ran, by the present script, and did not fail."""
+        return record is not None and record["error"] is None and record["script"] == self.fingerprint
+
+    def records(self) -> list[dict[str, Any]]:
+        """All that is known of the cells, in order: this machine's records, else those committed.
+
+        One that is stale or failed gives way to a committed one that is not: others may have measured since.
+        """
+        committed, known = self.committed(), []
+        for cell in self.cells:
+            candidates = [r for r in (self.own(cell), committed.get(cell.id)) if r is not None]
+            known += [next(filter(self.is_done, candidates), candidates[0])] if candidates else []
+        return known
+
+    def committed(self) -> dict[str, dict[str, Any]]:
+        """The rows of results.json by their cells' ids."""
+        rows = committed_rows(self.folder / RESULTS)
+        return {Cell(row["options"], row["seed"]).id: row for row in rows}
+
+
+def in_words(value: Any) -> str:
+    """An option's value as tables show it and `--only` takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def experiment_names(root: Path) -> list[str]:
+    """The folders below `root` that hold a config, sorted."""
+    expect(root.is_dir(), f"{root}", "a folder of experiments (--root names another)", "none there")
+    return sorted(path.parent.relative_to(root).as_posix() for path in root.glob(f"*/**/{CONFIG}"))
+
+
+def read_experiment(root: Path, name: str, out: Path) -> Experiment:
+    """Read and check the experiment `name`, whose cells are in `out`/`name`.
+
+    Args:
+        root: folder of the experiments.
+        name: its folder below that.
+        out: folder for what cells give.
+
+    Raises:
+        ValueError: there is none, or a key of its config is not as it should be.
+    """
+    names = experiment_names(root)
+    # A shell completes the path of the folder, with a slash at its end.
+    name = next((n for n in names if Path(name) in (Path(n), root / n)), name)
+    below = [n for n in names if n.startswith(name.rstrip("/") + "/")]
+    known = ", ".join(below or names) or f"none; make one as {root}/NAME/{CONFIG}"
+    if name not in names:
+        raise ValueError(f"{root}: no experiment {name!r}; there are: {known}")
+    path = root / name / CONFIG
+    config, columns, figure = read_config(path, root)
+    cells, text = _cells(config, path), (path.parent / config.script).read_text(encoding="utf-8")
+    return Experiment(name, root, out / name, config, columns, figure, cells, text)
+
+
+def _cells(config: Config, path: Path) -> tuple[Cell, ...]:
+    """The sweep, in order."""
+    expect(config.grid or config.cases, f"{path}: grid", "option: [values], or cases", "nothing to sweep")
+    for option, values in config.grid.items():
+        where = f"{path}: grid.{option}"
+        expect(isinstance(values, list) and values, where, "a list of values", values)
+        _expect_option(option, values, where)
+    for i, case in enumerate(config.cases):
+        where = f"{path}: cases[{i}]"
+        expect(isinstance(case, dict) and case, where, "option: value pairs", case)
+        for option, value in case.items():
+            _expect_option(option, [value], f"{where}.{option}")
+            expect(option not in config.grid, f"{where}.{option}", "an option that the grid has not", option)
+    sound = config.seeds and all(type(seed) is int for seed in config.seeds)
+    expect(sound, f"{path}: seeds", "a list of whole numbers", config.seeds)
+    points = [dict(zip(config.grid, p, strict=True)) for p in itertools.product(*config.grid.values())]
+    options = [{**case, **point} for case in config.cases or [{}] for point in points]
+    cells = tuple(Cell(o, seed) for o in options for seed in config.seeds)
+    expect_unlike([str(cell) for cell in cells], f"{path}: grid, cases and seeds")
+    return cells
+
+
+def _expect_option(name: Any, values: list, where: str) -> None:
+    """Options have names, and values that JSON can hold, so that a cell can be found again."""
+    expect(isinstance(name, str) and name not in RESERVED, where, "an option's name", name)
+    for value in itertools.chain.from_iterable(v if isinstance(v, list) else [v] for v in values):
+        plain = value is None or isinstance(value, (str, int, float))
+        expect(plain, where, "numbers, text, true, false, null, or lists of those", value)
+        expect(not isinstance(value, float) or math.isfinite(value), where, "finite numbers", value)
+        text = isinstance(value, str) and _LOOKS_LIKE_A_NUMBER.fullmatch(value)
+        expect(not text, where, "a number as YAML has it, with a point and a sign (1.0e-3)", value)

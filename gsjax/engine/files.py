@@ -1,0 +1,173 @@
+"""What commands that work on a run read back of it, whichever command made it: arrays, the scene, the
+recording. `again` is what each advises where a file is not as it was written."""
+
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gsjax.data import ReadOptions
+from gsjax.data.errors import DataError
+from gsjax.engine.messages import Notes
+from gsjax.engine.recording import Opener, Recording, open_recording
+from gsjax.io.ply import PlyReport, read_ply
+from gsjax.scene.gaussians import Gaussians
+
+_SETTINGS = ("dataset", "cameras", "frames")
+
+
+def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file, those that are wanted among them.
+
+    Args:
+        file: a .npz.
+        wanted: names.
+        again: what to do where one is missing, for the error.
+
+    Raises:
+        ValueError: it cannot be read, or lacks one of them.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            arrays = dict(saved)
+    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"{file}: expected plain arrays, found a file that cannot be read; {again}"
+        ) from error
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise ValueError(f"{file}: expected an array {missing[0]}, found {', '.join(arrays)}; {again}")
+    return arrays
+
+
+def check_arrays(
+    file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[str | int]], again: str
+) -> dict[str, int]:
+    """Check that arrays of a file hold finite numbers and fit each other.
+
+    Args:
+        file: where they are from, for the error.
+        arrays: by name.
+        again: what to do where one is wrong, for the error.
+        shapes: of each that is checked. A letter is as many as where it first stands, one at least.
+
+    Returns:
+        How many each letter is.
+
+    Raises:
+        ValueError: one has another shape, is of something else, or is not finite everywhere.
+    """
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.dtype.kind not in "iuf":
+            raise ValueError(f"{file}: {name}: expected numbers, found {array.dtype}; {again}")
+        known = [sizes.get(n, n) if isinstance(n, str) else n for n in shape]
+        fits = len(known) == array.ndim and all(
+            size > 0 if isinstance(n, str) else size == n for n, size in zip(known, array.shape, strict=True)
+        )
+        if not fits:
+            wanted, found = (",".join(map(str, each)) for each in (known, array.shape))
+            raise ValueError(f"{file}: {name}: expected the shape [{wanted}], found [{found}]; {again}")
+        sizes |= {n: found for n, found in zip(shape, array.shape, strict=True) if isinstance(n, str)}
+        wrong = int((~np.isfinite(array)).sum())
+        if wrong:
+            found = f"{wrong} of {array.size} that are not"
+            raise ValueError(f"{file}: {name}: expected finite numbers, found {found}; {again}")
+    return sizes
+
+
+def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
+    """The Gaussians of a PLY file that can be drawn, and what else it held; says how many cannot.
+
+    Raises:
+        FileNotFoundError, PlyError: as `read_ply`.
+        ValueError: it holds none.
+    """
+    gaussians, report = read_ply(file)
+    if report.culled:
+        notes.warn(f"{file}: {report.culled} of {report.stored} Gaussians cannot be drawn and are left out")
+    if gaussians.num == 0:
+        raise ValueError(f"{file}: expected Gaussians, found none that can be drawn")
+    return gaussians, report
+
+
+def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
+    """The Gaussians of a run's scene.ply, as many as its file `arrays` tells of.
+
+    Args:
+        path: of the run.
+        count: how many there have to be.
+        arrays: the name of the file that says so.
+        again: what to do where they differ, for the error.
+
+    Raises:
+        ValueError: there are not as many, or not all of them can be drawn.
+    """
+    gaussians, report = read_ply(path / "scene.ply")
+    if gaussians.num != count or report.stored != count:
+        found = f"{gaussians.num} drawable Gaussians of {report.stored} in scene.ply"
+        raise ValueError(f"{path}: expected {count} Gaussians as in {arrays}, found {found}; {again}")
+    return gaussians
+
+
+def reopen(
+    config: Path,
+    again: str,
+    also: Callable[[Mapping[str, Any]], Any] = lambda settings: None,
+    opened: Opener | None = None,
+) -> tuple[Recording, Any]:
+    """The recording of a run, by what its config.yml says, and what else is wanted of the settings. `opened`
+    opens it, as that command does.
+
+    Args:
+        config: the file.
+        again: what to do where it cannot be used, for the error.
+        also: takes what else is wanted out of the settings.
+        opened: as above; `open_sequence` unless given.
+
+    Raises:
+        ValueError: these are no such settings, or the recording cannot be opened.
+    """
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        wanted = also(settings)
+        read = read_options(settings.get("read") or {})
+        scale = float(settings.get("scale", 1.0))
+        dataset, cameras, frames = (settings[name] for name in _SETTINGS)
+        held_out = settings.get("eval_cameras") or ()  # which not all commands have
+        return open_recording(dataset, cameras, held_out, frames, read, scale, opened), wanted
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        listed = ", ".join(_SETTINGS)
+        raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error
+    except DataError as error:
+        raise ValueError(
+            f"{config}: its recording cannot be opened: {error} A path that is not absolute is looked for "
+            "from the folder you are in."
+        ) from error
+
+
+def read_options(stored: Mapping[str, Any]) -> ReadOptions:
+    """What a config.yml tells of how the dataset was read; what this version does not know is left out."""
+    known = {field.name for field in fields(ReadOptions)}
+    plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
+    return ReadOptions(**{name: value for name, value in plain.items() if name in known})
+
+
+def chosen_camera(recording: Recording, camera: int | None, run: Path) -> int:
+    """The id of a camera of a run; the first held out one, else the first, unless given.
+
+    Raises:
+        ValueError: the run had no such camera.
+    """
+    known = list(recording.judged.camera_ids)
+    if camera is None:
+        return [*recording.held_out, *known][0]
+    if camera not in known:
+        raise ValueError(f"--camera: {run} has no camera {camera}; it has {known}.")
+    return camera

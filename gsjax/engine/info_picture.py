@@ -1,0 +1,94 @@
+"""The picture that `gsjax info --picture` draws: cameras by what becomes of them, and points."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gsjax.data import Photographs, Sequence
+from gsjax.geometry.cameras import unproject
+from gsjax.io.atomic import atomic_write
+
+_DEPTHS, _PIXELS = 12, 3000  # depth images that points come from, where there are none, and points of each
+_MOST_COLORS = 8
+_OTHERS = "not used"
+
+Groups = Mapping[str, np.ndarray]
+"""Indices of photographs by what a legend calls them."""
+
+
+def by_split(photographs: Photographs) -> Groups:
+    """What `gsjax fit` does with each photograph unless it is told otherwise."""
+    from gsjax.engine.options import HeldOutFrames
+    from gsjax.engine.photographs import split
+
+    fitted, held_out = split(photographs, HeldOutFrames.test_every)
+    others = np.setdiff1d(np.arange(photographs.num), np.concatenate([fitted, held_out]))
+    groups = {"fitted": fitted, "held out": held_out, _OTHERS: others}
+    return {name: indices for name, indices in groups.items() if len(indices)}
+
+
+def by_camera(sequence: Sequence) -> Groups:
+    """The frames of each camera of a recording, counted as `photographs_of` counts them."""
+    indices = np.arange(sequence.num_frames * sequence.num_cameras)
+    if sequence.num_cameras > _MOST_COLORS:
+        return {"cameras": indices}
+    return {f"camera {id}": indices[c :: sequence.num_cameras] for c, id in enumerate(sequence.camera_ids)}
+
+
+def write_picture(path: Path, photographs: Photographs, groups: Groups) -> None:
+    """Draw cameras and points into a file of the kind that its suffix says."""
+    from gsjax.viz.cameras import CameraGroup, cameras_and_points
+    from gsjax.viz.colors import BACKGROUND, label_color
+    from gsjax.viz.plots import save
+
+    def color(number: int, name: str) -> str:
+        return "#{:02x}{:02x}{:02x}".format(*(BACKGROUND if name == _OTHERS else label_color(number + 1)))
+
+    points, colors = scene_points(photographs)
+    figure = cameras_and_points(
+        {
+            name: CameraGroup(
+                photographs.viewmats[chosen],
+                photographs.Ks[chosen],
+                photographs.sizes[chosen],
+                color(number, name),
+            )
+            for number, (name, chosen) in enumerate(groups.items())
+        },
+        points,
+        colors,
+        unit="m" if photographs.load_depth is not None else "units of the data",
+        title=photographs.name,
+    )
+    with atomic_write(path) as temporary:
+        save(figure, temporary)
+
+
+def scene_points(
+    photographs: Photographs,
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | tuple[None, None]:
+    """Points with colours, 0 to 1: those of the data, else of some of its depth images; None where it has
+    neither."""
+    if photographs.cloud is not None and len(photographs.cloud.points):
+        return photographs.cloud.points, photographs.cloud.colors
+    if photographs.load_depth is None:
+        return None, None
+    random, points, colors = np.random.default_rng(0), [], []
+    for i in np.unique(np.linspace(0, photographs.num - 1, _DEPTHS).astype(int)).tolist():
+        depth = photographs.depth(i)
+        if depth is None or not (depth > 0).any():
+            continue
+        rows, columns = np.nonzero(depth)
+        some = random.choice(len(rows), min(_PIXELS, len(rows)), replace=False)
+        rows, columns = rows[some], columns[some]
+        pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float32)
+        camera = photographs.camera(i)
+        at, depths = jnp.asarray(pixels), jnp.asarray(depth[rows, columns])
+        points.append(np.asarray(unproject(at, depths, camera.viewmat, camera.K), float))
+        colors.append(photographs.image(i)[rows, columns] / 255)
+    if not points:
+        return None, None
+    return np.concatenate(points), np.concatenate(colors)

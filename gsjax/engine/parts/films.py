@@ -1,0 +1,299 @@
+"""The film that edits make of a run of `gsjax parts`, and its folder, whoever asks for it."""
+
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import Notes
+from gsjax.engine.parts.saved import PartsRun, read_parts
+from gsjax.geometry.cameras import Camera, resized
+from gsjax.io.atomic import atomic_write, write_json
+from gsjax.io.ply import write_ply
+from gsjax.io.video import VideoWriter
+from gsjax.methods.parts.film import Film, Layer, film_gaussians
+from gsjax.methods.parts.limits import Beyond, beyond_captured, describe_beyond
+from gsjax.methods.parts.operation import Edit
+from gsjax.methods.parts.operations import label
+from gsjax.methods.parts.timeline import LENGTHS, ROUND, LoadScene, Script, apply, to_yaml
+from gsjax.methods.parts.trajectory import Trajectory
+from gsjax.optim.compiler import host_options
+from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.handles import Blend
+from gsjax.scene.render import render_with_room
+
+SCRIPT = "edit.yaml"
+"""What tells the folder of a film from others."""
+VIDEO = "video.mp4"
+"""The film itself, in its folder."""
+_METRICS, _PLY = "metrics.json", "ply"
+_THUMBNAIL, _LOOKS = 160, 5  # pixels and moments by which cameras are compared ...
+_CHANGED = 0.05  # ... of colours from 0 to 1: what differs less has not changed
+_NAME = re.compile(r"\w[\w .-]*")  # of a folder that lies where it should
+
+
+class Shot(NamedTuple):
+    """A frame of a film.
+
+    Attributes:
+        image: as the camera sees it.
+        gaussians: what is there.
+        seconds: that both took; None where something was compiled.
+    """
+
+    image: Float[np.ndarray, "height width 3"]
+    gaussians: Gaussians
+    seconds: float | None
+
+
+Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
+"""Passes on the frames of a film, of which there are so many; a KeyboardInterrupt from it ends the film."""
+
+
+def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
+    """The film that a script makes of a run, and what makes it doubtful, a sentence each.
+
+    Raises:
+        ValueError, OSError: there is no such part or other run, or the edits cannot be done.
+    """
+    known = cache(read_parts)  # other runs are read once
+    film = apply(script, saved.layer, saved.names, known)
+    recorded, now = saved.layer, film[0].trajectory
+    doubts = []
+    if not saved.complete:
+        frames = len(recorded.trajectory.times)
+        doubts.append(f"{saved.path} is a partial run: only {frames} of its frames are there")
+    beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
+    if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
+        doubts.append(". ".join(beyond))
+    if idle := _idle(script, film, saved, known):
+        doubts.append(f"nothing is to be seen of {', '.join(idle)}")
+    return film, doubts
+
+
+def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
+    """The id of the camera, of those that a run had, to which most looks different from the recording.
+
+    Args:
+        film: what is filmed.
+        saved: the run.
+        script: the edits.
+    """
+    plain = apply(replace(script, edits=(), length=_lasting(script, film, saved)), saved.layer, saved.names)
+    moments = _edited_moments(film, plain)
+    if not len(moments):
+        return saved.camera(None)
+    some = np.linspace(0, len(moments) - 1, min(_LOOKS, len(moments)) + 2).round().astype(int)[1:-1]
+    sequence = saved.recording.judged
+    scale = _THUMBNAIL / max(sequence.width, sequence.height)
+    size = [max(1, round(scale * side)) for side in (sequence.width, sequence.height)]
+    each = [resized(sequence.camera(0, c), scale, *size) for c in range(sequence.num_cameras)]
+    cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+    def seen(film: Film) -> Float[np.ndarray, "T C h w 3"]:
+        at, plan, images = frames_of(film, saved.blend), None, []
+        for t in np.unique(moments[some]).tolist():
+            drawn, plan = render_with_room(at(t), cameras, plan)
+            images.append(np.asarray(drawn.colors))
+        return np.stack(images)
+
+    changed = (np.abs(seen(film) - seen(plain)).max(axis=-1) > _CHANGED).mean(axis=(0, 2, 3))
+    return int(sequence.camera_ids[int(changed.argmax())]) if changed.any() else saved.camera(None)
+
+
+def new_folder(parent: Path, name: str) -> Path:
+    """A new folder of that name, with a number behind it if there is one.
+
+    Raises:
+        ValueError: that is no name for a folder.
+    """
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"film name: expected letters, digits, spaces and any of . _ - behind the first, found {name!r}"
+        )
+    number, folder = 1, parent / name
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = parent / f"{name}_{number}"
+        else:
+            return folder
+
+
+def write_film(
+    folder: Path,
+    script: Script,
+    film: Film,
+    saved: PartsRun,
+    camera: int,
+    notes: Notes,
+    *,
+    watch: Watch,
+    ply: bool = False,
+) -> dict[str, Any]:
+    """Film it: the script, a video and what is known of it take the place of an earlier film in the folder.
+
+    Args:
+        folder: for it.
+        script: the edits.
+        film: what is filmed.
+        saved: the run.
+        watch: shows how far it is.
+        camera: the id of that which films.
+        notes: of the film.
+        ply: write the Gaussians of each frame too.
+
+    Returns:
+        What is known of it, as in its metrics.json. It is not `complete` if it was stopped; what there is of
+        it can be watched.
+    """
+    _clear(folder)
+    with atomic_write(folder / SCRIPT) as temporary:
+        temporary.write_text(to_yaml(script), encoding="utf-8")
+    sequence = saved.recording.judged
+    view = sequence.camera(0, sequence.camera_ids.index(camera))
+    fps = script.fps or 1 / float(np.median(np.diff(saved.recording.tracked.times)))
+    seconds, stopped = [], False
+    with VideoWriter(folder / VIDEO, fps) as video:
+        try:
+            for shot in watch(shots(film, view, saved), len(film[0].trajectory.times)):
+                if ply:
+                    write_ply(folder / _PLY / f"{len(seconds):06d}.ply", shot.gaussians)
+                video.write(shot.image)
+                seconds.append(shot.seconds)
+        except KeyboardInterrupt:
+            stopped = True
+            notes.add(f"This film is not complete: it was stopped after {len(seconds)} frames by Ctrl-C.")
+    warm = [each for each in seconds if each is not None]
+    found = {
+        "kind": "edit",
+        "dataset": sequence.name,
+        "run": str(saved.path.absolute()),
+        "complete": not stopped,
+        "camera": camera,
+        "frames": len(seconds),
+        "fps": fps,
+        "seconds": len(seconds) / fps,
+        "num_gaussians": sum(layer.scene.gaussians.num for layer in film),
+        "render_hz": 1 / float(np.median(warm)) if warm else None,
+        "machine": describe_machine(),
+        "notes": notes.all,
+    }
+    write_json(folder / _METRICS, found)
+    return found
+
+
+def frames_of(
+    film: Film, blend: Blend, order: Int[np.ndarray, "n"] | None = None
+) -> Callable[[int], Gaussians]:
+    """From the number of a frame to the Gaussians of a film in it, in another order if given.
+
+    One moment is taken on the host: then the length of a film is nothing that is compiled.
+    """
+    scenes = tuple(layer.scene for layer in film)
+    trajectories = jax.tree.map(np.asarray, tuple(layer.trajectory for layer in film))
+
+    def at(frame: int) -> Gaussians:
+        now = jax.tree.map(lambda leaf: leaf[frame : frame + 1], trajectories)
+        return _placing()(tuple(map(Layer, scenes, now)), order, blend=blend)
+
+    return at
+
+
+@cache
+def _placing() -> Callable[..., Gaussians]:
+    return jax.jit(_placed, static_argnames="blend", compiler_options=host_options())
+
+
+def _placed(film: Film, order: Int[Array, "n"] | None, blend: Blend) -> Gaussians:
+    gaussians = film_gaussians(film, 0, blend)
+    return gaussians if order is None else take(gaussians, order)
+
+
+def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
+    """A film as a camera sees it, frame by frame.
+
+    Args:
+        film: what is filmed.
+        camera: that which films.
+        saved: the run.
+    """
+    at = frames_of(film, saved.blend)
+    cameras, plan = jax.tree.map(lambda leaf: leaf[None], camera), None
+    for t in range(len(film[0].trajectory.times)):
+        begun, before = perf_counter(), plan
+        gaussians = at(t)
+        drawn, plan = render_with_room(gaussians, cameras, plan)
+        image = np.clip(np.asarray(drawn.colors[0]), 0, 1)
+        yield Shot(image, gaussians, perf_counter() - begun if plan is before else None)
+
+
+def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
+    """`beyond_captured`, of a film of any length by a program that is there already."""
+    length = len(now.times)
+    rows = np.minimum(np.arange(length + -length % ROUND), length - 1)
+    longer = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), now)
+    return Beyond(*(np.asarray(values)[:length] for values in beyond_captured(recorded, longer)))
+
+
+def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
+    """The edits, as messages call them, without which the film would be the same, and so would be what those
+    before them make: of two that do the same, the second."""
+    length = _lasting(script, film, saved)
+
+    @cache
+    def made(edits: tuple[Edit, ...]) -> Film | None:
+        try:
+            return apply(replace(script, edits=edits, length=length), saved.layer, saved.names, known)
+        except ValueError:  # one needs another
+            return None
+
+    def same(*edits: tuple[Edit, ...]) -> bool:
+        films = [jax.tree.map(np.asarray, made(each)) for each in edits]
+        return all(film is not None for film in films) and bool(eqx.tree_equal(*films))
+
+    edits = script.edits
+    return [
+        label(k + 1, edit.operation())
+        for k, edit in enumerate(edits)
+        if same(edits, edits[:k] + edits[k + 1 :]) and same(edits[:k], edits[: k + 1])
+    ]
+
+
+def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
+    """The length, seconds, that fewer edits need to be told to make a film as long as this one."""
+    recorded = saved.layer.trajectory.times
+    step = 1 / script.fps if script.fps else float(np.median(np.diff(recorded)))
+    return float(np.clip(float(film[0].trajectory.times[-1]) + step / 2, *LENGTHS))
+
+
+def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
+    """At which moments a film differs from that without edits; all where something was added."""
+    both = film[0].trajectory, plain[0].trajectory
+    count = min(len(one.times) for one in both)
+    if len(film) > 1:
+        return np.arange(count)
+    pairs = zip(*map(jax.tree.leaves, both), strict=True)
+    differ = [(np.asarray(a)[:count] != np.asarray(b)[:count]).reshape(count, -1) for a, b in pairs]
+    return np.flatnonzero(np.concatenate(differ, axis=1).any(axis=1))
+
+
+def _clear(folder: Path) -> None:
+    """Removes what an earlier film left there."""
+    for name in (SCRIPT, VIDEO, _METRICS):
+        (folder / name).unlink(missing_ok=True)
+    if (folder / _PLY).is_dir():
+        shutil.rmtree(folder / _PLY)

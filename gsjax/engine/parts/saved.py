@@ -1,0 +1,161 @@
+"""A run of `gsjax parts` read back: the scene, where its parts went, and the recording that it came from."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import yaml
+
+from gsjax.engine.files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.folder import expect_run
+from gsjax.engine.recording import Recording
+from gsjax.methods.parts import PartScene, trajectory_of
+from gsjax.methods.parts.film import Layer
+from gsjax.methods.parts.follow import order_of_frames
+from gsjax.methods.parts.timeline import Names
+from gsjax.scene.handles import Blend, HandlePose
+
+_FILES = ("parts.npz", "scene.ply", "metrics.json")
+_ARRAYS = {
+    "anchor": (),
+    "weights": ("N", "P"),
+    "centres": ("P", 3),
+    "times": ("T",),
+    "R": ("T", "P", 3, 3),
+    "t": ("T", "P", 3),
+}
+_AGAIN = "run gsjax parts again with this version of gsjax, or name another folder"
+
+
+@dataclass(frozen=True, eq=False)
+class PartsRun:
+    """What `gsjax parts` left.
+
+    Attributes:
+        path: the folder.
+        layer: the scene, and its parts at the frames that were followed.
+        names: of the parts, with their numbers: "part 1", and what it truly is where that is known.
+        complete: whether all frames were followed.
+        recording: the same frames and cameras as then.
+        blend: how rotations were blended then.
+    """
+
+    path: Path
+    layer: Layer
+    names: Names
+    complete: bool
+    recording: Recording
+    blend: Blend
+
+    def camera(self, camera: int | None) -> int:
+        """The id of a camera of the run; the first held out one, else the first, unless given.
+
+        Raises:
+            ValueError: the run had no such camera.
+        """
+        return chosen_camera(self.recording, camera, self.path)
+
+
+def open_parts_run(path: Path) -> PartsRun:
+    """Read the folder of a run, and open its recording.
+
+    Raises:
+        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+    """
+    layer, names, complete = _read(path)
+    recording, blend = reopen(path / "config.yml", _AGAIN, _blend)
+    return PartsRun(path, layer, names, complete, recording, blend)
+
+
+def blend_of(path: Path) -> Blend:
+    """How a run blended rotations, whose recording need not be there; as usual where it does not say."""
+    try:
+        return _blend(yaml.safe_load((path / "config.yml").read_text(encoding="utf-8")))
+    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        return "quaternion"
+
+
+def _blend(settings: Mapping[str, Any]) -> Blend:
+    return settings["parts"]["stream"]["blend"]
+
+
+def read_parts(path: str | Path) -> tuple[Layer, Names]:
+    """The scene of a run with its parts, and their names. Its recording need not be there.
+
+    Raises:
+        FileNotFoundError, ValueError: as `open_parts_run`.
+    """
+    layer, names, _ = _read(Path(path))
+    return layer, names
+
+
+def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
+    expect_run(path, made_by="`gsjax parts`")
+    missing = [name for name in _FILES if not (path / name).is_file()]
+    if missing:
+        kind = _kind(path / "metrics.json")
+        if kind not in (None, "parts"):
+            raise ValueError(
+                f"{path}: expected a run of `gsjax parts`, found one of `gsjax {kind}`; name another folder"
+            )
+        raise FileNotFoundError(
+            f"{path}: expected a whole run of `gsjax parts`, found no {missing[0]}; {_AGAIN}"
+        )
+    arrays = _arrays(path / "parts.npz")
+    num, parts = arrays["weights"].shape
+    anchor, frames = int(arrays["anchor"]), len(arrays["times"])
+    names, followed = _of_metrics(path / "metrics.json", frames)
+    gaussians = read_scene(path, num, "parts.npz", _AGAIN)
+    # The others stand there as at the anchor, which they were not.
+    done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
+    R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
+    weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
+    poses = HandlePose(jaxlie.SO3.from_matrix(R).wxyz, t)
+    names = {name: part for name, part in names.items() if part < parts}
+    layer = Layer(PartScene(gaussians, weights, centers), trajectory_of(times, poses))
+    return layer, names, len(done) == frames
+
+
+def _kind(file: Path) -> str | None:
+    """The command that made a run; None where its scores do not say."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8")).get("kind")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of parts.npz, which fit each other."""
+    arrays = read_arrays(file, tuple(_ARRAYS), _AGAIN)
+    frames = check_arrays(file, arrays, _ARRAYS, _AGAIN)["T"]
+    anchor = arrays["anchor"]
+    if anchor.dtype.kind not in "iu" or not 0 <= anchor < frames:
+        expected = f"the index of one of {frames} frames, 0 to {frames - 1}"
+        raise ValueError(f"{file}: anchor: expected {expected}, found {anchor}; {_AGAIN}")
+    return arrays
+
+
+def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
+    """Parts by name, and how many of the frames were followed."""
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+        rows, followed = metrics["parts"], metrics["frames"]["followed"]
+        called = [(row["part"], row["name"], row.get("true_name")) for row in rows]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
+    for part, name, true in called:
+        if type(part) is not int or part < 0 or not isinstance(name, str) or not isinstance(true, str | None):
+            expected = "part, name and true_name to be a number, a text and a text or null"
+            raise ValueError(f"{file}: expected {expected}, found {part!r}, {name!r} and {true!r}; {_AGAIN}")
+    if type(followed) is not int or not 1 <= followed <= frames:
+        expected = f"1 to {frames} frames to be followed, as parts.npz has {frames}"
+        raise ValueError(f"{file}: expected {expected}, found {followed!r}; {_AGAIN}")
+    # The true names last: of two names, messages say the last.
+    names = {name: part for part, name, _ in called}
+    return names | {true.lower().replace(" ", "_"): part for part, _, true in called if true}, followed

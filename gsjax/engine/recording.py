@@ -1,0 +1,329 @@
+"""Which part of a recording is tracked, which is only judged, and what its masks call things."""
+
+import os
+import warnings
+from collections.abc import Callable
+from collections.abc import Sequence as Indices
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import track
+
+from gsjax.data import ReadOptions, Sequence, open_sequence
+from gsjax.data.errors import DataError, DataWarning
+from gsjax.data.open import SIMULATED_PREFIX
+from gsjax.engine.messages import Notes
+from gsjax.engine.options import OfRecording
+
+Opener = Callable[[str, ReadOptions | None], Sequence]
+_LEAST_SIDE = 8  # of a picture that is made smaller, pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The chosen frames of a recording.
+
+    Attributes:
+        tracked: as its tracked cameras saw them; the others are not even opened while tracking.
+        judged: the same frames with the cameras that are only judged behind the tracked ones.
+        frames_in_data: how many frames there were to choose from.
+        simulated: pictures are drawn when asked for, which takes longer than reading them, and are then kept.
+    """
+
+    tracked: Sequence
+    judged: Sequence
+    frames_in_data: int
+    simulated: bool = False
+
+    @property
+    def held_out(self) -> tuple[int, ...]:
+        """Ids of the cameras that are only judged."""
+        return self.judged.camera_ids[self.tracked.num_cameras :]
+
+
+def located(dataset: str) -> str:
+    """The absolute path of a dataset, by which a run finds it again from elsewhere; of a built-in scene its
+    name."""
+    return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)
+
+
+def chosen_recording(options: OfRecording) -> Recording:
+    """The recording that a command is told of. Raises: as `open_recording`."""
+    cameras = (options.cameras, options.eval_cameras)
+    return open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
+
+
+def open_recording(
+    dataset: str,
+    cameras: Indices[int],
+    eval_cameras: Indices[int],
+    frames: str,
+    read: ReadOptions | None = None,
+    scale: float = 1.0,
+    opened: Opener | None = None,
+) -> Recording:
+    """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
+    made smaller by `scale`. `opened` opens it, whole; `open_sequence` unless given.
+
+    Args:
+        dataset: a folder, or a built-in scene.
+        cameras: ids of those to look through.
+        eval_cameras: ids of those held out.
+        frames: START:STOP[:STEP].
+        read: what the layout leaves open.
+        scale: of pictures.
+        opened: as above.
+
+    Raises:
+        ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
+            much would be left of pictures.
+        DataError: the dataset cannot be read.
+    """
+    sequence = (opened or open_sequence)(dataset, read)
+    known = list(sequence.camera_ids)
+    chosen = [c for c in known if c not in eval_cameras] if not cameras else list(cameras)
+    for option, ids in (("--cameras", chosen), ("--eval-cameras", list(eval_cameras))):
+        unknown = [c for c in ids if c not in known]
+        if unknown:
+            raise ValueError(f"{option}: {sequence.name} has no camera {unknown[0]}; it has {known}.")
+        twice = [c for c in ids if ids.count(c) > 1]
+        if twice:
+            raise ValueError(f"{option}: camera {twice[0]} is named twice.")
+    both = [c for c in chosen if c in eval_cameras]
+    if both:
+        raise ValueError(f"--eval-cameras: camera {both[0]} stands in --cameras too; a judge must not.")
+    if not chosen:
+        raise ValueError(f"--cameras: none is left; {sequence.name} has {known}.")
+    total = sequence.num_frames
+    chosen_frames = parse_frames(frames)
+    if not range(total)[chosen_frames]:
+        raise ValueError(f"--frames: {frames} holds no frame of {sequence.name}, which has 0 to {total - 1}.")
+    if (chosen_frames.stop or 0) > total:
+        message = f"--frames: {frames} goes beyond the last frame of {sequence.name}, {total - 1}"
+        warnings.warn(message, DataWarning, stacklevel=2)
+    sequence = _scaled(sequence.select(frames=chosen_frames), scale)
+    simulated = dataset.startswith(SIMULATED_PREFIX)
+    if simulated:
+        sequence = remembered(sequence)
+    return Recording(
+        tracked=sequence.select(cameras=chosen),
+        judged=sequence.select(cameras=[*chosen, *eval_cameras]),
+        frames_in_data=total,
+        simulated=simulated,
+    )
+
+
+def _scaled(sequence: Sequence, scale: float) -> Sequence:
+    smaller = sequence.scaled(scale)
+    sizes = (sequence.width, sequence.height), (smaller.width, smaller.height)
+    expect_enough_left(scale, "pictures", *sizes)
+    return smaller
+
+
+def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:
+    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height.
+
+    Args:
+        scale: what was given.
+        what: is made smaller, in words.
+        before, after: its (width, height).
+    """
+    if scale < 1 and min(after) < _LEAST_SIDE:
+        raise ValueError(
+            f"--scale {scale:g}: {what} of {before[0]}x{before[1]} would be {after[0]}x{after[1]}; expected "
+            f"{_LEAST_SIDE} pixels or more a side"
+        )
+
+
+def parse_frames(text: str) -> slice:
+    """Frames as Python slices them: "0:60", "0:60:2", ":30", ":".
+
+    Raises:
+        ValueError: it is none of these, or does not go forward.
+    """
+    try:
+        parts = [int(part) if part.strip() else None for part in text.split(":")]
+    except ValueError:
+        parts = []
+    if not 2 <= len(parts) <= 3:
+        found = f"found {text!r}; :4 is the first four, 4:5 the fifth alone"
+        raise ValueError(f"--frames: expected START:STOP or START:STOP:STEP, as in 0:60, {found}.")
+    if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
+        raise ValueError(f"--frames: frames go forwards; found the step {parts[2]}.")
+    return slice(*parts)
+
+
+def remembered(sequence: Sequence) -> Sequence:
+    """The same sequence with what was loaded kept in memory: a simulated picture is slow to draw twice."""
+
+    def kept(loader: Callable | None) -> Callable | None:
+        if loader is None:
+            return None
+        seen: dict[tuple[int, int], Any] = {}
+
+        def load(t: int, c: int) -> Any:
+            if (t, c) not in seen:
+                seen[t, c] = loader(t, c)
+            return seen[t, c]
+
+        return load
+
+    return replace(sequence, load_image=kept(sequence.load_image), load_depth=kept(sequence.load_depth))
+
+
+def draw_ahead(recording: Recording, console: Console) -> None:
+    """Draw the tracked pictures of a simulated recording, so that updates need not share the processor."""
+    if not recording.simulated:
+        return
+    sequence = recording.tracked
+    views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
+    with ThreadPoolExecutor(2) as executor:
+        jobs = [executor.submit(sequence.image, *view) for view in views]
+        try:
+            for job in track(jobs, "drawing the simulated scene", console=console, transient=True):
+                job.result()
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
+
+
+class FirstMask(NamedTuple):
+    """Labels of one camera's first image, which is all that a tracker is told about objects.
+
+    Attributes:
+        labels: [H, W]; 0 is background. None where objects come as shapes.
+        camera: id of the camera, or None.
+        source: one of "files", "segment" and "shapes".
+    """
+
+    labels: Int[np.ndarray, "height width"] | None
+    camera: int | None
+    source: str
+
+
+def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
+    """The mask of the first frame: a file's, or made by the weight-free segmenter.
+
+    Args:
+        tracked: what is tracked.
+        camera: id of the mask's camera; None takes the first that has masks.
+        source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter.
+
+    Raises:
+        ValueError: the camera is not tracked, or has no mask.
+    """
+    if camera is not None and camera not in tracked.camera_ids:
+        raise ValueError(
+            f"--mask-camera: camera {camera} is not tracked; the tracked ones are {list(tracked.camera_ids)}."
+        )
+    if source in ("auto", "files") and tracked.has_masks:
+        for c, name in enumerate(tracked.camera_ids):
+            labels = tracked.mask(0, c) if camera in (None, name) else None
+            if labels is not None:
+                _check_not_empty(labels, tracked, c)
+                return FirstMask(labels, name, "files")
+        if camera is not None and source == "auto":
+            raise ValueError(
+                f"--mask-camera: camera {camera} has no masks. Name another, or --masks segment."
+            )
+    if source == "files":
+        other = "auto, which takes the shapes of this recording" if tracked.models else "segment"
+        raise ValueError(f"--masks files: {tracked.name} has none for these cameras; use --masks {other}.")
+    if source == "auto" and not tracked.has_depth and tracked.models:
+        return FirstMask(None, None, "shapes")
+    from gsjax.perception.segmenters import PlaneOrRegionSegmenter
+
+    name = tracked.camera_ids[0] if camera is None else camera
+    c = tracked.camera_ids.index(name)
+    labels = PlaneOrRegionSegmenter()(tracked.image(0, c), tracked.depth(0, c), tracked.Ks[0, c])
+    return FirstMask(labels.astype(np.int32), name, "segment")
+
+
+def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
+    """Raises DataError where a first mask names nothing, and says whose mask does."""
+    if labels.any():
+        return
+    masks = {name: tracked.mask(0, i) for i, name in enumerate(tracked.camera_ids)}
+    better = [name for name, mask in masks.items() if mask is not None and mask.any()]
+    advice = f"Use --mask-camera {better[0]}" if better else "Choose other --frames"
+    what = tracked.where("mask", 0, c)
+    raise DataError(what, "at least one object", "background only", f"{advice}, or --masks segment.")
+
+
+def label_names(recording: Recording, source: str) -> dict[int, str]:
+    """The name of each mask value that has one. The segmenter's own values have none."""
+    names = {0: "background"}
+    if source == "segment":
+        return names
+    names |= {model.label: model.name for model in recording.tracked.models if model.label}
+    truth = recording.tracked.truth
+    if truth is not None:
+        names |= {int(label): name for label, name in zip(truth.label_ids, truth.names, strict=True)}
+        names |= {} if truth.robot is None else {truth.robot: "robot"}
+    return names
+
+
+def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
+    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian.
+
+    Args:
+        recording: with its truth, where it has one.
+        mask: the first mask.
+        scene_ids: labels that the scene has.
+        notes: told of each.
+    """
+    if mask.labels is None:
+        return
+    names, there = label_names(recording, mask.source), set(np.unique(mask.labels).tolist())
+    if mask.source == "files":
+        for value in sorted(set(names) - there - {0}):
+            notes.warn(
+                f"{names[value]} (label {value}) has no pixel in the first mask of camera {mask.camera}: "
+                "it is not tracked; another --mask-camera may see it"
+            )
+    for value in sorted(there - set(scene_ids) - {0}):
+        pixels = int((mask.labels == value).sum())
+        notes.warn(
+            f"label {value} has {pixels} pixels in the first mask but none with depth: it is not tracked"
+        )
+
+
+Loaded = TypeVar("Loaded")
+
+
+class Prefetched(Generic[Loaded]):
+    """Iterate over `load(0), load(1), ...`, each by a thread, up to `ahead` while one is in use.
+
+    Attributes:
+        waited: seconds that the iteration had to wait for a load so far.
+    """
+
+    def __init__(self, load: Callable[[int], Loaded], indices: Indices[int], ahead: int = 2):
+        self._load, self._indices, self._ahead = load, indices, ahead
+        self.waited = 0.0
+
+    def __iter__(self):
+        executor = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+        pending: list[Future] = []
+        try:
+            rest = iter(self._indices)
+            for index in rest:
+                pending.append(executor.submit(self._load, index))
+                if len(pending) > self._ahead:
+                    yield self._take(pending)
+            while pending:
+                yield self._take(pending)
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
+
+    def _take(self, pending: list[Future]) -> Loaded:
+        begun = perf_counter()
+        try:
+            return pending.pop(0).result()
+        finally:
+            self.waited += perf_counter() - begun

@@ -1,0 +1,132 @@
+"""Scores of views, added up one by one so that memory stays flat, and the metrics that come of them."""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsjax.engine.tables import Column
+from gsjax.engine.views import View
+from gsjax.metrics.image import depth_error, psnr, ssim
+from gsjax.metrics.segmentation import LabelOverlap
+from gsjax.metrics.tracking import ObjectScore
+
+SMALLEST_FOR_SSIM = 11
+CAMERA_SCORES = (
+    *("psnr", "ssim", "coverage", "psnr_covered", "depth_error_mm", "depth_within_1cm"),
+    *("psnr_robot", "ssim_robot", "depth_error_robot_mm"),
+)
+CAMERA_COLUMNS = (
+    Column("camera", "name"),
+    Column("", "kind"),
+    Column("PSNR", "psnr", "dB", 2),
+    Column("SSIM", "ssim", "", 3),
+    Column("depth error", "depth_error_mm", "mm", 1),
+    Column("drawn", "coverage", "%", 1),
+    Column("PSNR drawn", "psnr_covered", "dB", 2),
+    Column("PSNR robot", "psnr_robot", "dB", 2),
+)
+
+
+def mean_scores(rows: list[dict[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
+    """Of each score, over the views that have a finite one; None where none has."""
+    known = {
+        name: [row[name] for row in rows if row.get(name) is not None and np.isfinite(row[name])]
+        for name in names
+    }
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+
+
+@dataclass
+class CameraScores:
+    """Scores of one camera, one entry a frame; NaN where there was nothing to compare."""
+
+    held_out: bool
+    values: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+    def mean(self, name: str) -> float | None:
+        """The mean over frames of those that are finite; None without any."""
+        values = np.asarray(self.values.get(name, []), np.float64)
+        values = values[np.isfinite(values)]
+        return float(values.mean()) if len(values) else None
+
+
+class Scores:
+    """Pictures, depth and labels against what the cameras saw.
+
+    Args:
+        values: the mask value that each group of the scene stands for, [K+1]; None scores no labels.
+        robot: the robot's mask value, or None.
+    """
+
+    def __init__(self, values: np.ndarray | None, robot: int | None):
+        self._values, self._robot = values, robot
+        self.cameras: dict[int, CameraScores] = {}
+        self.overlaps = {False: LabelOverlap(), True: LabelOverlap()}
+        self.num_frames = 0
+
+    def add(self, view: View) -> None:
+        """Score one view."""
+        self.num_frames = max(self.num_frames, view.t + 1)
+        camera = self.cameras.setdefault(view.camera, CameraScores(view.held_out))
+        scored = {"psnr": psnr(view.render, view.image), "coverage": float(view.covered.mean())}
+        scored["psnr_covered"] = psnr(view.render, view.image, view.covered)
+        if min(view.image.shape[:2]) >= SMALLEST_FOR_SSIM:
+            scored["ssim"] = ssim(view.render, view.image)
+        if view.depth is not None:
+            error = depth_error(view.render_depth, view.depth)
+            scored |= {"depth_error_mm": error.mean_abs_mm, "depth_within_1cm": error.within_1cm}
+        if view.mask is not None and self._robot is not None:
+            inside = view.mask == self._robot
+            scored["psnr_robot"] = psnr(view.render, view.image, inside)
+            if "ssim" in scored:
+                scored["ssim_robot"] = ssim(view.render, view.image, inside)
+            if view.depth is not None:
+                error = depth_error(view.render_depth, view.depth, inside)
+                scored["depth_error_robot_mm"] = error.mean_abs_mm
+        for name, value in scored.items():
+            camera.values[name].append(value)
+        if view.mask is not None and self._values is not None:
+            self.overlaps[view.held_out].add(self._values[view.groups], view.mask)
+
+
+def camera_metrics(scores: Scores) -> dict[str, Any]:
+    """Each score's mean over frames, by camera, and over the cameras of each kind."""
+    cameras = {
+        str(camera): {"tracked": not found.held_out} | {name: found.mean(name) for name in CAMERA_SCORES}
+        for camera, found in scores.cameras.items()
+    }
+    kinds = {kind: _mean_of(cameras, tracked=kind == "tracked") for kind in ("tracked", "held_out")}
+    return {"cameras": cameras, **kinds}
+
+
+def _mean_of(cameras: dict[str, dict], tracked: bool) -> dict[str, float | None]:
+    """Each score's mean over the cameras of one kind."""
+    chosen = [found for found in cameras.values() if found["tracked"] == tracked]
+    means = {}
+    for name in CAMERA_SCORES:
+        there = [found[name] for found in chosen if found[name] is not None]
+        means[name] = float(np.mean(there)) if there else None
+    return means
+
+
+def camera_rows(found: dict[str, Any], seen: str = "tracked") -> list[dict[str, Any]]:
+    """One row a camera, by the keys of `CAMERA_COLUMNS`; one that is not held out is called `seen`."""
+    return [
+        {
+            **scored,
+            "name": camera,
+            "kind": seen if scored["tracked"] else "held out",
+            "coverage": None if scored["coverage"] is None else 100 * scored["coverage"],
+        }
+        for camera, scored in found["cameras"].items()
+    ]
+
+
+def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
+    """The errors of one object for metrics.json; None each where it was not scored."""
+    fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
+    scored = {name: getattr(score, name, None) for name in fields}
+    return scored | {"gaussians_scored": 0 if score is None else score.num_scored}

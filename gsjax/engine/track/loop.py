@@ -1,0 +1,202 @@
+"""The host loop: frames in, poses out, and everything timed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsjax.data import Sequence
+from gsjax.engine.machine import usable_cores
+from gsjax.engine.messages import COMPILING, MEASURING
+from gsjax.engine.recording import Prefetched
+from gsjax.methods.track import (
+    EMPTY,
+    Pose,
+    TrackConfig,
+    Tracked,
+    TrackedScene,
+    first_pose,
+    track,
+)
+from gsjax.methods.track.budget import Chosen
+from gsjax.scene.frame import Frame
+
+LOADED_AHEAD = 2
+"""Frames that are read while an update runs, where there is a second core for that."""
+
+_SHOWN_EVERY_S = 0.1
+"""The progress bar is drawn between updates, for a thread of its own would make some of them late."""
+
+
+@dataclass
+class Tracking:
+    """What tracking gave so far: the first frame, and one entry more for each update.
+
+    Attributes:
+        scene: at the first frame.
+        final: after the last frame, with what has joined the objects.
+        joined: how many Gaussians had joined by each frame.
+        poses: of the moving Gaussians in each frame, and after the first of those that join; on the host.
+        update_s: seconds of each update; 0 for the first frame, which is initialisation.
+        compile_s: seconds spent compiling, since it began or was resumed.
+        planning_s: seconds before the first update that went into its plan, and into compiling what plans.
+        loading_s: seconds that the loop waited for images.
+        loop_s: seconds of the whole loop.
+        plans: how many plans there were; more than one means that it had to plan again.
+        visible: [K] of each update, which objects some camera saw.
+        lost: [K] of each update, which objects were not where they were believed to be.
+        turn_known: [K] of each update, which objects' turns since the first frame pictures told.
+        skipped: updates that changed nothing, because a number in them was not finite.
+        everywhere: of each update, how many groups it looked for everywhere.
+        chosen: the settings chosen for a budget, or None.
+        resumed: how many frames an earlier run had tracked; 0 without one.
+        stopped: what ended the loop early, or None.
+    """
+
+    scene: TrackedScene
+    poses: list[Pose]
+    final: TrackedScene | None = None
+    joined: list[int] = field(default_factory=lambda: [0])
+    update_s: list[float] = field(default_factory=lambda: [0.0])
+    compile_s: float = 0.0
+    planning_s: float = 0.0
+    loading_s: float = 0.0
+    loop_s: float = 0.0
+    plans: int = 0
+    visible: list[np.ndarray] = field(default_factory=list)
+    lost: list[np.ndarray] = field(default_factory=list)
+    turn_known: list[np.ndarray] = field(default_factory=list)
+    skipped: int = 0
+    everywhere: list[int] = field(default_factory=list)
+    chosen: Chosen | None = None
+    resumed: int = 0
+    stopped: BaseException | None = None
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that have a pose."""
+        return len(self.poses)
+
+    @property
+    def hz(self) -> float | None:
+        """Updates a second, loading and compiling apart; None before the first."""
+        total = sum(self.update_s)
+        return (self.num_frames - 1) / total if total else None
+
+    def means(self) -> Float[np.ndarray, "T N 3"]:
+        """The centres of all Gaussians over time, metres."""
+        still = np.asarray(self.scene.gaussians.means)[self.scene.num_moving :]
+        count = self.scene.num_moving
+        return np.stack([np.concatenate([pose.means[:count], still]) for pose in self.poses])
+
+    def quats(self) -> Float[np.ndarray, "T M 4"]:
+        """The orientations of the moving Gaussians, which stand first, over time."""
+        return np.stack([pose.quats[: self.scene.num_moving] for pose in self.poses])
+
+    def at(self, t: int) -> tuple[TrackedScene, Pose]:
+        """The scene and its pose in frame t, in the same shapes for all t; what joined later is hidden."""
+        if self.final is None:
+            return self.scene, self.poses[t]
+        count, pose = self.scene.num_moving, self.poses[t]
+        slots = self.final.num_moving - len(pose.means)  # the first frame has none
+        if slots:
+            pose = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], slots, axis=0)]), pose)
+        labels = np.asarray(self.final.labels).copy()
+        later = slice(count + self.joined[t], self.final.num_moving)
+        labels[later] = self.final.num_objects + 1
+        logits = np.asarray(self.final.gaussians.logit_opacities).copy()
+        logits[later] = EMPTY
+        scene = eqx.tree_at(lambda s: (s.labels, s.gaussians.logit_opacities), self.final, (labels, logits))
+        return scene, pose
+
+
+def begin(scene: TrackedScene) -> Tracking:
+    """Tracking that has come to the first frame."""
+    return Tracking(scene, [jax.device_get(first_pose(scene))])
+
+
+def follow(
+    tracking: Tracking,
+    first: Frame,
+    tracked: Sequence,
+    config: TrackConfig,
+    console: Console,
+    *,
+    budget_ms: float | None = None,
+    after: Tracked | None = None,
+    saved: Callable[..., None] = lambda tracking, update, *, last: None,
+) -> Tracking:
+    """Track all frames that are left. Ctrl-C or an error ends the loop; what was tracked until then stays.
+
+    Args:
+        tracking: what there is so far; it is added to, and returned.
+        first: what the tracked cameras saw at first.
+        tracked: the tracked cameras; only images and depth are loaded.
+        config: the tracker's.
+        console: for the progress bar.
+        budget_ms: what an update may take, or None.
+        after: the last update, where tracking goes on from an earlier run.
+        saved: called after each update, and once more, with `last` on, where the loop is stopped early.
+    """
+    shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
+    ahead = 0 if shared else LOADED_AHEAD
+    frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), ahead)
+    update = after
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    begun, plans, drawn = perf_counter(), set(), 0.0
+    if not console.is_terminal and tracking.num_frames < tracked.num_frames:  # the bar is drawn at the end
+        console.print(COMPILING if budget_ms is None else MEASURING, soft_wrap=True)
+    with Progress(*columns, console=console, expand=True, auto_refresh=False) as progress:
+        task = progress.add_task(
+            "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"
+        )
+        try:
+            for update in track(tracking.scene, first, frames, config, budget_ms=budget_ms, after=after):
+                tracking.poses.append(jax.device_get(update.pose))
+                tracking.final = update.scene
+                tracking.joined.append(int(update.info["joined"]))
+                tracking.update_s.append(update.seconds)
+                tracking.compile_s += update.compile_seconds
+                tracking.everywhere.append(update.everywhere)
+                tracking.chosen = update.chosen
+                if not plans:
+                    known = update.seconds + update.compile_seconds + frames.waited
+                    tracking.planning_s = max(0.0, perf_counter() - begun - known)
+                tracking.visible.append(np.asarray(update.info["visible"]))
+                tracking.lost.append(np.asarray(update.info["lost"]))
+                tracking.turn_known.append(np.asarray(update.info["turn_known"]))
+                tracking.skipped += int(update.info["skipped"])
+                plans.add(update.plan)
+                saved(tracking, update, last=False)
+                progress.update(task, advance=1, rate=_rate(tracking))
+                if perf_counter() - drawn > _SHOWN_EVERY_S:
+                    progress.refresh()
+                    drawn = perf_counter()
+            if update is not None and update.info:
+                saved(tracking, update, last=True)
+        except (KeyboardInterrupt, Exception) as stopped:
+            tracking.stopped = stopped
+            progress.update(task, rate="stopped")
+            if update is not None and update.info:
+                saved(tracking, update, last=True)
+    tracking.loop_s = perf_counter() - begun
+    tracking.loading_s, tracking.plans = frames.waited, len(plans)
+    return tracking
+
+
+def _rate(tracking: Tracking) -> str:
+    """The rate of the last ten updates."""
+    recent = tracking.update_s[1:][-10:]
+    return f"{len(recent) / sum(recent):.2f} Hz"

@@ -1,0 +1,209 @@
+"""`gsjax query` on a run of `gsjax track`: which object a text means, and where it is in every frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Bool, Int
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from gsjax.engine.folder import OF_QUERY, replaced_folder
+from gsjax.engine.messages import Notes
+from gsjax.engine.options import ClipWeights, Common, ObjectText
+from gsjax.engine.pictures import frame_rate
+from gsjax.engine.track.saved import SavedRun, open_run
+from gsjax.engine.track.views import views
+from gsjax.engine.views import View
+from gsjax.io.atomic import write_json, write_npz
+from gsjax.io.pictures import write_png
+from gsjax.io.video import VideoWriter
+from gsjax.methods.protocols import LanguageEncoder
+from gsjax.methods.track import find_object
+from gsjax.perception.closed_vocabulary import ClosedVocabulary
+from gsjax.viz.colors import highlight, label_color, to_uint8
+
+_CLOSE = 0.02  # a smaller margin is called a close call
+_VIDEO_HEIGHT = 480  # smaller pictures are enlarged
+
+
+@dataclass(frozen=True)
+class ObjectQuery(Common, ClipWeights, ObjectText):
+    """What is asked of a run, and how it is understood."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of a run of `gsjax track`."""
+    text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")]
+    """Which object: "red can"."""
+    camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
+    """Id of the camera to show it from. The first held out one, else the first tracked, unless given."""
+
+
+class Answer(NamedTuple):
+    """The object that a text means.
+
+    Attributes:
+        group: its label in the run's files, 1 to K.
+        name: what it is called.
+        scores: cosine of each object, by name.
+        margin: how far it lies above the next.
+        min_score: the score that was asked for.
+        rows: its Gaussians, as rows of scene.ply.
+    """
+
+    group: int
+    name: str
+    scores: dict[str, float]
+    margin: float
+    min_score: float
+    rows: Int[np.ndarray, "n"]
+
+
+def ask_for_object(options: ObjectQuery, console: Console) -> None:
+    """Answer, and write query/ into the run folder.
+
+    Raises:
+        ValueError, OSError: there is no such run or encoder, or the text means none of the objects.
+    """
+    with Notes(console) as notes:
+        saved, answer = ask(options, console, notes)
+        recording = saved.seen_by(options.camera)
+        camera = recording.tracked.camera_ids[0]
+        folder = saved.path / "query"
+        with replaced_folder(folder, OF_QUERY) as new:
+            write_npz(
+                new / "selection.npz",
+                {
+                    "indices": answer.rows,
+                    "scores": np.array(list(answer.scores.values()), np.float32),
+                    "names": np.array(list(answer.scores)),
+                    "means": saved.tracking.means()[:, answer.rows],
+                    "times": recording.tracked.times[: saved.tracking.num_frames],
+                },
+            )
+            pixels = []
+            with VideoWriter(new / "video.mp4", frame_rate(recording.tracked.times)) as video:
+                for view in progress(views(saved.tracking, recording), saved, console):
+                    mask = view.groups == answer.group
+                    pixels.append(int(mask.sum()))
+                    frame_id = recording.tracked.frame_ids[view.t]
+                    write_png(new / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
+                    video.write(show(view, mask, answer.group))
+            told = {"text": options.text, "encoder": options.encoder, "camera": camera}
+            told |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
+            told |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
+            told |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
+            write_json(new / "query.json", told)
+    hidden = sum(count == 0 for count in pixels)
+    unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
+    score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"
+    print(f"{answer.name}: {len(answer.rows)} Gaussians ({score}){unseen}")
+    print(f"query   {folder}")
+
+
+def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun, Answer]:
+    """Open the run and find the object; prints the scores of all.
+
+    Args:
+        options: the run and the text.
+        console: for the scores.
+        notes: told of what is odd.
+
+    Raises:
+        ValueError, OSError: as `ask_for_object`.
+    """
+    _check_encoder(options)
+    saved = open_run(options.run)
+    saved.seen_by(options.camera)  # one that is not there need not wait for the rest either
+    encoder = _encoder(options, saved)
+    wanted = encoder.embed_text(options.text)  # first: a word that nobody knows need not wait for the rest
+    with console.status("looking at the first frame"):
+        view = next(views(saved.tracking, saved.seen_by(saved.mask_camera)))[0]
+        objects = encoder.embed_objects(to_uint8(view.image), view.groups, len(saved.names))
+    min_score = encoder.min_score if options.min_score is None else options.min_score
+    match = find_object(jnp.asarray(wanted, float), jnp.asarray(objects, float), float(min_score))
+    scores = dict(zip(saved.names.values(), np.asarray(match.scores).tolist(), strict=True))
+    group, margin = int(match.best) + 1, float(match.margin)
+    if not match.found:
+        listed = ", ".join(f"{name} {score:.2f}" for name, score in _ranked(scores))
+        raise ValueError(
+            f"{options.text!r} means none of the objects of {saved.path}: its best cosine is "
+            f"{max(scores.values()):.2f}, and {min_score:.2f} is asked for. There are: {listed}"
+        )
+    if margin < _CLOSE:
+        second = _ranked(scores)[1][0]
+        notes.warn(f"{second} fits {options.text!r} about as well; say more to tell them apart")
+    _print_scores(scores, saved.names[group])
+    rows = np.flatnonzero(np.asarray(saved.tracking.scene.labels) == group)
+    return saved, Answer(group, saved.names[group], scores, margin, float(min_score), rows)
+
+
+def show(view: View, mask: Bool[np.ndarray, "h w"], group: int) -> np.ndarray:
+    """What the camera saw, with the object in its colours and the rest dimmed; small pictures enlarged.
+
+    Args:
+        view: of one camera.
+        mask: where the object is.
+        group: that of the object, for its colour.
+    """
+    size = enlarged(mask.shape[1], mask.shape[0])
+    image = cv2.resize(to_uint8(view.image), size, interpolation=cv2.INTER_CUBIC)
+    # Smooth outlines: a mask's share of each pixel is interpolated, not the mask.
+    soft = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
+    return highlight(image, soft > 0.5, label_color(group))
+
+
+def enlarged(width: int, height: int) -> tuple[int, int]:
+    """The size of a video of pictures of this size."""
+    factor = max(1, -(-_VIDEO_HEIGHT // height))
+    return width * factor, height * factor
+
+
+def progress(frames: Iterator[list[View]], saved: SavedRun, console: Console) -> Iterator[View]:
+    """The one view of each frame, with a progress bar.
+
+    Args:
+        frames: the views of each frame, one camera.
+        saved: the run.
+        console: for the bar.
+    """
+    count = saved.tracking.num_frames
+    for frame in track(frames, "rendering", total=count, console=console, transient=True):
+        yield frame[0]
+
+
+def _check_encoder(options: ObjectQuery) -> None:
+    if options.encoder == "clip" and options.weights is None:
+        raise ValueError(
+            "--encoder clip: expected --weights PATH as well, a folder of CLIP's weights, found none"
+        )
+    if options.encoder == "closed" and options.weights is not None:
+        raise ValueError("--weights: the closed vocabulary has none; they are for --encoder clip")
+
+
+def _encoder(options: ObjectQuery, saved: SavedRun) -> LanguageEncoder:
+    if options.encoder == "closed":
+        return ClosedVocabulary(saved.names)
+    from gsjax.perception.clip import load_clip
+
+    assert options.weights is not None
+    return load_clip(options.weights)
+
+
+def _ranked(scores: dict[str, float]) -> list[tuple[str, float]]:
+    return sorted(scores.items(), key=lambda item: -item[1])
+
+
+def _print_scores(scores: dict[str, float], best: str) -> None:
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    table.add_column("object")
+    table.add_column("cosine", justify="right")
+    for name, score in _ranked(scores):
+        table.add_row(name, f"{score:.3f}", style="bold green" if name == best else None)
+    Console(highlight=False).print(table)

@@ -1,0 +1,107 @@
+"""A run folder read back: the scene, where it went, and the recording that it came from."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from gsjax.engine.files import chosen_camera, read_arrays, read_scene, reopen
+from gsjax.engine.folder import expect_run
+from gsjax.engine.recording import Recording
+from gsjax.engine.track.loop import Tracking
+from gsjax.methods.track import Pose, TrackedScene
+
+_AGAIN = "track again with this version of gsjax, or name another folder"
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """What `gsjax track` left.
+
+    Attributes:
+        path: the folder.
+        tracking: the scene and its poses; parts of one object are one group here.
+        recording: the same frames and cameras as then.
+        mask_camera: id of the camera whose first mask named the objects; the first tracked one if none did.
+        names: of each object, by its group, 1 to K.
+    """
+
+    path: Path
+    tracking: Tracking
+    recording: Recording
+    mask_camera: int
+    names: dict[int, str]
+
+    def seen_by(self, camera: int | None) -> Recording:
+        """The recording with one camera only; the first held out one, else the first tracked, unless given.
+
+        Raises:
+            ValueError: the run had no such camera.
+        """
+        camera = chosen_camera(self.recording, camera, self.path)
+        one = self.recording.judged.select(cameras=[camera])
+        return Recording(one, one, self.recording.frames_in_data, self.recording.simulated)
+
+
+def open_run(path: Path) -> SavedRun:
+    """Read the folder of a run.
+
+    Raises:
+        FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
+        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+    """
+    expect_run(path, made_by="`gsjax track`")
+    missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
+    if missing:
+        raise FileNotFoundError(f"{path}: expected a whole run, found no {missing[0]}; {_AGAIN}")
+    tracking = read_tracking(path)
+    recording, _ = reopen(path / "config.yml", _AGAIN)
+    if recording.tracked.num_frames < tracking.num_frames:
+        found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
+        raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")
+    camera, names = _read_metrics(path / "metrics.json", tracking.scene)
+    if camera is None:
+        camera = recording.tracked.camera_ids[0]
+    return SavedRun(path, tracking, recording, camera, names)
+
+
+def read_tracking(path: Path) -> Tracking:
+    """The scene of scene.ply with the poses of trajectory.npz.
+
+    Raises:
+        ValueError: they do not fit each other, or one of them is something else.
+    """
+    wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
+    arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
+    means, quats, labels = arrays["means"], arrays["quats"], arrays["labels"]
+    count, moving = means.shape[1], quats.shape[1]
+    gaussians = read_scene(path, count, "trajectory.npz", _AGAIN)
+    if len(labels) != count:
+        raise ValueError(f"{path}: expected {count} labels in trajectory.npz, found {len(labels)}; {_AGAIN}")
+    scene = TrackedScene(
+        gaussians=gaussians,
+        normals=jnp.asarray(arrays["normals"]),
+        labels=jnp.asarray(labels, jnp.int32),
+        label_ids=tuple(arrays["label_ids"].tolist()),
+        num_moving=moving,
+    )
+    poses = jax.device_get(
+        [Pose(jnp.asarray(m[:moving]), jnp.asarray(q)) for m, q in zip(means, quats, strict=True)]
+    )
+    return Tracking(scene, poses, lost=[*arrays["lost"][1:]], turn_known=[*arrays["turn_known"][1:]])
+
+
+def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:
+    """The camera whose mask named the objects, and the names that the recording has for its labels; those
+    of the segmenter have none."""
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+        camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]
+        known = {found["label"]: name for name, found in metrics["objects"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: expected a run's scores, found something else; {_AGAIN}") from error
+    if source == "segment":
+        known = {}
+    return camera, {k: known.get(scene.label_ids[k], f"object {k}") for k in range(1, scene.num_objects + 1)}

@@ -1,0 +1,206 @@
+"""What `gsjax view` opens: a run of any kind, or a PLY file."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from gsjax.data.photographs import Photographs
+from gsjax.engine.deform.file import NAME as DEFORMATION
+from gsjax.engine.deform.viewer import viewable_deformation
+from gsjax.engine.distill.file import NAME
+from gsjax.engine.distill.saved import AS_IT_WAS, FieldRun, Whereabouts, field_of, open_field_run
+from gsjax.engine.distill.viewer import asking_of
+from gsjax.engine.files import read_drawable
+from gsjax.engine.folder import expect_run
+from gsjax.engine.messages import Notes, describe
+from gsjax.engine.parts.saved import blend_of, open_parts_run, read_parts
+from gsjax.engine.parts.viewer import Filmed, camera_names, editing_of
+from gsjax.engine.photographs import photographs_of_run
+from gsjax.engine.recording import Recording
+from gsjax.engine.track.saved import open_run, read_tracking
+from gsjax.viz.colors import to_uint8
+from gsjax.viz.viewer import Shots, Viewable, moved
+
+
+def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:
+    """What there is to see, and the folder that screenshots belong to.
+
+    Args:
+        path: of a run, a field, or a PLY file.
+        notes: told what is odd.
+        now: where things of a field or a fit are.
+
+    Raises:
+        FileNotFoundError: there is no such file, or the folder is no run with a scene.
+        ValueError: the file holds no Gaussians, or something else than a run writes; or it has no use for
+            something in `now`.
+    """
+    if path.is_file():
+        if path.suffix.lower() != ".ply":
+            raise ValueError(f"{path}: expected a PLY file or the folder of a run, found another file")
+        _expect_only((), now, f"{path} is a PLY file")
+        gaussians, report = read_drawable(path, notes)
+        return Viewable(path.name, gaussians, report.labels), path.absolute().parent
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a run or a PLY file, found nothing there; check the path")
+    if (path / NAME).is_file():
+        return _of_field(path, notes, now), path
+    expect_run(path)
+    if (path / DEFORMATION).is_file():
+        _expect_only(("weights",), now, f"{path} is a run that deforms")
+        return viewable_deformation(path, notes, now.weights), path
+    if not (path / "scene.ply").is_file():
+        raise FileNotFoundError(
+            f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
+            "keeps no scene; let it finish (--resume goes on)"
+        )
+    for file, of_run in (("parts.npz", _of_parts), ("trajectory.npz", _of_track)):
+        if (path / file).is_file():
+            _expect_only((), now, f"{path} is a run that moves")
+            if (field := field_of(path)) is not None:
+                notes.warn(
+                    f"its field is not asked while it moves; gsjax view {field} shows what its field is of"
+                )
+            return of_run(path, notes), path
+    return _of_fit(path, notes, now), path
+
+
+def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
+    """Raises a ValueError where something is said to be elsewhere that is not looked for."""
+    unused = [f.name for f in fields(now) if f.name not in used and getattr(now, f.name) is not None]
+    if unused:
+        raise ValueError(f"--{unused[0]}: {because}, which has no use for it; leave it out")
+
+
+def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+    """The scene of a field, with the photographs that taught it where they still are."""
+    run = open_field_run(path, notes, now)
+    folder = path.absolute()
+    return Viewable(
+        f"{folder.parent.name}, {folder.name}",
+        run.gaussians,
+        run.labels,
+        shots=None if run.photographs is None else _shots_of(run.photographs),
+        antialiased=run.rasterize_mode == "antialiased",
+        unit=run.unit,
+        asking=asking_of(run),
+    )
+
+
+def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None:
+    """The field of a fit's scene, where it has one that can be asked."""
+    folder = field_of(path)
+    if folder is None:
+        _expect_only(("images",), now, f"{path} has no field")
+        return None
+    _expect_only(("images", "weights"), now, f"{path} is a run with its scene")
+    try:
+        run = open_field_run(folder, notes, now, photographs=False)
+    except (ValueError, OSError) as error:
+        notes.warn(f"its field cannot be asked: {describe(error)}")
+        return None
+    if not run.file.samefile(path / "scene.ply"):
+        notes.warn(f"its field is of another scene, {run.file}; gsjax view {folder} shows that")
+        return None
+    return run
+
+
+def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
+    """The scene of a run of `gsjax fit`, with its photographs where they still are, and its field."""
+    field, config = _field_of_fit(path, notes, now), path / "config.yml"
+    if field is None:
+        gaussians, report = read_drawable(path / "scene.ply", notes)
+        labels = report.labels
+    else:
+        gaussians, labels = field.gaussians, field.labels
+    try:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        antialiased = bool(settings["fit"]["antialiased"])
+        behind = settings["fit"]["background"]
+        shots, photographs = None, None
+        try:
+            photographs = photographs_of_run(settings, now.images)
+            shots = _shots_of(photographs)
+        except (ValueError, OSError) as error:
+            notes.warn(f"its photographs are not shown: {describe(error)} (--images says where they are now)")
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
+    background = photographs.background if photographs is not None and behind == "data" else None
+    if background is None:
+        background = (1.0, 1.0, 1.0) if behind == "white" else (0.0, 0.0, 0.0)
+    return Viewable(
+        path.absolute().name,
+        gaussians,
+        labels,
+        shots=shots,
+        background=background,
+        antialiased=antialiased,
+        asking=None if field is None else asking_of(field),
+    )
+
+
+def _of_track(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax track` over time, with its cameras where its recording still is."""
+    names: dict[int, str] = {}
+    shots, times = None, None
+    try:
+        saved = open_run(path)
+    except ValueError as error:
+        tracking = read_tracking(path)  # what is damaged there is an error
+        notes.warn(f"its recording is not shown: {error}")
+    else:
+        tracking, names = saved.tracking, saved.names
+        recording = saved.recording.judged
+        shots, times = _shots_of_recording(saved.recording), recording.times[: tracking.num_frames]
+    count = tracking.scene.num_moving
+    return Viewable(
+        path.absolute().name,
+        tracking.scene.gaussians,
+        np.asarray(tracking.scene.labels),
+        names,
+        motion=moved(tracking.scene.gaussians, tracking.means()[:, :count], tracking.quats()),
+        times=times,
+        shots=shots,
+        unit="m",
+    )
+
+
+def _of_parts(path: Path, notes: Notes) -> Viewable:
+    """The scene of a run of `gsjax parts` over time, with its cameras where its recording still is."""
+    layer, names = read_parts(path)
+    saved, shots = None, None
+    try:
+        saved = open_parts_run(path)
+    except ValueError as error:
+        notes.warn(f"its recording is not shown, and nothing can be edited: {error}")
+    else:
+        if saved.complete:
+            shots = _shots_of_recording(saved.recording)
+        else:
+            notes.warn("it is a partial run: only the frames that were followed are there, and no cameras")
+    times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
+    filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
+    return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))
+
+
+def _shots_of(photographs: Photographs) -> Shots:
+    return Shots(
+        photographs.names,
+        photographs.viewmats[None],
+        photographs.Ks[None],
+        photographs.sizes,
+        load_image=lambda _, v: photographs.image(v),
+    )
+
+
+def _shots_of_recording(recording: Recording) -> Shots:
+    sequence, names = recording.judged, camera_names(recording)
+    return Shots(
+        tuple(names),
+        sequence.viewmats,
+        sequence.Ks,
+        np.tile([sequence.width, sequence.height], (len(names), 1)),
+        load_image=lambda t, v: to_uint8(np.asarray(sequence.image(t, v))),
+    )
