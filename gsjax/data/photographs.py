@@ -13,6 +13,7 @@ from gsjax.data.resizing import blended, expect_scale, picked
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses, check_shape
 from gsjax.geometry.cameras import NEAR, Camera
+from gsjax.scene.frame import Frame
 
 # Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
 
@@ -107,6 +108,22 @@ class Photographs:
         width, height = (int(size) for size in self.sizes[i])
         viewmat, K = (jnp.asarray(a[i], dtype) for a in (self.viewmats, self.Ks))
         return Camera(viewmat, K, width, height, self.near)
+
+    def frame(self, i: int) -> Frame:
+        """Photograph `i` as a frame of one camera, on the host: RGB in bytes, poses in float64.
+
+        Raises:
+            DataError: as `image`.
+        """
+        width, height = (int(size) for size in self.sizes[i])
+        camera = Camera(self.viewmats[i][None], self.Ks[i][None], width, height, self.near)
+        mask, depth = self.mask(i), self.depth(i)
+        return Frame(
+            self.image(i)[None],
+            None if depth is None else depth[None],
+            camera,
+            None if mask is None else mask[None],
+        )
 
     def image(self, i: int) -> UInt8[np.ndarray, "height width 3"]:
         """RGB.

@@ -2,7 +2,7 @@
 
 Python raises KeyboardInterrupt wherever it happens to be. In a finalizer, or a callback of the garbage
 collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on
-as if nobody had asked. Here Ctrl-C is raised again until it is heard.
+as if nobody had asked. Here Ctrl-C is raised again until it gets through.
 """
 
 import signal
@@ -13,36 +13,37 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, no_type_check
 
-DEAF = frozenset({"called_by_xla", "undisturbed"})
-"""Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions; what is not to be disturbed."""
+UNINTERRUPTIBLE = frozenset({"called_by_xla", "shielded"})
+"""Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and `shielded` calls."""
 RETRY_S = 0.01
 _waiting = threading.Event()  # signals are the process's, and so is whether one waits
 
 
-@no_type_check  # a wrapper that checks types would be disturbed between the call's end and its own
-def undisturbed(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What `call` gives; Ctrl-C waits for its end and for `hear`. It is for steps that give away the buffers
-    they replace: to stop in the middle of one would lose both the old and the new."""
+@no_type_check  # a wrapper that checks types could be interrupted between the call's end and its own
+def shielded(call: Callable[..., Any], *arguments: Any) -> Any:
+    """The result of `call`. Ctrl-C waits until it has returned, and is raised by `raise_if_interrupted` at
+    the latest. It is for steps that give away the buffers they replace: to stop in the middle of one would
+    lose both the old and the new."""
     return call(*arguments)
 
 
-def hear() -> None:
-    """Raises KeyboardInterrupt where Ctrl-C waits: between undisturbed calls is too little time for it."""
+def raise_if_interrupted() -> None:
+    """Raises KeyboardInterrupt if Ctrl-C is pending: shielded calls leave too little time between them."""
     if _waiting.is_set():
         _forget()
         raise KeyboardInterrupt
 
 
 def _forget() -> None:
-    """Nothing waits: who hears Ctrl-C once must not be disturbed by it while tidying up."""
+    """Nothing is pending any more: once raised, Ctrl-C must not strike again during the clean-up."""
     signal.setitimer(signal.ITIMER_REAL, 0)
     _waiting.clear()
 
 
-def is_deaf(frame: FrameType | None) -> bool:
+def is_uninterruptible(frame: FrameType | None) -> bool:
     """Whether an exception raised in `frame` would be dropped, or do harm."""
     while frame is not None:
-        if frame.f_code.co_name in DEAF:
+        if frame.f_code.co_name in UNINTERRUPTIBLE:
             return True
         frame = frame.f_back
     return False
@@ -50,7 +51,7 @@ def is_deaf(frame: FrameType | None) -> bool:
 
 @contextmanager
 def heard_interrupts() -> Iterator[None]:
-    """While the block runs, Ctrl-C raises KeyboardInterrupt where it will be heard, if a little later.
+    """While the block runs, Ctrl-C raises KeyboardInterrupt where it gets through, if a little later.
 
     Where SIGINT is ignored or handled by somebody else, or there are no timers, nothing changes.
     """
@@ -61,7 +62,7 @@ def heard_interrupts() -> Iterator[None]:
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        if is_deaf(frame):
+        if is_uninterruptible(frame):
             try_again()
         else:
             _forget()

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsjax.engine.ending import ended
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.interrupts import hear, undisturbed
+from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.engine.messages import Notes
 from gsjax.engine.saving import Saver
 from gsjax.io.atomic import atomic_write
@@ -162,10 +162,10 @@ def learn(
     with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=total, completed=learning.state.step)
         try:
-            while not learning.is_over(minutes) and undisturbed(_made_one_more, steps, learning):
+            while not learning.is_over(minutes) and shielded(_made_one_more, steps, learning):
                 step = learning.state.step
                 if step % _LOGGED_EVERY == 0 or step == total or learning.is_over(minutes):
-                    undisturbed(_add_row, learning, course, folder)
+                    shielded(_add_row, learning, course, folder)
                 if perf_counter() - shown > _SHOWN_EVERY_S and learning.rows:
                     bar.update(task, completed=step, description=course.told(learning.rows[-1]))
                     shown = perf_counter()
@@ -173,7 +173,7 @@ def learn(
                     told = f": {course.told(learning.rows[-1])}" if learning.rows else ""
                     console.print(f"{step:,} of {total:,} steps{told}", soft_wrap=True)
                 save(last=False)
-                hear()
+                raise_if_interrupted()
         except (KeyboardInterrupt, Exception) as stopped:
             if any(
                 leaf.is_deleted() for leaf in jax.tree.leaves(learning.state) if isinstance(leaf, jax.Array)

@@ -28,8 +28,8 @@ class Camera(eqx.Module):
         near: what is nearer is not drawn, metres, static: the rig itself, where cameras see each other.
     """
 
-    viewmat: Float[Array, "*batch 4 4"]
-    K: Float[Array, "*batch 3 3"]
+    viewmat: Float[Array | np.ndarray, "*batch 4 4"]
+    K: Float[Array | np.ndarray, "*batch 3 3"]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     near: float = eqx.field(static=True, default=NEAR)
@@ -73,6 +73,13 @@ def intrinsics(
     """
     cx, cy = center or (width / 2, height / 2)
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+
+
+def on_device(camera: Camera) -> Camera:
+    """The camera in JAX arrays of the default float type."""
+    dtype = jnp.result_type(float)
+    viewmat, K = (jnp.asarray(a, dtype) for a in (camera.viewmat, camera.K))
+    return Camera(viewmat, K, camera.width, camera.height, camera.near)
 
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:

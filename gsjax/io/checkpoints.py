@@ -1,103 +1,199 @@
-"""Checkpoints: the arrays of any pytree in one .npz, with JSON metadata and a checksum; never pickle.
+"""Checkpoints: a pytree of gsjax in one .npz, which says by itself what it holds. Never pickle.
 
-The file holds arrays only, so the structure comes from `like`: a tree of the same kind, of any values.
+The file has the arrays by their path, and a JSON header with the tree around them: containers, numbers, text,
+and by name the types of NamedTuples, dataclasses and equinox modules with all their fields, static ones too.
+So it is read without a template. Only types of gsjax and of the libraries whose states it stores are made
+again, and no code of theirs runs but that of a dataclass that checks its own values.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
 import zipfile
 import zlib
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsjax.io.atomic import write_npz
 
-_FORMAT = 1
+_FORMAT = 2  # 1 needed a template
 _HEADER = "__header__"
-_SCALARS = (bool, int, float, complex)
-
-Tree = TypeVar("Tree")
+_LIBRARIES = ("gsjax", "optax", "equinox", "jaxlie")
+_ANEW = "begin anew, or go on with the version that wrote it"
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is damaged or does not fit the tree wanted; the message names what differs."""
+    """A checkpoint that is damaged or of another version; the message says which, and what to do."""
 
 
 def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write the arrays and numbers of `tree`, and `metadata`, to `path`; atomic.
-
-    Leaves of other kinds (functions, strings) are left out: loading takes them from `like`.
+    """Write `tree` and `metadata` to `path`; atomic.
 
     Args:
-        tree: any pytree. Random keys and low-precision floats are kept exactly.
+        tree: arrays (also random keys and low-precision floats, kept exactly), numbers, text, None, lists,
+            tuples, dicts, and NamedTuples, dataclasses and modules of gsjax, optax, equinox and jaxlie.
         metadata: what JSON can hold.
 
     Raises:
-        TypeError: `metadata` holds something that JSON cannot.
+        TypeError: `tree` holds something else, a function say, or `metadata` what JSON cannot hold.
     """
-    arrays = {name: _to_stored(leaf) for name, leaf in _named_leaves(tree).items()}
+    arrays: dict[str, np.ndarray] = {}
     header = {
         "format": _FORMAT,
-        "dtypes": {name: dtype for name, (_, dtype) in arrays.items()},
+        "version": import_module("gsjax").__version__,
+        "tree": _encoded(tree, "", arrays),
         "metadata": dict(metadata or {}),
-        "sha256": _checksum({name: array for name, (array, _) in arrays.items()}),
+        "sha256": _checksum(arrays),
     }
-    stored = {name: array for name, (array, _) in arrays.items()}
     # Uncompressed: optimizers' floats shrink by a tenth, in sixty times the time.
-    write_npz(path, stored | {_HEADER: np.array(json.dumps(header))}, compress=False)
+    write_npz(path, arrays | {_HEADER: np.array(json.dumps(header))}, compress=False)
 
 
-def load_checkpoint(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
-    """The tree that was saved at `path`, in the structure of `like`, and the metadata.
-
-    Args:
-        like: a tree of the wanted structure, shapes and dtypes (`jax.eval_shape` makes one for nothing).
+def load_checkpoint(path: str | os.PathLike) -> tuple[Any, dict[str, Any]]:
+    """The tree that was saved at `path`, and the metadata.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
-        CheckpointError: the file is damaged, or leaves are missing, left over, or of another shape or dtype.
+        CheckpointError: the file is damaged, or holds types that this version does not have.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
-    stored, header = _read(path)
-    wanted = _named_leaves(like)
-    _check_names(path, wanted, stored)
-    loaded = {name: _from_stored(stored[name], header["dtypes"][name], leaf) for name, leaf in wanted.items()}
-    differing = [
-        f"{name}: stored {_describe(loaded[name])}, wanted {_describe(leaf)}"
-        for name, leaf in wanted.items()
-        if _describe(loaded[name]) != _describe(leaf)
-    ]
-    if differing:
-        raise CheckpointError(f"{path}: the checkpoint does not fit: {'; '.join(differing)}")
-    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
-    merged = [loaded.get(jax.tree_util.keystr(key), leaf) for key, leaf in leaves]
-    return jax.tree.unflatten(structure, merged), header["metadata"]
+    arrays, header = _read(path)
+    try:
+        return _decoded(header["tree"], arrays), header["metadata"]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise CheckpointError(
+            f"{path}: expected what gsjax {import_module('gsjax').__version__} stores, found something else "
+            f"({error}), written by gsjax {header.get('version')}; {_ANEW}"
+        ) from error
 
 
 def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
     """The metadata that was saved at `path`.
 
     Raises:
+        FileNotFoundError: there is no file at `path`.
         CheckpointError: the file is damaged.
     """
     return _read(Path(path))[1]["metadata"]
 
 
+def _encoded(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A node as JSON has it; its arrays go into `arrays`, by their path."""
+    if node is None or isinstance(node, (bool, str)) or type(node) in (int, float):
+        return node
+    if isinstance(node, (np.ndarray, np.generic, jax.Array)):
+        arrays[path], dtype = _to_stored(node)
+        kind = "jax" if isinstance(node, jax.Array) else "numpy"
+        return {"array": path, "dtype": dtype, "kind": kind}
+    if isinstance(node, tuple) and hasattr(node, "_fields"):
+        return _fields_of(node, node._fields, path, arrays)
+    if dataclasses.is_dataclass(node) and not isinstance(node, type):
+        names = [field.name for field in dataclasses.fields(node) if hasattr(node, field.name)]
+        return _fields_of(node, names, path, arrays)
+    if isinstance(node, (list, tuple)):
+        items = [_encoded(item, f"{path}[{i}]", arrays) for i, item in enumerate(node)]
+        return {"list" if isinstance(node, list) else "tuple": items}
+    if isinstance(node, dict):
+        keys = [_encoded(key, f"{path}.key", arrays) for key in node]
+        values = [_encoded(value, f"{path}[{key!r}]", arrays) for key, value in node.items()]
+        return {"dict": [list(pair) for pair in zip(keys, values, strict=True)]}
+    where = path or "the tree"
+    raise TypeError(
+        f"checkpoint: {where}: expected arrays, numbers, text, containers or modules, found {node!r}"
+    )
+
+
+def _fields_of(node: Any, names: Any, path: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    dot = f"{path}." if path else ""
+    fields = {name: _encoded(getattr(node, name), f"{dot}{name}", arrays) for name in names}
+    return {"type": _name_of(type(node)), "fields": fields}
+
+
+def _name_of(kind: type) -> str:
+    """Where a type is found again: "optax:ScaleByAdamState" where the library itself exports it, for the
+    modules within a library move."""
+    library = kind.__module__.split(".")[0]
+    if library not in _LIBRARIES:
+        raise TypeError(
+            f"checkpoint: expected types of {', '.join(_LIBRARIES)}, found {kind.__module__}.{kind.__name__}"
+        )
+    if library != "gsjax" and getattr(import_module(library), kind.__qualname__, None) is kind:
+        return f"{library}:{kind.__qualname__}"
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _type_named(name: str) -> type:
+    """The inverse of `_name_of`.
+
+    Raises:
+        ValueError: it is no type of these libraries, or one that holds no fields.
+    """
+    module, _, qualified = name.partition(":")
+    if module.split(".")[0] not in _LIBRARIES or "__main__" in module:
+        raise ValueError(f"type {name}: not of {', '.join(_LIBRARIES)}")
+    try:
+        kind: Any = import_module(module)
+        for part in qualified.split("."):
+            kind = getattr(kind, part)
+    except (ImportError, AttributeError):
+        raise ValueError(f"type {name}: there is none of this name") from None
+    if not isinstance(kind, type) or not (dataclasses.is_dataclass(kind) or hasattr(kind, "_fields")):
+        raise ValueError(f"type {name}: no NamedTuple, dataclass or module")
+    return kind
+
+
+def _decoded(node: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The inverse of `_encoded`."""
+    if not isinstance(node, dict):
+        return node
+    if "array" in node:
+        return _from_stored(arrays[node["array"]], node["dtype"], node["kind"])
+    if "list" in node:
+        return [_decoded(item, arrays) for item in node["list"]]
+    if "tuple" in node:
+        return tuple(_decoded(item, arrays) for item in node["tuple"])
+    if "dict" in node:
+        return {_decoded(key, arrays): _decoded(value, arrays) for key, value in node["dict"]}
+    kind = _type_named(node["type"])
+    return _made(kind, {name: _decoded(value, arrays) for name, value in node["fields"].items()})
+
+
+def _made(kind: type, fields: dict[str, Any]) -> Any:
+    """A value of a type with these fields.
+
+    Raises:
+        ValueError: the type has other fields by now.
+    """
+    is_tuple = hasattr(kind, "_fields")
+    names = kind._fields if is_tuple else [field.name for field in dataclasses.fields(kind)]
+    others = sorted(set(names) ^ set(fields))
+    if others:
+        raise ValueError(f"type {kind.__name__}: {', '.join(others)} is not a field both then and now")
+    if not issubclass(kind, eqx.Module):
+        return kind(**fields)
+    module = object.__new__(kind)  # as tree_unflatten does: what was sound when it was saved is not checked
+    for name, value in fields.items():
+        object.__setattr__(module, name, value)
+    return module
+
+
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the header of a checkpoint whose checksum is right."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
     try:
         with np.load(path, allow_pickle=False) as archive:
             stored = {name: archive[name] for name in archive.files}
         header = json.loads(str(stored.pop(_HEADER)))
-        intact = header["format"] == _FORMAT and header["sha256"] == _checksum(stored)
+        written, intact = header["format"], header["sha256"] == _checksum(stored)
     except (
         zipfile.BadZipFile,
         zlib.error,
@@ -112,28 +208,16 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             f"{path}: expected a checkpoint, found a file that cannot be read as one ({error}). "
             "It may be cut off or damaged: take another one"
         ) from error
+    if written != _FORMAT:
+        raise CheckpointError(
+            f"{path}: expected a checkpoint of format {_FORMAT}, found format {written}, of another version "
+            f"of gsjax; {_ANEW}"
+        )
     if not intact:
         raise CheckpointError(
-            f"{path}: expected format {_FORMAT} and a matching checksum, found format {header['format']} "
-            "or changed content. Take another checkpoint"
+            f"{path}: expected a matching checksum, found changed content. Take another checkpoint"
         )
     return stored, header
-
-
-def _check_names(path: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    missing, left_over = sorted(wanted.keys() - stored.keys()), sorted(stored.keys() - wanted.keys())
-    if missing or left_over:
-        raise CheckpointError(
-            f"{path}: the checkpoint does not fit: it lacks {missing or 'nothing'} "
-            f"and has {left_over or 'nothing'} beyond what is wanted. Was it saved with other options?"
-        )
-
-
-def _named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of a tree that are arrays, specs of arrays, or numbers, by their path."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    kept = (np.ndarray, np.generic, jax.Array, jax.ShapeDtypeStruct, *_SCALARS)
-    return {jax.tree_util.keystr(key): leaf for key, leaf in leaves if isinstance(leaf, kept)}
 
 
 def _is_key(leaf: Any) -> bool:
@@ -150,23 +234,13 @@ def _to_stored(leaf: Any) -> tuple[np.ndarray, str]:
     return plain, str(array.dtype)
 
 
-def _from_stored(array: np.ndarray, dtype: str, like: Any) -> Any:
-    """The inverse of `_to_stored`, of the kind of `like` (JAX array, numpy array, Python number)."""
+def _from_stored(array: np.ndarray, dtype: str, kind: str) -> Any:
+    """The inverse of `_to_stored`: a JAX array, a random key or a numpy array."""
     if dtype.startswith("key<"):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=dtype[len("key<") : -1])
-    array = (
-        array if array.dtype.isbuiltin == 1 and str(array.dtype) == dtype else array.view(jnp.dtype(dtype))
-    )
-    if isinstance(like, _SCALARS) and not isinstance(like, np.generic):
-        return array.item() if array.ndim == 0 else array
-    return array if isinstance(like, (np.ndarray, np.generic)) else jnp.asarray(array)
-
-
-def _describe(leaf: Any) -> str:
-    """Shape and dtype of an array, the type of a number."""
-    if hasattr(leaf, "dtype"):
-        return f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
-    return type(leaf).__name__
+    if not (array.dtype.isbuiltin == 1 and str(array.dtype) == dtype):
+        array = array.view(jnp.dtype(dtype))
+    return jnp.asarray(array) if kind == "jax" else array
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:

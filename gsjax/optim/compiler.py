@@ -4,6 +4,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import threading
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -46,6 +47,25 @@ def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
         return jnp.full_like(array, jnp.nan if jnp.issubdtype(array.dtype, jnp.inexact) else 0)
 
     return jax.lax.cond(true, lambda: arrays, lambda: jax.tree.map(nothing, arrays))
+
+
+_compiling = threading.local()
+
+
+def compile_seconds() -> float:
+    """Seconds that this thread has spent tracing and compiling since the first call of this function. Like
+    `time.perf_counter`, only the difference between two readings has a meaning."""
+    _listen()
+    return getattr(_compiling, "seconds", 0.0)
+
+
+@cache
+def _listen() -> None:
+    def add(event: str, seconds: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            _compiling.seconds = getattr(_compiling, "seconds", 0.0) + seconds
+
+    jax.monitoring.register_event_duration_secs_listener(add)
 
 
 def has_avx512() -> bool:

@@ -3,8 +3,17 @@
     state = step.init(params)
     params, state, info = step.update(params, state, batch, step=i, key=key)
 
-`params` holds what trains, `batch` what is given (observations, frozen scene, plan), `state` what a method
-carries along. `info` has the losses by name.
+`params` holds what trains, `batch` what is given (observations, frozen scene, plan, progress), `state` what a
+method carries along. `step` is the index of the step, a traced integer; how far a schedule is, 0 to 1,
+travels in the batch. `info` has the losses by name, and always
+
+    loss       what went down
+    skipped    the step changed neither params nor state: a number was not finite, or a plan overflowed
+    overflow   a plan was too small
+    needed     what it should have held; a number, or what the method's plans need in their own form
+
+Nothing is closed over but static configuration, so steps run under jit, vmap and scan, and compose by calling
+one another. tests/optim/test_laws.py holds every step of the package to this.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,13 +29,13 @@ from jaxtyping import Array, Bool, PyTree
 
 
 class Init(Protocol):
-    """What makes the state of a step, from the parameters."""
+    """Makes the state of a step from its parameters."""
 
     def __call__(self, params: PyTree) -> PyTree: ...
 
 
 class Update(Protocol):
-    """What advances parameters and state by one batch, and says how it went."""
+    """Advances parameters and state by one batch, and reports how it went."""
 
     def __call__(
         self, params: PyTree, state: PyTree, batch: PyTree, *, step: Any, key: Any
@@ -45,17 +54,20 @@ def gradient_step(
 ) -> Step:
     """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
 
-    A step whose loss or gradient is not finite, or whose aux says `overflow`, returns params and state
-    unchanged; `info["skipped"]` says so. `info` is aux with `loss` added.
+    A step whose loss or gradient is not finite, or whose aux has a true `overflow`, returns params and state
+    unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`; a loss that draws with
+    no plan need not mention `overflow` and `needed`, which are then False and 0.
     """
 
     def update(params, state, batch, *, step, key):
         (value, aux), gradients = jax.value_and_grad(loss, has_aux=True)(params, batch, step=step, key=key)
         updates, new_state = optimizer.update(gradients, state, params)
         new_params = optax.apply_updates(params, updates)
-        sound = all_finite((value, gradients)) & ~jnp.asarray(aux.get("overflow", False)).any()
+        overflow = jnp.asarray(aux.get("overflow", False)).any()
+        sound = all_finite((value, gradients)) & ~overflow
         params, state = keep_if(sound, (new_params, new_state), (params, state))
-        return params, state, {**aux, "loss": value, "skipped": ~sound}
+        reported = {"needed": jnp.int32(0), **aux, "overflow": overflow}
+        return params, state, {**reported, "loss": value, "skipped": ~sound}
 
     return Step(optimizer.init, update)
 

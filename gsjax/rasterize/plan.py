@@ -7,8 +7,9 @@ scene that grows compiles a few variants in all, and re-planning on a known rung
 
 import dataclasses
 import math
+from collections.abc import Callable
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
@@ -159,6 +160,7 @@ class Plan:
         """
         if not isinstance(headroom, Real) or not headroom >= 1:
             raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom!r}")
+        needed = int(needed)
         if needed < 0:
             raise ValueError(f"needed must be 0 or more, as meta.needed is; got {needed}")
         if needed >= 2**31 - 1:
@@ -167,6 +169,30 @@ class Plan:
                 "prune the ones that fill the frame, or draw fewer at a time"
             )
         return dataclasses.replace(self, capacity=max(self.capacity, rung(needed * headroom)))
+
+
+HEADROOM = 1.3
+"""How many times as much as is needed a plan holds, unless a caller knows better."""
+
+Drawn = TypeVar("Drawn")
+
+
+def with_room(
+    draw: Callable[[Plan], tuple[Drawn, Any]], plan: Plan, headroom: float = HEADROOM
+) -> tuple[Drawn, Plan]:
+    """What `draw(plan)` returns, and a plan that held it: that one, grown as often as it overflows. For loops
+    on the host.
+
+    Args:
+        draw: plan -> (result, meta), whose `overflow` and `needed` are those of a rasterization.
+        plan: the plan to begin with.
+        headroom: how many times as much as was needed a grown plan holds, 1 or more.
+    """
+    while True:
+        drawn, meta = draw(plan)
+        if not bool(meta.overflow.any()):
+            return drawn, plan
+        plan = plan.grown(int(meta.needed.max()), headroom)
 
 
 def rung(pairs: float) -> int:

@@ -1,4 +1,4 @@
-"""What a set of cameras sees at one moment, as arrays."""
+"""What a set of cameras saw at one moment: the one observation that every loss and method takes."""
 
 from typing import TypeVar
 
@@ -6,38 +6,69 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gsjax.geometry.cameras import Camera, resized
-
-
-class Frame(eqx.Module):
-    """What C cameras see at one moment.
-
-    Attributes:
-        images: RGB, 0 to 1.
-        depths: metres, 0 where unknown; None without depth cameras.
-        cameras: C cameras (viewmat [C,4,4], K [C,3,3]), which may move from frame to frame.
-    """
-
-    images: Float[Array, "c height width 3"]
-    depths: Float[Array, "c height width"] | None
-    cameras: Camera
-
 
 Seen = TypeVar("Seen")
 
 
+class Frame(eqx.Module):
+    """What C cameras saw at one moment; numpy arrays on the host, JAX arrays on the device.
+
+    Attributes:
+        images: RGB, floats from 0 to 1 or bytes from 0 to 255.
+        depths: metres along the optical axis, 0 where unknown; None without depth cameras.
+        cameras: C cameras (viewmat [C,4,4], K [C,3,3]), which may move from frame to frame.
+        masks: the pixels that count; None if all do.
+        time: when it was seen, 0 to 1 over the recording; None for a scene that stands still.
+    """
+
+    images: Float[Array | np.ndarray, "c height width 3"] | UInt8[Array | np.ndarray, "c height width 3"]
+    depths: Float[Array | np.ndarray, "c height width"] | None
+    cameras: Camera
+    masks: Bool[Array | np.ndarray, "c height width"] | None = None
+    time: Float[Array | np.ndarray, ""] | None = None
+
+    @property
+    def colors(self) -> Float[Array, "c height width 3"]:
+        """The images as floats, 0 to 1."""
+        if jnp.issubdtype(self.images.dtype, jnp.floating):
+            return self.images
+        return self.images.astype(jnp.result_type(float)) / 255
+
+    @property
+    def known_depths(self) -> Float[np.ndarray, "c height width"]:
+        """On the host: depths where they are finite, positive and count, else 0; zeros without depth."""
+        if self.depths is None:
+            return np.zeros(self.images.shape[:-1], np.float32)
+        depths = np.asarray(self.depths)
+        known = np.isfinite(depths) & (depths > 0)
+        if self.masks is not None:
+            known &= np.asarray(self.masks)
+        return np.where(known, depths, 0)
+
+
+def of_cameras(frame: Frame, which: slice | Int[np.ndarray, "k"]) -> Frame:
+    """The frame as some of its cameras saw it."""
+    images, depths, cameras, masks = jax.tree.map(
+        lambda a: a[which], (frame.images, frame.depths, frame.cameras, frame.masks)
+    )
+    return Frame(images, depths, cameras, masks, frame.time)
+
+
 def one_camera(seen: Seen, c: int) -> Seen:
-    """Of a pytree of which every array has a camera axis in front, camera `c` alone, with that axis."""
-    return jax.tree.map(lambda a: a[c : c + 1], seen)
+    """Camera `c` alone of a frame, or of a batch of cameras; the camera axis stays."""
+    only = slice(c, c + 1)
+    return of_cameras(seen, only) if isinstance(seen, Frame) else jax.tree.map(lambda a: a[only], seen)
 
 
 def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Frame:
     """The frame of some cameras (all unless given), in smaller pictures.
 
-    Colours are means over blocks of `shrink` by `shrink` pixels, depth is that of one pixel in the block's
-    middle, for a mean would lie between surfaces. Rows and columns that fill no block are left out.
+    Colours are means over blocks of `shrink` by `shrink` pixels; depths and masks are those of one pixel in
+    the block's middle, for a mean of depths would lie between surfaces. Rows and columns that fill no block
+    are left out.
 
     Raises:
         ValueError: there is no such camera, or nothing is left of the pictures.
@@ -46,7 +77,7 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
         count = len(frame.images)
         if not all(0 <= camera < count for camera in cameras):
             raise ValueError(f"cameras: expected numbers from 0 to {count - 1}, found {cameras}")
-        frame = jax.tree.map(lambda a: a[np.array(cameras)], frame)
+        frame = of_cameras(frame, np.array(cameras))
     if shrink == 1:
         return frame
     height, width = (size // shrink for size in (frame.cameras.height, frame.cameras.width))
@@ -55,8 +86,12 @@ def part_of(frame: Frame, cameras: tuple[int, ...] = (), shrink: int = 1) -> Fra
     images = frame.images[:, : height * shrink, : width * shrink]
     images = images.reshape(-1, height, shrink, width, shrink, 3).mean((2, 4))
     middle = slice(shrink // 2, None, shrink)
-    depths = None if frame.depths is None else frame.depths[:, middle, middle][:, :height, :width]
-    return Frame(images, depths, resized(frame.cameras, 1 / shrink, width, height))
+
+    def picked(pixels):
+        return None if pixels is None else pixels[:, middle, middle][:, :height, :width]
+
+    cameras = resized(frame.cameras, 1 / shrink, width, height)
+    return Frame(images, picked(frame.depths), cameras, picked(frame.masks), frame.time)
 
 
 def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
@@ -70,7 +105,7 @@ def without_broken(frame: Frame) -> tuple[Frame, Int[Array, ""]]:
     def mended() -> Frame:
         images = jnp.where(broken[..., None], 0.0, frame.images)
         depths = None if frame.depths is None else jnp.where(broken, 0.0, frame.depths)
-        return Frame(images, depths, frame.cameras)
+        return Frame(images, depths, frame.cameras, frame.masks, frame.time)
 
     # Where there is nothing to mend, what reads the images is not slowed by the question, pixel for pixel.
     return jax.lax.cond(count > 0, mended, lambda: frame), count

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import HEADROOM, Plan, with_room
 from gsjax.rasterize.rasterization import Meta, rasterization
 from gsjax.rasterize.rasterization import plan as _plan
 from gsjax.scene.gaussians import Gaussians
@@ -103,7 +103,7 @@ def render_with_room(
     *,
     backgrounds: Float[Array, "c 3"] | None = None,
     rasterize_mode: str = "classic",
-    headroom: float = 1.3,
+    headroom: float = HEADROOM,
 ) -> tuple[Rendered, Plan]:
     """What `render` draws, and a plan that held it: that of an earlier call, made or grown where it must be.
     For loops on the host, over views of one size.
@@ -116,8 +116,9 @@ def render_with_room(
     """
     if plan is None or plan.sh_degree != gaussians.sh_degree:
         plan = plan_render(gaussians, cameras, headroom=headroom, rasterize_mode=rasterize_mode)
-    drawn = render(gaussians, cameras, plan, backgrounds=backgrounds)
-    while bool(drawn.meta.overflow.any()):
-        plan = plan.grown(int(drawn.meta.needed.max()), headroom)
+
+    def draw(plan: Plan) -> tuple[Rendered, Any]:
         drawn = render(gaussians, cameras, plan, backgrounds=backgrounds)
-    return drawn, plan
+        return drawn, drawn.meta
+
+    return with_room(draw, plan, headroom)

@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from gsjax.engine.interrupts import hear, heard_interrupts, undisturbed
+from gsjax.engine.interrupts import raise_if_interrupted, heard_interrupts, shielded
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -83,7 +83,7 @@ def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
         return amount
 
     def step_and_wait():
-        done.append(undisturbed(step, 3))
+        done.append(shielded(step, 3))
         time.sleep(5)
 
     with pytest.raises(KeyboardInterrupt), heard_interrupts():
@@ -93,7 +93,7 @@ def test_what_must_not_be_disturbed_ends_before_an_interrupt_is_raised():
 
 def test_nothing_stands_between_an_undisturbed_call_and_who_made_it():
     # Once the types of results were checked there, and an interrupt in the check lost what the call gave.
-    assert not hasattr(undisturbed, "__wrapped__")
+    assert not hasattr(shielded, "__wrapped__")
 
 
 def test_between_undisturbed_steps_an_interrupt_is_heard_at_once():
@@ -106,14 +106,14 @@ def test_between_undisturbed_steps_an_interrupt_is_heard_at_once():
 
     def walk():
         for _ in range(100):
-            steps.append(undisturbed(step, not steps))
-            hear()
+            steps.append(shielded(step, not steps))
+            raise_if_interrupted()
 
     with heard_interrupts():
         with pytest.raises(KeyboardInterrupt):
             walk()
         time.sleep(0.03)  # nothing is raised a second time
-        hear()
+        raise_if_interrupted()
     assert len(steps) == 1
 
 

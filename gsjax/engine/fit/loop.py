@@ -11,7 +11,7 @@ from gsjax.engine.fit.results import Curve, Plans, judge
 from gsjax.engine.fit.resume import Saver
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
-from gsjax.engine.interrupts import hear, undisturbed
+from gsjax.engine.interrupts import raise_if_interrupted, shielded
 from gsjax.methods.fit import Fitted, Problem, View, fit
 
 _SHOWN_EVERY_S = 0.2
@@ -130,7 +130,7 @@ def follow(
     with _Display(console, curve, budget, state.step, len(judged) > 0) as display:
         try:
             steps = iter(()) if met(state.gaussians) else fit(problem, state, share=budget)
-            while (fitted := undisturbed(next, steps, None)) is not None:
+            while (fitted := shielded(next, steps, None)) is not None:
                 state, step = fitted.state, fitted.state.step
                 curve.took(fitted.seconds, fitted.compile_seconds)
                 curve.skipped += bool(fitted.info["skipped"])
@@ -147,7 +147,7 @@ def follow(
                 if look and met(state.gaussians):
                     break
                 saver(state, curve, last=False)
-                hear()
+                raise_if_interrupted()
             saver(state, curve, last=True)
         except (KeyboardInterrupt, Exception) as stopped:
             if any(leaf.is_deleted() for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array)):

@@ -1,240 +1,206 @@
-"""The host loop of a fit: which photograph is next, at what size, with which capacity."""
+"""The fit as one value: which photograph is next, at what size, with which capacity, and when it grows."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import Camera, on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
-from gsjax.methods.fit.start import Extent, View, extent_of, in_slots, start_points
-from gsjax.methods.fit.update import (
-    Batch,
-    Observation,
-    fit_step,
-    grow,
-    slots_wanted,
-    split,
-)
+from gsjax.methods.fit.start import Extent, extent_of, in_slots, start_points
+from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan, rung
-from gsjax.scene.gaussians import Gaussians
+from gsjax.optim.densification import is_alive
+from gsjax.optim.method import Run
+from gsjax.optim.step import Step
+from gsjax.rasterize.plan import HEADROOM, rung
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians, cull_invalid, take
 from gsjax.scene.render import plan_render
 
-_HEADROOM = 1.3
-_RANDOM_BACKGROUND, _WALK, _GROWTH = range(3)  # what keys are for
+_BACKGROUND, _GROWTH = 0, 2  # what keys are for, beside that of the step
 
 
 class Problem(NamedTuple):
     """What does not change during a fit.
 
     Attributes:
-        views: the photographs to fit, on the host.
-        config: how.
+        frames: the photographs to fit, of one camera each, on the host.
         extent: where the scene is.
         background: RGB behind the scene; None: another in each step.
-        start: where the first Gaussians come from: cloud, depth or random.
+        start: where the first Gaussians come from: cloud, depth, matches or random.
+        held: photographs of the size that is looked at now, on the device; filled as they are needed.
     """
 
-    views: list[View]
-    config: FitConfig
+    frames: list[Frame]
     extent: Extent
     background: tuple[float, float, float] | None
     start: str
+    held: dict[tuple[int, int], Frame]
 
 
-class FitState(eqx.Module):
-    """What a fit goes on from, to the same bits.
-
-    Attributes:
-        model: what is fitted. Of the Gaussians' slots, those that are not alive are empty.
-        optimizer: what the step carries along.
-        step: how many steps were made.
-        capacity: of the plan for each size of photographs, a row (shrink, width, height, capacity) each.
-    """
-
-    model: Model
-    optimizer: Any
-    step: int
-    capacity: Int[np.ndarray, "sizes 4"]
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """Of all slots."""
-        return self.model.gaussians
-
-
-class Fitted(NamedTuple):
-    """A fit after one more step.
+@dataclass(frozen=True)
+class Fit:
+    """A static scene from posed photographs (`gsjax.optim.method.Method`).
 
     Attributes:
-        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
-        info: loss, psnr, alive, skipped of this step, on the device.
-        seconds: that it took, without what compiled.
-        compile_seconds: that compiling took in it.
-        shrink: how many times smaller the photograph was.
-    """
-
-    state: FitState
-    info: dict[str, Array]
-    seconds: float
-    compile_seconds: float
-    shrink: int
-
-
-def begin(
-    views: list[View],
-    config: FitConfig,
-    cloud: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
-    background: tuple[float, float, float] | None = None,
-) -> tuple[Problem, FitState]:
-    """A fit before its first step.
-
-    Args:
-        views: the photographs.
-        config: how they are fitted.
-        cloud: points of the scene and their colours, 0 to 1.
-        background: what is behind the scene, where the data says so.
-
-    Raises:
-        ValueError: there is no view, or none in which a pixel counts, or nothing of the kind from which the
-            fit is to start, or another background is asked for than the data has.
-    """
-    if not views:
-        raise ValueError("views: expected at least one photograph to fit, found none")
-    if background is not None and config.background != "data":
-        raise ValueError(
-            f"background: the photographs stand on {background} where nothing is, which before "
-            f"{config.background!r} would be learned as a thing; leave it at data"
-        )
-    if not any(view.mask is None or view.mask.any() for view in views):
-        raise ValueError("masks: in none of the photographs to fit does any pixel count; are they inverted?")
-    extent = extent_of(np.stack([view.viewmat for view in views]))
-    points, colors, source = start_points(views, cloud, config.start, config.seed)
-    slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
-    gaussians = in_slots(points, colors, slots, config.start, config.seed)
-    behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
-    behind["data"] = background or behind["black"]
-    problem = Problem(views, config, extent, behind[config.background], source)
-    model = model_of(gaussians, config, len(views))
-    state = fit_step(config, extent.radius).init(model)
-    return problem, FitState(model, state, 0, np.zeros((0, 4), int))
-
-
-def fit(
-    problem: Problem,
-    state: FitState,
-    *,
-    share: Callable[[int], float] | None = None,
-    extra_losses: ExtraLosses = (),
-) -> Iterator[Fitted]:
-    """Step by step, until all is done. The same state, problem and `share` give the same bits, wherever the
-    fit was begun or resumed.
-
-    Args:
-        problem: from `begin`.
-        state: from `begin`, or that of an earlier `Fitted`.
-        share: step -> what share of the fit is done before it, by which rates fall and photographs grow; at 1
-            it ends. That of the config's steps unless given.
-        extra_losses: functions `loss(scene, rendered, frame)` of one's own, whose scene is a `Model`; see
+        config: how it is fitted.
+        extra_losses: custom losses `loss(scene, rendered, frame)`, whose scene is a `Model`; see
             `gsjax.losses.extra`. `info["extra"]` has their values.
     """
-    config, views = problem.config, problem.views
-    key = jax.random.key(config.seed)
-    plans = {tuple(row[:3].tolist()): int(row[3]) for row in state.capacity}
-    named_losses(extra_losses)  # before it is a key, which a list cannot be
-    advance, densify = _compiled(config, problem.extent.radius, extra_losses)
-    seen: dict[tuple[int, int], Observation] = {}
-    model, optimizer = state.model, state.optimizer
-    compiled: set[Any] = set()
-    # All observations are of one kind, for each kind is a program of its own.
-    kinds = any(_counts(view) is not None for view in views), any(view.depth is not None for view in views)
-    i = state.step
-    while (done := i / config.steps if share is None else share(i)) < 1:
-        begun, compiling = perf_counter(), 0.0
-        degree = min(config.sh_degree, i // config.sh_every)
-        model, optimizer = enlarged(problem, model, optimizer, degree, 0)
-        v, shrink = shuffled_index(config.seed, i, len(views)), _shrink(config, done)
-        if (v, shrink) not in seen:
-            if any(of != shrink for _, of in seen):
-                seen.clear()  # photographs of a size that is over
-            seen[v, shrink] = _observe(views[v], v, shrink, kinds)
-        observed = seen[v, shrink]
-        size = (shrink, observed.camera.width, observed.camera.height)
-        while True:
-            if size not in plans:
-                plans[size] = _plan(problem, model.gaussians, observed.camera, 0).capacity
-            plan = _plan(problem, model.gaussians, observed.camera, plans[size])
-            batch = Batch(observed, _background(problem, key, i), plan)
-            new = (plan, model.gaussians.num)
-            walk = jax.random.fold_in(jax.random.fold_in(key, _WALK), i)
-            model, optimizer, info = advance(model, optimizer, batch, done, walk)
-            overflow = bool(info["overflow"])
-            if new not in compiled:  # planning and the first call of a program are not the time of a step
-                compiling = perf_counter() - begun
-                compiled.add(new)
-            if not overflow:
-                break
-            plans[size] = plan.grown(int(info["needed"]), _HEADROOM).capacity
-        if _densifies(config, i, done):
-            started, new = perf_counter(), (model.gaussians.num, model.gaussians.sh_degree)
-            turn = jax.random.fold_in(jax.random.fold_in(key, _GROWTH), i)
-            if config.strategy == "split":
-                room = min(config.cap, rung(int(slots_wanted(model, optimizer, config))))
-                model, optimizer = enlarged(problem, model, optimizer, 0, room)
-            model, optimizer = densify(model, optimizer, turn, i, _all_looked(config, i, len(views)))
-            if new not in compiled:
-                compiling += perf_counter() - started
-                compiled.add(new)
-        i += 1
-        capacity = np.array([[*of, room] for of, room in plans.items()], int)
-        now = FitState(model, optimizer, i, capacity)
-        yield Fitted(now, info, perf_counter() - begun - compiling, compiling, shrink)
+
+    config: FitConfig = field(default_factory=FitConfig)
+    extra_losses: ExtraLosses = ()
+
+    def __post_init__(self):
+        named_losses(self.extra_losses)
+
+    def start(
+        self,
+        frames: list[Frame],
+        cloud: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> tuple[Problem, Run]:
+        """A fit before its first step.
+
+        Args:
+            frames: the photographs, each a frame of one camera on the host.
+            cloud: points of the scene and their colours, 0 to 1.
+            background: what is behind the scene, where the data has it.
+
+        Raises:
+            ValueError: there is no photograph, or none in which a pixel counts, or nothing of the kind from
+                which the fit is to start, or another background is asked for than the data has.
+        """
+        config = self.config
+        if not frames:
+            raise ValueError("views: expected at least one photograph to fit, found none")
+        if background is not None and config.background != "data":
+            raise ValueError(
+                f"background: the photographs stand on {background} where nothing is, which before "
+                f"{config.background!r} would be learned as a thing; leave it at data"
+            )
+        if not any(frame.masks is None or frame.masks.any() for frame in frames):
+            raise ValueError(
+                "masks: in none of the photographs to fit does any pixel count; are they inverted?"
+            )
+        extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
+        points, colors, source = start_points(frames, cloud, config.start, config.seed)
+        slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
+        gaussians = in_slots(points, colors, slots, config.start, config.seed)
+        behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
+        behind["data"] = background or behind["black"]
+        model = model_of(gaussians, config, len(frames))
+        problem = Problem(frames, extent, behind[config.background], source, {})
+        return problem, Run(model, self.step.init(model))
+
+    @property
+    def step(self) -> Step:
+        """See `fit_step`."""
+        return fit_step(self.config, self.extra_losses)
+
+    def total(self, problem: Problem) -> int:
+        """The steps of the configuration."""
+        return self.config.steps
+
+    def between(self, problem: Problem, run: Run, progress: float) -> Run:
+        """Relocates or divides, unlocks the next degree of the spherical harmonics, plans a new size."""
+        run = self._densified(problem, run, run.step - 1, progress)
+        run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
+        name, frame = self._turn(problem, run.step, progress)
+        plan, gaussians = run.plans.get(name), run.params.gaussians
+        if plan is None:
+            mode = "antialiased" if self.config.antialiased else "classic"
+            plan = plan_render(gaussians, frame.cameras, headroom=HEADROOM, rasterize_mode=mode)
+        return run.having(plans=run.plans | {name: replace(plan, sh_degree=gaussians.sh_degree)})
+
+    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
+        """The photograph whose turn it is."""
+        name, frame = self._turn(problem, run.step, progress)
+        if problem.background is None:
+            key = jax.random.fold_in(jax.random.key(self.config.seed), _BACKGROUND)
+            background = jax.random.uniform(jax.random.fold_in(key, run.step), (1, 3))
+        else:
+            background = jnp.array([problem.background])
+        view = jnp.asarray(self._view(problem, run.step), jnp.int32)
+        batch = Batch(frame, view, background, progress, problem.extent.radius, run.plans[name])
+        return batch, (name,)
+
+    def result(self, problem: Problem | None, run: Run) -> Gaussians:
+        """The Gaussians that hold something; empty slots are left out."""
+        gaussians = run.params.gaussians
+        return cull_invalid(take(gaussians, np.asarray(is_alive(gaussians))))[0]
+
+    def _view(self, problem: Problem, step: int) -> int:
+        return shuffled_index(self.config.seed, step, len(problem.frames))
+
+    def _turn(self, problem: Problem, step: int, progress: float) -> tuple[str, Frame]:
+        """The photograph of a step on the device, and the name of the plan for its size."""
+        view, shrink = self._view(problem, step), shrink_at(self.config, progress)
+        if (view, shrink) not in problem.held:
+            if any(held != shrink for _, held in problem.held):
+                problem.held.clear()  # photographs of a size that is over
+            problem.held[view, shrink] = on_device_at(problem.frames, view, shrink)
+        frame = problem.held[view, shrink]
+        return f"{shrink}:{frame.cameras.width}x{frame.cameras.height}", frame
+
+    def _enlarged(self, run: Run, *, degree: int = 0, slots: int = 0) -> Run:
+        """With the coefficients of a degree, and this many slots; what the optimizer knew is kept."""
+        larger = with_slots(with_degree(run.params, degree), slots)
+        if larger is run.params:
+            return run
+        return run.having(params=larger, state=carried_over(run.state, self.step.init(larger)))
+
+    def _densified(self, problem: Problem, run: Run, step: int, progress: float) -> Run:
+        """After `step`, where it is time: with Gaussians where they are needed."""
+        config = self.config
+        when = config.growth if config.strategy == "relocate" else config.split
+        if step < when.begin or step % when.every or progress >= when.end:
+            return run
+        if config.strategy == "split":
+            room = min(config.cap, rung(int(slots_wanted(run.params, run.state, config))))
+            run = self._enlarged(run, slots=room)
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _GROWTH), step)
+        seen = all_seen_since(config, step, len(problem.frames))
+        params, state = _compiled_growth(config)(
+            run.params, run.state, key, step, seen, problem.extent.radius
+        )
+        return run.having(params=params, state=state)
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: FitConfig, radius: float, extra_losses: ExtraLosses) -> tuple[Callable, Callable]:
-    """The jitted step and what makes more Gaussians; buffers that they replace are given away."""
-    step, options = fit_step(config, radius, extra_losses), host_options()
+def _compiled_growth(config: FitConfig) -> Callable:
+    """The jitted relocation or division; buffers that it replaces are given away."""
 
-    @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
-    def advance(model, optimizer, batch, share, key):
-        return step.update(model, optimizer, batch, step=share, key=key)
-
-    @partial(jax.jit, compiler_options=options, donate_argnums=(0, 1))
-    def densify(model, optimizer, key, i, all_looked):
+    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
+    def densify(model, optimizer, key, step, all_seen, radius):
         if config.strategy == "relocate":
-            return grow(model, optimizer, key, config.cap, config.growth.factor, all_looked)
+            return grow(model, optimizer, key, config.cap, config.growth.factor, all_seen)
         every, between = config.split.reset_every, config.split.every
-        reset = i // every > jnp.maximum(i - between, 0) // every
-        return split(model, optimizer, key, config, radius, reset, i > every, all_looked)
+        reset = step // every > jnp.maximum(step - between, 0) // every
+        return split(model, optimizer, key, config, radius, reset, step > every, all_seen)
 
-    return advance, densify
+    return densify
 
 
-def _shrink(config: FitConfig, share: float) -> int:
-    """How many times smaller photographs are: first 4, then 2."""
-    if share >= config.coarse_until:
+def shrink_at(config: FitConfig, progress: float) -> int:
+    """By how many times smaller photographs are looked at: first 4, then 2, then 1."""
+    if progress >= config.coarse_until:
         return 1
-    return 4 if share < config.coarse_until / 3 else 2
+    return 4 if progress < config.coarse_until / 3 else 2
 
 
-def _densifies(config: FitConfig, step: int, share: float) -> bool:
-    when = config.growth if config.strategy == "relocate" else config.split
-    return step >= when.begin and step % when.every == 0 and share < when.end
-
-
-def _all_looked(config: FitConfig, step: int, views: int) -> bool:
+def all_seen_since(config: FitConfig, step: int, views: int) -> bool:
     """Whether each photograph had a turn since this was last so; two rounds of turns hold a whole one."""
     if config.strategy == "split":  # which forgets each time what was seen
         return config.split.every >= 2 * views
@@ -242,18 +208,18 @@ def _all_looked(config: FitConfig, step: int, views: int) -> bool:
     return step >= period and step % period == 0
 
 
-def _counts(view: View) -> np.ndarray | None:
-    """Which pixels count, where not all do."""
-    return None if view.mask is None or view.mask.all() else view.mask
+def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
+    """A photograph on the device, a number of times smaller.
 
-
-def _observe(view: View, number: int, shrink: int, kinds: tuple[bool, bool]) -> Observation:
-    """A view on the device, in a picture of another size. `kinds`: with a mask, with depth, known or not."""
-    image, mask, depth = view.image, _counts(view), view.depth
-    masked, with_depth = kinds
-    if masked and mask is None:
+    All are of one kind, with a mask where any has one that leaves something out, and with depth where any has
+    some: each kind is a program of its own.
+    """
+    frame = frames[view]
+    image, mask = frame.images[0], None if _counts_all(frame) else frame.masks[0]
+    depth = None if frame.depths is None else frame.depths[0]
+    if mask is None and not all(map(_counts_all, frames)):
         mask = np.ones(image.shape[:2], bool)
-    if with_depth and depth is None:
+    if depth is None and any(other.depths is not None for other in frames):
         depth = np.zeros(image.shape[:2], np.float32)
     height, width = (max(1, side // shrink) for side in image.shape[:2])
     factors = np.array([width / image.shape[1], height / image.shape[0], 1.0])
@@ -262,48 +228,27 @@ def _observe(view: View, number: int, shrink: int, kinds: tuple[bool, bool]) -> 
         smaller = partial(cv2.resize, dsize=(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
         mask = None if mask is None else smaller(mask.astype(np.uint8)) > 0
         depth = None if depth is None else smaller(depth)
-    dtype = jnp.result_type(float)
-    viewmat, K = (jnp.asarray(a, dtype)[None] for a in (view.viewmat, factors[:, None] * view.K))
-    known = None if depth is None else jnp.asarray(depth, dtype)[None]
-    counts = None if mask is None else jnp.asarray(mask)[None]
-    camera = Camera(viewmat, K, width, height, view.near)
-    return Observation(jnp.asarray(image)[None], counts, known, camera, jnp.asarray(number, jnp.int32))
-
-
-def _plan(problem: Problem, gaussians: Gaussians, cameras: Camera, capacity: int) -> Plan:
-    """A plan of this capacity, or, where that is 0, of what these cameras need."""
-    mode = "antialiased" if problem.config.antialiased else "classic"
-    if capacity == 0:
-        return plan_render(gaussians, cameras, headroom=_HEADROOM, rasterize_mode=mode)
-    options = {"rasterize_mode": mode, "render_mode": "RGB+ED", "sh_degree": gaussians.sh_degree}
-    options["near_plane"] = cameras.near
-    return Plan(cameras.width, cameras.height, capacity, **options)
-
-
-def _background(problem: Problem, key: Array, step: int) -> Float[Array, "1 3"]:
-    if problem.background is not None:
-        return jnp.array([problem.background])
-    return jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, _RANDOM_BACKGROUND), step), (1, 3))
-
-
-def as_found(problem: Problem, model: Model) -> list[View]:
-    """The views from where the fit found their cameras."""
-    if model.twists is None:
-        return problem.views
-    viewmats = (
-        refined(
-            jnp.asarray(view.viewmat, jnp.float32)[None], model.twists, jnp.int32(i), problem.extent.radius
-        )[0]
-        for i, view in enumerate(problem.views)
+    cameras = frame.cameras
+    camera = Camera(cameras.viewmat, factors[:, None] * cameras.K, width, height, cameras.near)
+    return Frame(
+        jnp.asarray(image)[None],
+        None if depth is None else jnp.asarray(depth, jnp.result_type(float))[None],
+        on_device(camera),
+        None if mask is None else jnp.asarray(mask)[None],
     )
-    found = [np.asarray(viewmat, np.float64) for viewmat in viewmats]
-    return [view._replace(viewmat=viewmat) for view, viewmat in zip(problem.views, found, strict=True)]
 
 
-def enlarged(problem: Problem, model: Model, optimizer: Any, degree: int, slots: int) -> tuple[Model, Any]:
-    """With the coefficients of a degree, and with so many slots; what the optimizer knew is kept."""
-    larger = with_slots(with_degree(model, degree), slots)
-    if larger is model:
-        return model, optimizer
-    fresh = fit_step(problem.config, problem.extent.radius).init(larger)
-    return larger, carried_over(optimizer, fresh)
+def _counts_all(frame: Frame) -> bool:
+    return frame.masks is None or bool(frame.masks.all())
+
+
+def as_found(problem: Problem, model: Model) -> list[Frame]:
+    """The photographs from where the fit found their cameras."""
+    if model.twists is None:
+        return problem.frames
+    found = []
+    for i, frame in enumerate(problem.frames):
+        given = jnp.asarray(frame.cameras.viewmat, jnp.float32)
+        viewmat = refined(given, model.twists, jnp.int32(i), problem.extent.radius)
+        found.append(eqx.tree_at(lambda f: f.cameras.viewmat, frame, np.asarray(viewmat, np.float64)))
+    return found

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gsjax.geometry.cameras import Camera
-from gsjax.methods.fit.start import View
+from gsjax.geometry.cameras import Camera, on_device
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import HEADROOM, Plan, with_room
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import plan_render, render
 
@@ -31,7 +31,7 @@ def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]
 
 
 def light_of(
-    gaussians: Gaussians, views: list[View], rasterize_mode: str = "classic"
+    gaussians: Gaussians, frames: list[Frame], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
     """What share of the scene's light each Gaussian sends, in the view that has the most of it: the largest
     over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i, over that of all.
@@ -40,23 +40,16 @@ def light_of(
 
     Args:
         gaussians: the scene.
-        views: all photographs.
+        frames: all photographs, of one camera each.
         rasterize_mode: "classic" or "antialiased", as the scene is fitted.
     """
     most, plans = np.zeros(gaussians.num, np.float32), {}
-    for view in views:
-        height, width = view.image.shape[:2]
-        viewmat, K = (jnp.asarray(a, gaussians.means.dtype)[None] for a in (view.viewmat, view.K))
-        camera = Camera(viewmat, K, width, height, view.near)
-        while True:
-            if (width, height) not in plans:
-                plans[width, height] = plan_render(
-                    gaussians, camera, headroom=1.3, rasterize_mode=rasterize_mode
-                )
-            weights, meta = _weights(gaussians, camera, plans[width, height])
-            if not bool(meta.overflow.any()):
-                break
-            plans[width, height] = plans[width, height].grown(int(meta.needed.max()), 1.3)
+    for frame in frames:
+        camera = on_device(frame.cameras)
+        size = camera.width, camera.height
+        if size not in plans:
+            plans[size] = plan_render(gaussians, camera, headroom=HEADROOM, rasterize_mode=rasterize_mode)
+        weights, plans[size] = with_room(partial(_weights, gaussians, camera), plans[size])
         total = float(weights.sum())
         most = np.maximum(most, np.asarray(weights) / max(total, 1e-12))
     return most

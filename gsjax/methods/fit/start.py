@@ -8,34 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.geometry.cameras import NEAR
 from gsjax.methods.fit.config import StartConfig
 from gsjax.optim.densification import EMPTY_LOGIT
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 _FEW = 0.1  # share of the points that photographs show, below which something is wrong
 _FLAT_PX = 1.0  # by which cameras shift what they see against each other, below which nothing has a depth
-
-
-class View(NamedTuple):
-    """What a photograph shows, on the host.
-
-    Attributes:
-        image: RGB, uint8.
-        mask: which pixels count, or None for all.
-        depth: 0 where unknown, or None.
-        viewmat: world to camera, OpenCV axes.
-        K: intrinsics in pixels.
-        near: what is nearer is not drawn, metres.
-    """
-
-    image: np.ndarray
-    mask: np.ndarray | None
-    depth: np.ndarray | None
-    viewmat: Float[np.ndarray, "4 4"]
-    K: Float[np.ndarray, "3 3"]
-    near: float = NEAR
 
 
 class Extent(NamedTuple):
@@ -70,13 +50,13 @@ def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
 
 
 def start_points(
-    views: list[View], cloud: tuple[np.ndarray, np.ndarray] | None, config: StartConfig, seed: int
+    frames: list[Frame], cloud: tuple[np.ndarray, np.ndarray] | None, config: StartConfig, seed: int
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], str]:
     """Points and their colours, and where they come from.
 
     Args:
         cloud: points and their colours: the data's own, or, where `config.source` says so, those of matches.
-        views: the photographs.
+        frames: the photographs.
         config: which source, and how many points.
         seed: of what is drawn at random.
 
@@ -84,11 +64,11 @@ def start_points(
         ValueError: the source that is asked for is not there.
     """
     random = np.random.default_rng(seed)
-    has_depth = any(_known_depth(view).any() for view in views)
+    has_depth = any(frame.known_depths[0].any() for frame in frames)
     source = config.source
     if cloud is not None and not len(cloud[0]):
         cloud = None
-    is_seen = cloud is not None and source in ("auto", "cloud") and _is_seen(cloud[0], views)
+    is_seen = cloud is not None and source in ("auto", "cloud") and _is_seen(cloud[0], frames)
     if source == "auto":
         source = "cloud" if is_seen else "depth" if has_depth else "random"
     if source in ("cloud", "matches"):
@@ -99,22 +79,22 @@ def start_points(
     if source == "depth":
         if not has_depth:
             raise ValueError("start.source: the data has no depth; use cloud, random or auto")
-        return *_from_depth(views, config.count, random), source
-    return *_at_random(views, config.count, random), source
+        return *_from_depth(frames, config.count, random), source
+    return *_at_random(frames, config.count, random), source
 
 
-def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
+def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
     """Whether photographs show any of the points; a warning where they show few."""
     seen, disparities = np.zeros(len(points), bool), np.zeros(len(points))
-    extent = extent_of(np.stack([view.viewmat for view in views]))
-    for view in views:
-        height, width = view.image.shape[:2]
-        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
+    for frame in frames:
+        height, width = frame.images[0].shape[:2]
+        local = points @ frame.cameras.viewmat[0][:3, :3].T + frame.cameras.viewmat[0][:3, 3]
         ahead = local[:, 2] > 0
-        x, y, z = (local[ahead] @ view.K.T).T
+        x, y, z = (local[ahead] @ frame.cameras.K[0].T).T
         shown = (x >= 0) & (x < width * z) & (y >= 0) & (y < height * z)
         seen[ahead] |= shown
-        disparities[np.flatnonzero(ahead)[shown]] = view.K[0, 0] * extent.radius / z[shown]
+        disparities[np.flatnonzero(ahead)[shown]] = frame.cameras.K[0][0, 0] * extent.radius / z[shown]
     if seen.mean() < _FEW:
         warnings.warn(
             f"of the data's {len(points)} points the photographs show {seen.sum()}: are they in the axes and "
@@ -130,44 +110,39 @@ def _is_seen(points: Float[np.ndarray, "m 3"], views: list[View]) -> bool:
     return bool(seen.any())
 
 
-def _known_depth(view: View) -> np.ndarray:
-    """Depth where it is known and counts, else 0."""
-    if view.depth is None:
-        return np.zeros((1, 1))
-    known = np.isfinite(view.depth) & (view.depth > 0)
-    return np.where(known if view.mask is None else known & view.mask, view.depth, 0)
-
-
-def _from_depth(views, count, random):
-    """Pixels with depth, as many from each view."""
-    each = -(-count // len(views))
+def _from_depth(frames, count, random):
+    """Pixels with depth, as many from each frame."""
+    each = -(-count // len(frames))
     points, colors = [], []
-    for view in views:
-        known = _known_depth(view)
+    for frame in frames:
+        known = frame.known_depths[0]
         if not known.any():
             continue
-        some = points_from_rgbd(view.image, known, view.viewmat, view.K)
+        some = points_from_rgbd(frame.images[0], known, frame.cameras.viewmat[0], frame.cameras.K[0])
         kept = random.permutation(len(some[0]))[:each]
         points.append(some[0][kept])
         colors.append(some[1][kept])
     return np.concatenate(points), np.concatenate(colors)
 
 
-def _at_random(views, count, random):
-    """Pixels of the views at depths about that of what they look at, each coloured as its pixel is."""
-    extent = extent_of(np.stack([view.viewmat for view in views]))
+def _at_random(frames, count, random):
+    """Pixels of the frames at depths about that of what they look at, each coloured as its pixel is."""
+    extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
     points, colors = np.zeros((count, 3)), np.zeros((count, 3))
-    chosen: Int[np.ndarray, "count"] = random.integers(len(views), size=count)
+    chosen: Int[np.ndarray, "count"] = random.integers(len(frames), size=count)
     for v in np.unique(chosen):
-        view, rows = views[v], np.flatnonzero(chosen == v)
-        height, width = view.image.shape[:2]
+        frame, rows = frames[v], np.flatnonzero(chosen == v)
+        height, width = frame.images[0].shape[:2]
         row, column = random.integers(height, size=len(rows)), random.integers(width, size=len(rows))
-        rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
+        rotation, shift = frame.cameras.viewmat[0][:3, :3], frame.cameras.viewmat[0][:3, 3]
         middle = max(float((rotation @ extent.focus + shift)[2]), 0.3 * extent.radius)
         depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))  # even in disparity, 0.4 to 4 times as far
-        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1) @ np.linalg.inv(view.K).T
+        rays = (
+            np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1)
+            @ np.linalg.inv(frame.cameras.K[0]).T
+        )
         points[rows] = (rays * depth[:, None] - shift) @ rotation
-        colors[rows] = view.image[row, column] / 255
+        colors[rows] = frame.images[0][row, column] / 255
     return points, colors
 
 

@@ -9,9 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from gsjax.geometry.cameras import Camera
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.fit.config import FitConfig
@@ -27,99 +26,93 @@ from gsjax.scene.render import render
 _FINAL_RATE = 0.01  # of means and twists, over the first
 
 
-class Observation(NamedTuple):
-    """A photograph on the device.
+class Batch(NamedTuple):
+    """What a step is given.
 
     Attributes:
-        image: RGB, 0 to 255.
-        mask: which pixels count; None where all do.
-        depth: 0 where unknown; None without depth.
-        camera: one camera, viewmat [1,4,4] and K [1,3,3].
-        view: which photograph it is.
+        frame: the photograph, of one camera, RGB in bytes.
+        view: which of the photographs it is.
+        background: RGB behind the scene, 0 to 1.
+        progress: how far the fit is, 0 to 1, by which rates fall.
+        radius: of the scene, the unit in which means and cameras move and depth counts.
+        plan: to draw with.
     """
 
-    image: UInt8[Array, "1 height width 3"]
-    mask: Bool[Array, "1 height width"] | None
-    depth: Float[Array, "1 height width"] | None
-    camera: Camera
+    frame: Frame
     view: Int[Array, ""]
-
-
-class Batch(NamedTuple):
-    """What a step is given: a photograph, the colour behind the scene, and a plan to draw it with."""
-
-    seen: Observation
     background: Float[Array, "1 3"]
+    progress: Float[Array, ""] | float
+    radius: Float[Array, ""] | float
     plan: Plan
 
 
-def fit_loss(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
+def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
     """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and under relocation what
     opacity and size cost (3DGS-MCMC, eq. 10), of one photograph.
 
     Args:
         config: its weights.
-        radius: of the scene, in which depth counts and cameras move.
         extra_losses: given the `Model`, how it was drawn, and the photograph; what does not count is drawn as
             photographed.
     """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
-        seen, background, plan = batch
-        gaussians, camera = model.gaussians, seen.camera
+        frame, radius = batch.frame, batch.radius
+        gaussians, camera = model.gaussians, frame.cameras
         if model.twists is not None:
-            viewmat = refined(camera.viewmat, model.twists, seen.view, radius)
+            viewmat = refined(camera.viewmat, model.twists, batch.view, radius)
             camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
         # By half a picture, so that one threshold of the pull serves pictures of any size.
         nudges = model.nudges * jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
-        drawn = render(gaussians, camera, plan, backgrounds=background, means2d_offset=nudges)
+        drawn = render(gaussians, camera, batch.plan, backgrounds=batch.background, means2d_offset=nudges)
         image = drawn.colors
         if model.exposures is not None:
-            image = exposed(image, model.exposures, seen.view)
-        target = seen.image.astype(image.dtype) / 255
-        if seen.mask is not None:  # what does not count is as it was photographed: no slope, no edge
-            image = jnp.where(seen.mask[..., None], image, target)
+            image = exposed(image, model.exposures, batch.view)
+        target = frame.colors
+        if frame.masks is not None:  # what does not count is as it was photographed: no slope, no edge
+            image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
-        counted = 1.0 if seen.mask is None else seen.mask.mean()
+        counted = 1.0 if frame.masks is None else frame.masks.mean()
         mse = jnp.square(image - target).mean() / counted
-        if config.depth_weight and seen.depth is not None:
-            known = (seen.depth > 0) & jax.lax.stop_gradient(drawn.alphas > 0.5)
-            if seen.mask is not None:
-                known &= seen.mask
-            off = weighted_mean(jnp.abs(drawn.depths - seen.depth), known.astype(value.dtype))
+        if config.depth_weight and frame.depths is not None:
+            known = (frame.depths > 0) & jax.lax.stop_gradient(drawn.alphas > 0.5)
+            if frame.masks is not None:
+                known &= frame.masks
+            off = weighted_mean(jnp.abs(drawn.depths - frame.depths), known.astype(value.dtype))
             value += config.depth_weight * off / radius
         if config.strategy == "relocate":
             alive = jax.lax.stop_gradient(is_alive(gaussians).astype(value.dtype))
             value += config.growth.opacity_cost * weighted_mean(gaussians.opacities, alive)
             value += config.growth.scale_cost * weighted_mean(gaussians.scales.mean(-1), alive) / radius
-        told = {
+        aux = {
             "psnr": -10 * jnp.log10(mse),
             "overflow": drawn.meta.overflow.any(),
             "needed": drawn.meta.needed.max(),
         }
         if extra_losses:
             rendered = drawn._replace(colors=image)
-            told["extra"] = extra_terms(extra_losses, model, rendered, Frame(target, seen.depth, camera))
-            value += sum(told["extra"].values())
-        return value, told
+            aux["extra"] = extra_terms(
+                extra_losses, model, rendered, Frame(target, frame.depths, camera, frame.masks)
+            )
+            value += sum(aux["extra"].values())
+        return value, aux
 
     return loss
 
 
-def fit_step(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -> Step:
+def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on a `Model`, and under relocation the walk of 3DGS-MCMC.
 
-    `batch` is a `Batch`, `step` the share of the fit that is done, 0 to 1, and `key` is needed. `info` has
-    `alive` beside what the loss says.
+    `batch` is a `Batch`; `key` is used by the walk; `step` is not, for rates fall with `batch.progress`.
+    `info` has `psnr` and `alive` beside what every step reports.
 
     Args:
         config: of the fit.
-        radius: of the scene, the unit in which means move.
-        extra_losses: of one's own (`gsjax.losses.extra`), beside that of photographs.
+        extra_losses: custom losses (`gsjax.losses.extra`) beside that of photographs.
     """
     named_losses(extra_losses)
     rates = vars(config.rates)
-    loss = fit_loss(config, radius, extra_losses)
+    loss = fit_loss(config, extra_losses)
 
     def of(model: Model) -> Step:
         there = [name for name in rates if getattr(model.gaussians, name, None) is not None]
@@ -130,7 +123,7 @@ def fit_step(config: FitConfig, radius: float, extra_losses: ExtraLosses = ()) -
 
     def update(params: Model, state, batch: Batch, *, step, key: PRNGKeyArray):
         moved, new_state, info = of(params).update(params, state, batch, step=step, key=key)
-        fall = _FINAL_RATE**step
+        radius, fall = batch.radius, _FINAL_RATE**batch.progress
         rate = rates["means"] * radius * fall
         before, after = params.gaussians, moved.gaussians
         means = before.means + rate * (after.means - before.means)

@@ -1,19 +1,19 @@
 """MotionSplicer (papers/001): parts of a moving scene, found by their motion without annotation, and edited.
 
-    anchor = choose_anchor(views.image, views.num_frames, views.num_cameras)
-    moved = moved_pixels(views.image, anchor, views.num_cameras)
-    start = begin(views, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
-    for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
-    parts, _ = without_needless(views, followed.parts, config)
-    for refined in refine(views, parts, config): parts = refined.parts
-    scene, trajectory = outcome(start, parts, times)
+anchor = choose_anchor(views.image, views.num_frames, views.num_cameras)
+moved = moved_pixels(views.image, anchor, views.num_cameras)
+start = begin(views, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
+for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
+parts, _ = without_needless(views, followed.parts, config)
+for refined in refine(views, parts, config): parts = refined.parts
+scene, trajectory = outcome(start, parts, times)
 
-    config.py    what can be set              stream.py   one step of the optimisation
-    anchor.py    which frame is canonical     unify.py    which parts are one
-    masks.py     what moves in every view     follow.py   the loop over frames
-    lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
-    weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
-    discover.py  all that, before any motion  refine.py   all frames together, in the end
+config.py    what can be set              stream.py   one step of the optimisation
+anchor.py    which frame is canonical     unify.py    which parts are one
+masks.py     what moves in every view     follow.py   the loop over frames
+lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
+weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
+discover.py  all that, before any motion  refine.py   all frames together, in the end
 """
 
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, moved_pixels

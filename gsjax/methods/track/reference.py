@@ -72,7 +72,9 @@ def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap:
     return Points(*of_each, jnp.moveaxis(seen, 0, 1) * reference.real[:, None])
 
 
-def as_facing(reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], sight: Sight) -> Points:
+def as_facing(
+    reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], sight: Sight
+) -> Points:
     """Those of one group after a twist about its centre, of which cameras look for what faces them.
 
     What hides a group where it is believed to be need not hide it elsewhere.

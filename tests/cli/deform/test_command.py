@@ -76,13 +76,13 @@ def test_scores_over_time_and_of_classes(deformed):
 def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
     told, heard = ("deform", SCENE, "--out", tmp_path / "run", "--tools", "draw", *SMALL), []
 
-    def hear():  # after each step
+    def raise_if_interrupted():  # after each step
         heard.append(1)
         if len(heard) == 25:  # after the graph was made
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "hear", hear)
+        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
         code, said = gsjax(*told)
     assert code == 130, said
     assert metrics(tmp_path / "run")["complete"] is False

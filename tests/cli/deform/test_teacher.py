@@ -210,13 +210,13 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
 def test_a_run_of_features_goes_on_to_the_same_bits(files, learned, tmp_path, monkeypatch):
     options, heard = ("--features", files, "--deform.rates.features", 0.03), []
 
-    def hear():  # after each step
+    def raise_if_interrupted():  # after each step
         heard.append(1)
         if len(heard) == 25:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "hear", hear)
+        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
         assert main(told(tmp_path / "run", *options)) == 130
     assert main(told(tmp_path / "run", *options, "--resume")) == 0
     ours, theirs = (read_deformation(run / "deformation.npz") for run in (tmp_path / "run", learned))

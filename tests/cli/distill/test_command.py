@@ -106,13 +106,13 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
     told += ("--distill.iterations", 20)
     steps = []
 
-    def hear():
+    def raise_if_interrupted():
         steps.append(1)
         if len(steps) == 5:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "hear", hear)
+        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
         assert gsjax(*told)[0] == 130
     before, mask = (out / "field.npz").read_bytes(), recording / "seg/0/000000.png"
     gaussians = read_ply(file)[0]

@@ -93,13 +93,13 @@ def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, disti
     steps, heard = ("--distill.iterations", STEPS, *TABLE), []
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
 
-    def hear():  # after each step
+    def raise_if_interrupted():  # after each step
         heard.append(1)
         if len(heard) == 105:  # between two rows
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "hear", hear)
+        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
         code, said = gsjax(*told)
     assert code == 130, said
     assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be asked

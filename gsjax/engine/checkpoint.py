@@ -1,0 +1,44 @@
+"""`gsjax.save` and `gsjax.load`: a tick of any method in one file, read back without a template."""
+
+import dataclasses
+import os
+from typing import Any
+
+from gsjax.engine.drive import Tick
+from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+
+
+def save(path: str | os.PathLike, now: Tick) -> None:
+    """Write what a method has come to, its configuration and its result; atomic.
+
+    Args:
+        path: where; `.npz` by custom.
+        now: a tick, the newest one: the arrays of those before it are given away. Custom losses are functions
+            and are not stored; give them again when you go on.
+    """
+    method = now.method
+    if getattr(method, "extra_losses", ()):
+        method = dataclasses.replace(method, extra_losses=())
+    stored = {"method": method, "run": now.run, "result": now.result, "info": now.info}
+    times = {"seconds": now.seconds, "compile_seconds": now.compile_seconds}
+    save_checkpoint(path, stored, times)
+
+
+def load(path: str | os.PathLike) -> Tick:
+    """The tick that `save` wrote. Its `result` is there at once; to go on, give it to the verb that made it:
+    `gsjax.fit(photographs, now.method.config, after=now)`.
+
+    Raises:
+        FileNotFoundError: there is no file at `path`.
+        CheckpointError: it is damaged, of another version of gsjax, or holds something else.
+    """
+    stored, times = load_checkpoint(path)
+    if not isinstance(stored, dict) or set(stored) != {"method", "run", "result", "info"}:
+        raise CheckpointError(
+            f"{path}: expected what gsjax.save writes, found another checkpoint; the resume folder of a run "
+            "is gone on with by --resume"
+        )
+    result: Any = stored.pop("result")
+    now = Tick(problem=None, **stored, **times)
+    vars(now)["result"] = result
+    return now

@@ -1,0 +1,324 @@
+"""How a run of steps goes on: rows of scores, time, a bar for people and lines for a log, and what is saved.
+
+`watch` drives a method to its end for a command; saving, rows and the bar listen to its ticks.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from gsjax.engine.drive import Drive, Tick
+from gsjax.engine.ending import ended
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.interrupts import raise_if_interrupted, shielded
+from gsjax.engine.messages import Notes
+from gsjax.engine.saving import Saver
+from gsjax.io.atomic import atomic_write
+from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from gsjax.optim.method import Run
+
+KEPT = 2
+"""Checkpoints that are kept: one that is damaged leaves the one before."""
+_SHOWN_EVERY_S = 0.2
+_LINES = 10  # of a log
+
+
+@dataclass
+class Progress:
+    """How a run has gone so far.
+
+    Attributes:
+        about: digests of what the run is made from, by what they are of, in words.
+        rows: one every few steps: step, seconds, and what the schedule makes of the steps since the last.
+        recent: info of the steps since the last row.
+        seconds: of all steps, compiling apart.
+        compile_seconds: of tracing and compiling.
+        skipped: steps up to the last row that changed nothing, for a number in them was not finite.
+        stopped: what ended it early, or None.
+    """
+
+    about: Mapping[str, str | None] = field(default_factory=dict)
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    recent: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+    skipped: int = 0
+    stopped: BaseException | None = None
+
+    @property
+    def used_seconds(self) -> float:
+        """Of the time that was given: steps and compiling."""
+        return self.seconds + self.compile_seconds
+
+    def is_over(self, minutes: float | None) -> bool:
+        """Whether this many minutes are used up."""
+        return minutes is not None and self.used_seconds >= 60 * minutes
+
+    def add(self, tick: Tick) -> None:
+        """One step more."""
+        self.seconds += tick.seconds
+        self.compile_seconds += tick.compile_seconds
+        self.recent.append({name: tick.info[name] for name in _scalars(tick.info)})
+
+    def metadata(self) -> dict[str, Any]:
+        """What is saved beside the run."""
+        recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
+        kept = ("rows", "seconds", "compile_seconds", "skipped")
+        return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
+
+    def found(self, steps: int, begun: float) -> dict[str, Any]:
+        """What metrics.json has of it.
+
+        Args:
+            steps: that were made.
+            begun: when the command began, by the performance counter.
+        """
+        return {
+            **ended(self.stopped),
+            "steps": steps,
+            "skipped": self.skipped,
+            "seconds": {
+                "steps": self.seconds,
+                "compile": self.compile_seconds,
+                "total": perf_counter() - begun,
+            },
+            "curve": self.rows,
+        }
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What is shown and recorded of a run.
+
+    Attributes:
+        doing: in a word: "distilling".
+        total: steps, in all.
+        row: infos of the steps since the last row, on the host, without skipped ones -> what the row has
+            beside step and seconds. See `means_of`.
+        words: a row in words.
+        every: steps between rows.
+    """
+
+    doing: str
+    total: int
+    row: Callable[[list[Mapping[str, Any]]], dict[str, Any]]
+    words: Callable[[Mapping[str, Any]], str]
+    every: int = 10
+
+
+def means_of(*names: str) -> Callable[[list[Mapping[str, Any]]], dict[str, Any]]:
+    """The row of a schedule that has the mean of each loss by name, None where no step had it."""
+
+    def row(infos: list[Mapping[str, Any]]) -> dict[str, Any]:
+        found = {}
+        for name in ("loss", *names):
+            values = [float(info[name]) for info in infos if name in info]
+            mean = float(np.mean(values)) if values else np.nan
+            found[name] = mean if np.isfinite(mean) else None  # JSON has no infinity
+        return found
+
+    return row
+
+
+def watch(
+    ticks: Drive,
+    progress: Progress,
+    schedule: Schedule,
+    folder: RunFolder,
+    console: Console,
+    *,
+    minutes: float | None = None,
+    save_every: float | None = None,
+    look: Callable[[Tick], dict[str, Any] | None] | None = None,
+    enough: Callable[[Tick, Mapping[str, Any]], bool] | None = None,
+    listeners: tuple[Callable[[Mapping[str, Any]], None], ...] = (),
+) -> Progress:
+    """Go on until all steps are made, the time is up, Ctrl-C or an error; `ticks.run` is what it came to.
+
+    Args:
+        ticks: the method, from `drive`.
+        progress: how it has gone so far; it is added to.
+        schedule: what is shown and recorded.
+        folder: of the run.
+        console: that shows it.
+        minutes: of steps, compiling included, after which it ends.
+        save_every: seconds of work that may be lost when the run is killed.
+        look: a tick -> what its row has beside, or None; a tick that it says something of gets a row.
+        enough: (tick, its row) -> whether to end there; asked where there is a new row.
+        listeners: called with each new row.
+    """
+    saver = Saver(schedule.doing, save_every)
+
+    def save(last: bool) -> None:
+        saver(lambda: save_run(folder.resume, ticks.run, progress), last=last)
+
+    with _Display(console, schedule, progress, ticks, minutes) as display:
+        try:
+            while not progress.is_over(minutes) and (now := _next(ticks, progress)) is not None:
+                more = None if look is None else look(now)
+                last = now.step == schedule.total or progress.is_over(minutes)
+                row = None
+                if now.step % schedule.every == 0 or last or more is not None:
+                    row = shielded(_add_row, now, progress, schedule, folder, more or {})
+                    for listen in listeners:
+                        listen(row)
+                display.show()
+                if row is not None and enough is not None and enough(now, row):
+                    break
+                save(last=False)
+                raise_if_interrupted()
+        except (KeyboardInterrupt, Exception) as stopped:
+            if any(leaf.is_deleted() for leaf in jax.tree.leaves(ticks.run) if isinstance(leaf, jax.Array)):
+                raise  # a step that failed took the run along: what --resume needs was saved before
+            progress.stopped = stopped
+        save(last=True)
+    return progress
+
+
+def _next(ticks: Drive, progress: Progress) -> Tick | None:
+    """One step more, if there is one to make; it is counted even where Ctrl-C strikes next."""
+    before = ticks.tick
+    now = next(ticks, None)
+    if now is not None and now is not before:
+        progress.add(now)
+    return now
+
+
+def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes: Notes) -> None:
+    """Note where `--minutes` ended it before all steps were made."""
+    if steps < schedule.total and progress.stopped is None:
+        notes.add(f"Stopped by --minutes after {steps:,} of {schedule.total:,} steps.")
+
+
+def save_run(folder: Path, run: Run, progress: Progress) -> None:
+    """Writes a checkpoint; the newest few are kept."""
+    save_checkpoint(_path(folder, run.step), run, progress.metadata())
+    for old in _saved(folder)[:-KEPT]:
+        old.unlink()
+
+
+def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]:
+    """The newest run that is whole, and how it had gone; those given where none was saved.
+
+    Args:
+        folder: RUN/resume.
+        run: before the first step.
+        progress: before the first step, with digests of what it is made from.
+
+    Raises:
+        CheckpointError: there are only damaged ones, or of another version.
+        ValueError: it is made from something else.
+    """
+    wrong, damaged = None, []
+    for path in reversed(_saved(folder)):
+        try:
+            found, stored = load_checkpoint(path)
+        except CheckpointError as error:
+            wrong = error
+            damaged.append(path)
+            continue
+        about = stored.pop("about")
+        others = [what for what, digest in progress.about.items() if about.get(what) != digest]
+        if others:
+            raise ValueError(
+                f"--resume: {' and '.join(others)}: expected what the run in {folder.parent} was begun with, "
+                "found something else; put that back, or replace the run with --overwrite instead"
+            )
+        for later in damaged:  # else they would count among the newest
+            later.unlink()
+        return found, Progress(about, **stored)
+    if wrong is not None:
+        raise wrong
+    return run, progress
+
+
+def _path(folder: Path, step: int) -> Path:
+    return folder / f"step-{step:08d}.npz"
+
+
+def _saved(folder: Path) -> list[Path]:
+    """Checkpoints in the order in which they were made."""
+    return sorted(folder.glob("step-*.npz"))
+
+
+def _scalars(info: Mapping[str, Any]) -> list[str]:
+    """Names of what a row may have: numbers."""
+    return [name for name, value in info.items() if getattr(value, "shape", None) == ()]
+
+
+def _add_row(
+    now: Tick, progress: Progress, schedule: Schedule, folder: RunFolder, more: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A row more, which stands in metrics.jsonl at once."""
+    infos = jax.device_get(progress.recent)
+    sound = [info for info in infos if not info["skipped"]]
+    progress.skipped += len(infos) - len(sound)
+    progress.recent = []
+    row = {"step": now.step, "seconds": progress.used_seconds, **schedule.row(sound), **more}
+    progress.rows.append(row)
+    with atomic_write(folder.metrics_lines) as temporary:
+        temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")
+    return row
+
+
+class _Display:
+    """A bar for people; about ten lines for a log."""
+
+    def __init__(
+        self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, minutes: float | None
+    ):
+        self._console, self._schedule, self._progress = console, schedule, progress
+        self._ticks, self._minutes, self._at, self._line = ticks, minutes, 0.0, int(_LINES * self._share())
+        columns = (
+            TextColumn(schedule.doing),
+            BarColumn(),
+            TextColumn("{task.fields[reached]}"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.description}"),
+        )
+        self._bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._task = self._bar.add_task(
+            "compiling", total=1.0, completed=self._share(), reached=self._reached()
+        )
+
+    def __enter__(self) -> "_Display":
+        if not self._console.is_terminal:
+            words = f"{self._schedule.doing}; compiling, which takes half a minute the first time"
+            self._console.print(words, soft_wrap=True)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def show(self) -> None:
+        """A step is made; a log has a line for each tenth of the way, once there is something to say."""
+        rows, words = self._progress.rows, self._schedule.words
+        if rows and perf_counter() - self._at > _SHOWN_EVERY_S:
+            share, reached = self._share(), self._reached()
+            self._bar.update(self._task, completed=share, description=words(rows[-1]), reached=reached)
+            self._at = perf_counter()
+        tenth = int(_LINES * self._share())
+        if not self._console.is_terminal and rows and tenth > self._line:
+            self._line = tenth
+            self._console.print(f"{self._reached()}: {words(rows[-1])}", soft_wrap=True)
+
+    def _share(self) -> float:
+        """How far it is, in steps or in minutes, whichever is more."""
+        used = 0.0 if self._minutes is None else self._progress.used_seconds / 60 / self._minutes
+        return min(1.0, max(self._ticks.run.step / max(1, self._schedule.total), used))
+
+    def _reached(self) -> str:
+        step = self._ticks.run.step
+        if self._minutes is None:
+            return f"{step:,} of {self._schedule.total:,} steps"
+        return f"{self._progress.used_seconds / 60:.1f} of {self._minutes:g} min, {step:,} steps"
