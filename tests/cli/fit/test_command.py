@@ -23,7 +23,8 @@ from gsjax.engine.fit.ablation import ablate_time
 from gsjax.engine.fit.schedule import Budget, Looks
 from gsjax.engine.progress import Progress
 from gsjax.io.ply import read_ply
-from gsjax.methods.fit import PRESETS
+from gsjax.methods.fit import PRESETS, Fit
+from gsjax.optim.method import Run
 
 QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
 QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")
@@ -290,7 +291,7 @@ def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
         if shares[-1] >= 1:
             break
         seconds = 0.01 if shares[-1] < 0.25 else 0.05  # small photographs first
-        progress.add(Tick(None, None, None, {}, seconds, 5.0 if step == 0 else 0.0))
+        progress.add(Tick(Fit(), None, Run(None, None), {}, seconds, 5.0 if step == 0 else 0.0))
     assert shares[0] == 0.0
     assert shares[1] == pytest.approx(5.01 / 60)
     assert max(np.diff(shares[1:])) < 0.001
