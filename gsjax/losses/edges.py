@@ -1,4 +1,5 @@
-"""Edges of a graph over nodes seen at several times, and how well matches what they tie (papers/003, 2.3).
+"""Edges of a graph over nodes seen at several times, and how well matches what they tie (SurstSplat, section
+2.3).
 
 Nodes are points picked from those of each frame (`gsjax.geometry.sampling`). Frames, nodes and edges are as
 many everywhere, with masks for what is absent. Edges lead to the nearest nodes of the same frame and to those
@@ -101,8 +102,8 @@ def temporal_edges(
 
 
 def similar_edges(features: Features, k: int, window: int = 0, valid: There | None = None) -> Edges:
-    """From each node to the `k` of highest cosine in its own frame (papers/004, eq. 7), or with a `window` in
-    every other frame at most that far away. None from or to a feature without a length.
+    """From each node to the `k` of highest cosine in its own frame (GaussianClin, eq. 7), or with a `window`
+    in every other frame at most that far away. None from or to a feature without a length.
 
     Args:
         features: of n nodes in t frames.

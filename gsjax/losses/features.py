@@ -1,4 +1,4 @@
-"""Losses between a rendered feature map and what a teacher says of its pixels (papers/002, section 3.4).
+"""Losses between a rendered feature map and what a teacher says of its pixels (FD-3DGS, section 3.4).
 
 A field of C channels meets a teacher of D through a linear map W, [D, C], without bias. With g a pixel's C
 rendered numbers and e the teacher's D, all that L_rec (eq. 4) and L_cos (eq. 5) need of W g is

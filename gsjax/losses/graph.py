@@ -1,5 +1,5 @@
-"""What a teacher asks of features that learn, over a graph of nodes and frames (papers/003, section 2.3, and
-papers/004, section 3.3).
+"""What a teacher asks of features that learn, over a graph of nodes and frames (SurstSplat, section 2.3, and
+GaussianClin, section 3.3).
 
 `gsjax.losses.edges` makes edges, their weights and the affinities wanted, once. Then, of features that learn,
 
@@ -87,7 +87,7 @@ def structure_loss(
 
 
 def similarity_loss(features: Features, edges: Edges, valid: There | None = None) -> Float[Array, ""]:
-    """The mean over edges of (1 - cos)^2 (papers/004, eq. 8), without those of a feature that has no length.
+    """The mean over edges of (1 - cos)^2 (GaussianClin, eq. 8), without those of a feature of length 0.
 
     L_s and L_t are this of `similar_edges` of the teacher, within frames and with a window, each with its own
     weight. Features that are all alike have no such loss: something else has to tell them apart.

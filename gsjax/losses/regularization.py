@@ -9,7 +9,7 @@ def total_variation(
     above: Float[Array, "w c"] | None = None,
     inside: Bool[Array, "h"] | None = None,
 ) -> Float[Array, ""]:
-    """Sum over neighbouring pixels and channels of |du| + |dv| (papers/002, eq. 7, before its division by
+    """Sum over neighbouring pixels and channels of |du| + |dv| (FD-3DGS, eq. 7, before its division by
     H W C).
 
     A sum and not a mean, so that strips of an image can be added up.

@@ -1,4 +1,4 @@
-"""Scores of pairs become a matching, whose rows and columns sum to one (papers/003, eq. 10).
+"""Scores of pairs become a matching, whose rows and columns sum to one (SurstSplat, eq. 10).
 
     A = exp(S / tau + f 1^T + 1 g^T),    f and g such that A 1 = 1 and A^T 1 = 1,
 

@@ -2,7 +2,7 @@
 place clean?
 
 It looks at pixels alone, and at what the edit was told to do. It is no GPT-EE, which is GPT-4o's opinion
-(papers/001, section 4.1), and no figure of it bears that name. Each finding has a reason in words.
+(MotionSplicer, section 4.1), and no figure of it bears that name. Each finding has a reason in words.
 
 Videos are [T, H, W, 3], RGB, uint8 or floats 0 to 1; regions [T, H, W]. On the host.
 """

@@ -13,7 +13,7 @@ def feature_psnr(
     teacher: Float[np.ndarray, "..."],
     mask: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
-    """f-PSNR (papers/003, section 4): features as pictures of many channels, each pixel's of length 1, for a
+    """f-PSNR (SurstSplat, section 4): features as pictures of many channels, each pixel's of length 1, for a
     peak of 1.
 
         -10 log10( mean over pixels and channels of (f / |f| - g / |g|)^2 )

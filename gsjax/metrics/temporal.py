@@ -60,8 +60,8 @@ def between_neighbors(
 
 
 def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None) -> float:
-    """Mean SSIM of neighbouring frames (papers/003, section 4); 1 if nothing moves. What T-LPIPS asks a
-    network, 1 - t-SSIM asks windows of 11 pixels.
+    """Mean SSIM of neighbouring frames (SurstSplat, section 4); 1 if nothing moves. 1 - t-SSIM compares
+    windows of 11 pixels, where T-LPIPS compares a network's features.
 
     Args:
         video: [T, H, W, 3], at least two frames.
@@ -76,7 +76,7 @@ def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None 
 def t_lpips(
     weights: LpipsWeights, video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None
 ) -> float:
-    """Mean LPIPS of neighbouring frames (papers/001, section 4.1); 0 if nothing moves.
+    """Mean LPIPS of neighbouring frames (MotionSplicer, section 4.1); 0 if nothing moves.
 
     Args:
         weights: of LPIPS.
@@ -132,7 +132,7 @@ class FlowWarpError(NamedTuple):
 def flow_warp_error(
     video: Num[np.ndarray, "..."], flows: Flows, masks: Bool[np.ndarray, "..."] | None = None
 ) -> FlowWarpError:
-    """Flow-Warp (papers/001, section 4.1): mean |frame t - frame t + 1 brought to t along the flow|.
+    """Flow-Warp (MotionSplicer, section 4.1): mean |frame t - frame t + 1 brought to t along the flow|.
 
     Compared is what both frames show (`gsjax.geometry.flow.seen_in_both`) and both masks hold. Lai et al.
     (2018) square the differences instead.
@@ -162,7 +162,8 @@ def along_flow(
     masks: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
     """The mean over t of compare(frame t + 1 brought to t along the flow, frame t), where `flow_warp_error`
-    compares: warped LPIPS and warped SSIM (papers/003, section 4), which discount motion that is explained.
+    compares: warped LPIPS and warped SSIM (SurstSplat, section 4), which discount motion that the flow
+    explains.
 
     Elsewhere both pictures show frame t, so that a window or network that reaches there finds no difference.
 

@@ -1,8 +1,8 @@
 """Scenes that deform: what a field says of each Gaussian at a time, and the Gaussians there.
 
     mean' = mean + dmean,    scale' = exp(log s + ds)
-    q' = Exp(dw) q                    SurstSplat (papers/003, eq. 4): dw an axis times an angle
-    q' = normalize(q + dq)            GaussianClin (papers/004, eq. 3), with q of length 1
+    q' = Exp(dw) q                    SurstSplat, eq. 4: dw an axis times an angle
+    q' = normalize(q + dq)            GaussianClin, eq. 3, with q of length 1
 
 A field has an encoding of place and time, a small network on it, and a last layer that begins at zero, so
 that nothing moves before it was trained. Encodings are in `gsjax.scene.time_encodings`.
@@ -31,7 +31,7 @@ class DeformationConfig:
 
     kind: Literal["hexplane", "mlp", "voxels"] = "hexplane"
     """Encoding of place and time: six planes a level, of each pair of axes (Cao and Johnson 2023); sines of
-    both; or a dense grid of voxels in space and sines of the time (papers/003, section 2.1)."""
+    both; or a dense grid of voxels in space and sines of the time (SurstSplat, section 2.1)."""
     rotation: Literal["exp", "add"] = "exp"
     """An axis and angle before the rotation, as in SurstSplat, or a difference of quaternions, as in
     GaussianClin."""

@@ -1,6 +1,6 @@
 """A field over a box: features in a multiresolution hash grid, and a small network on them (Müller et al.
 2022, "Instant Neural Graphics Primitives", section 3). What it maps a place to is up to its user: logits of
-skinning weights (papers/001, section 3.3), or semantic features (papers/002, section 3.3).
+skinning weights (MotionSplicer, section 3.3), or semantic features (FD-3DGS, section 3.3).
 
 Level l has a resolution N_l, and b is such that they reach from the least to the most (eq. 2, 3):
 
@@ -36,7 +36,7 @@ _FIRST_FEATURES = 1e-4  # largest at the start, as in the paper
 
 @dataclass(frozen=True)
 class FeatureGridConfig:
-    """Sizes of a grid and of its network; the defaults are those of FD-3DGS (papers/002, section 4)."""
+    """Sizes of a grid and of its network; the defaults are those of FD-3DGS, section 4."""
 
     levels: int = 16
     """Resolutions, from the coarsest to the finest; a place has features of each."""

@@ -1,7 +1,7 @@
 """Handles: a few rigid motions that move many Gaussians, each by its own weights (linear blend skinning).
 
 A handle p has a place c_p in the canonical scene, a rotation R_p about it and a translation T_p. A Gaussian
-with weights w moves as MotionSplicer has it (papers/001, section 3.3):
+with weights w moves as in MotionSplicer, section 3.3:
 
     mean' = sum_p w_p (R_p (mean - c_p) + c_p + T_p)
 

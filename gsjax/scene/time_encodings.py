@@ -132,7 +132,7 @@ class Sinusoids(eqx.Module):
 
 
 def sinusoids(values: Float[Array, "N D"], frequencies: int) -> Float[Array, "N size"]:
-    """Values in 0 to 1, -1 to 1, beside their sines and cosines (papers/003, section 2.1: gamma)."""
+    """Values in 0 to 1, -1 to 1, beside their sines and cosines (SurstSplat, section 2.1: gamma)."""
     centered = 2 * values - 1
     phases = centered[..., None] * (np.pi * 2.0 ** np.arange(frequencies)).astype(values.dtype)
     waves = jnp.concatenate([jnp.sin(phases), jnp.cos(phases)], axis=-1)
@@ -140,7 +140,7 @@ def sinusoids(values: Float[Array, "N D"], frequencies: int) -> Float[Array, "N 
 
 
 class Voxels(eqx.Module):
-    """Dense neural voxels (papers/003, section 2.1) beside sines of the time. They stand for what is where,
+    """Dense neural voxels (SurstSplat, section 2.1) beside sines of the time. They stand for what is where,
     "organ or background", so meanings are read from them too.
 
     Attributes:
