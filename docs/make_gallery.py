@@ -166,8 +166,7 @@ def page(shown: dict[str, str]) -> str:
         "",
         "Small runs on built-in scenes (simulated, and no results), with their commands, and figures "
         "of [experiments](experiments.md): `gsjax experiment run NAME` makes each, and "
-        "`experiments/NAME/results.md` "
-        "has its full caption. `make gallery` takes 20 minutes the first time.",
+        "`experiments/NAME/results.md` has its full caption. `make gallery` takes 20 minutes the first time.",
         "",
         "## Speed against accuracy",
         "",
