@@ -131,7 +131,7 @@ def test_each_kind_of_warning_is_shown_once_and_counted(capfd):
 
 def test_a_preset_is_where_the_trackers_settings_begin(monkeypatch, tmp_path):
     chosen = []
-    monkeypatch.setattr("gsjax.engine.track.run", lambda options: chosen.append(options) or 0)
+    monkeypatch.setattr("gsjax.cli.track.run", lambda options: chosen.append(options) or 0)
     command = ["track", "simulated:tabletop", "--out", str(tmp_path / "run")]
     for more in ([], ["--preset", "fast"], ["--preset=fast", "--track.align.iterations", "3"]):
         assert main([*command, *more]) == 0

@@ -38,7 +38,7 @@ def opened(monkeypatch):
         return result
 
     monkeypatch.setattr(Sequence, "mask", watched)
-    monkeypatch.setattr("gsjax.engine.track.follow", followed)
+    monkeypatch.setattr("gsjax.cli.track.follow", followed)
     return log
 
 
