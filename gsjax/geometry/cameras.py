@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -172,6 +173,23 @@ def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch
     """Positions of cameras in the world: -R^T t."""
     rotations, translations = viewmats[..., :3, :3], viewmats[..., :3, 3]
     return -jnp.einsum("...ji,...j->...i", rotations, translations, precision="highest")
+
+
+def perturbed(
+    viewmats: Float[Array, "c 4 4"], twist: Float[Array, "6"], radius: float
+) -> Float[Array, "c 4 4"]:
+    """View matrices of cameras that are rotated about their own centres and shifted, all by one twist.
+
+    Args:
+        viewmats: world to camera.
+        twist: a rotation vector (radians) and a shift (in units of `radius`), both along the world's axes.
+        radius: of the scene, metres.
+    """
+    turn = jaxlie.SO3.exp(twist[:3]).as_matrix()
+    rotations = jnp.matmul(viewmats[:, :3, :3], turn.T, precision="highest")
+    centers = -jnp.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3]) + radius * twist[3:]
+    shifts = -jnp.einsum("cij,cj->ci", rotations, centers)
+    return viewmats.at[:, :3, :3].set(rotations).at[:, :3, 3].set(shifts)
 
 
 def pixel_grid(width: int, height: int) -> Float[Array, "height width 2"]:
