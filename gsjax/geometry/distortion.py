@@ -195,8 +195,7 @@ def sample(image: Image, pixels: Float[Array, "height width 2"]) -> Warped:
 
 
 def _padded(coeffs: Coeffs, model: str) -> tuple[Float[Array, "9"], Bool[Array, ""]]:
-    """Coefficients of `_bend` (numerator r^2 to r^8, denominator r^2 to r^6, p1, p2), and whether all are
-    finite.
+    """Coefficients of `_bend` (numerator r^2..r^8, denominator r^2..r^6, p1, p2), and whether all are finite.
 
     If any is not, all are replaced by zeros.
     """
@@ -247,8 +246,7 @@ def _divide(v: Float[Array, "*n 2"], J: Float[Array, "*n 4"]) -> Float[Array, "*
 def _unbend(
     points: Float[Array, "*n 2"], coeffs: Float[Array, "9"]
 ) -> tuple[Float[Array, "*n 2"], Bool[Array, "*n"]]:
-    """The inverse of `_bend`, and where it exists. A step that raises the error or crosses a fold is
-    shortened."""
+    """The inverse of `_bend`, and where it exists. Steps that raise the error or cross a fold shrink."""
     target = jnp.where(jnp.isfinite(points).all(axis=-1, keepdims=True), points, 0.0)
 
     def iteration(_, carry):

@@ -1,5 +1,4 @@
-"""Optical flow: the displacement (x, y) of each pixel from one image to another, pixels; NaN where
-unknown."""
+"""Optical flow: displacements (x, y) of pixels from one image to another, in pixels; NaN where unknown."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped

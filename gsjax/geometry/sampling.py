@@ -19,8 +19,7 @@ def farthest_points(points: Float[Array, "n c"], count: int, valid: Bool[Array, 
     sampled. So no point is farther from its nearest sample than any two samples are from each other.
 
     Args:
-        points: positions. Points that are not finite are never sampled, nor is a second point at the same
-            position.
+        points: positions. Points that are not finite are never sampled, nor are duplicates.
         count: number of samples, static.
         valid: points that may be sampled; default: all.
 
