@@ -112,7 +112,7 @@ def project(
     return homogeneous[..., :2] / jnp.maximum(z, 1e-6)[..., None], z
 
 
-class PixelsOf(NamedTuple):
+class PointPixels(NamedTuple):
     """The pixels onto which points project.
 
     Attributes:
@@ -133,7 +133,7 @@ def pixels_of(
     K: Float[np.ndarray, "3 3"],
     width: int,
     height: int,
-) -> PixelsOf:
+) -> PointPixels:
     """The pixel onto which each point projects, on the host. Occlusion is not tested.
 
     Args:
@@ -147,7 +147,7 @@ def pixels_of(
     xy = (local @ K.T)[:, :2] / ahead[:, None]
     inside = np.isfinite(ahead) & (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)
     columns, rows = np.where(inside[:, None], xy, 0).astype(int).T
-    return PixelsOf(columns, rows, depths, inside)
+    return PointPixels(columns, rows, depths, inside)
 
 
 @partial(jax.jit, inline=True)
