@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 CONVERT = (
-    'In a separate environment with torch: python -c "import sys, numpy, torch; '
+    'In an environment with torch: python -c "import sys, numpy, torch; '
     "w = torch.load(sys.argv[1], map_location='cpu', weights_only=True); "
     'numpy.savez(sys.argv[2], **{k: v.numpy() for k, v in w.items()})" OLD.pth NEW.npz'
 )
