@@ -72,8 +72,8 @@ def _check_no_pickles(folder: Path) -> None:
     named = _read_json(folder / _CONFIG).get("transformers_weights")
     if named is not None:
         raise ValueError(
-            f"{folder / _CONFIG}: expected no transformers_weights, found {named!r}; delete the entry, so that "
-            f"weights come from {_WHOLE}"
+            f"{folder / _CONFIG}: expected no transformers_weights, found {named!r}; delete the entry, "
+            f"so that weights come from {_WHOLE}"
         )
     if (adapter := folder / "adapter_config.json").exists():
         raise ValueError(
