@@ -312,7 +312,7 @@ def live_edges(edges: Edges, there: NodeMask) -> Bool[Array, "t n e"]:
 def edge_cosines(
     features: Features, edges: Edges, there: NodeMask
 ) -> tuple[Float[Array, "t n e"], Bool[Array, "t n e"]]:
-    """Cosine of the two features that each edge joins, and where both are present and non-zero."""
+    """Cosine of the two features that each edge joins, and where both are `there` and non-zero."""
     squared = jnp.sum(features**2, axis=-1)
     products = jnp.sum(features[:, :, None] * _at_ends(features, edges), axis=-1)
     one = jnp.broadcast_to(squared[:, :, None], products.shape)
