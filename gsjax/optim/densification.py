@@ -59,14 +59,14 @@ def relocate(
     source = jnp.where(vacant, source, jnp.arange(count))
     copies = jnp.zeros(count, jnp.int32).at[source].add(vacant.astype(jnp.int32))
     copied = copies > 0
-    opacities, shrink = divided(gaussians.opacities, jnp.clip(copies + 1, 1, _MOST_COPIES))
+    opacities, shrink = split_into_copies(gaussians.opacities, jnp.clip(copies + 1, 1, _MOST_COPIES))
     logits = jnp.where(copied, jnp.log(opacities) - jnp.log1p(-opacities), gaussians.logit_opacities)
     log_scales = gaussians.log_scales + jnp.where(copied, jnp.log(shrink), 0.0)[:, None]
     shared = eqx.tree_at(lambda g: (g.logit_opacities, g.log_scales), gaussians, (logits, log_scales))
     return jax.tree.map(lambda leaf: leaf[source], shared), vacant | copied
 
 
-def divided(
+def split_into_copies(
     opacities: Float[Array, "n"], copies: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """The opacity of each of `copies` Gaussians that together look like one, and the factor on its scales.
@@ -112,7 +112,7 @@ def exploration(
 State = TypeVar("State")
 
 
-def forgotten(state: State, rows: Bool[Array, "n"]) -> State:
+def reset_rows(state: State, rows: Bool[Array, "n"]) -> State:
     """An optimizer state with these rows set to zero in every array that has one row per Gaussian.
 
     Args:

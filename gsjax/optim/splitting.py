@@ -60,7 +60,7 @@ def _only(tree) -> Array:
     return leaf
 
 
-def wanted(gaussians: Gaussians, pull: Pull, threshold: float) -> Bool[Array, "n"]:
+def strongly_pulled(gaussians: Gaussians, pull: Pull, threshold: float) -> Bool[Array, "n"]:
     """Which living Gaussians have a mean pull above the threshold."""
     return is_alive(gaussians) & (pull.mean > threshold)
 
@@ -92,7 +92,7 @@ def divide(
     count = gaussians.num
     largest = gaussians.scales.max(-1)
     fits = is_alive(gaussians) & (largest <= too_large)
-    candidate = wanted(gaussians, pull, threshold) & fits
+    candidate = strongly_pulled(gaussians, pull, threshold) & fits
     vacant = ~fits & (jnp.arange(count) < slots)
     # The k-th candidate, strongest pull first, takes the k-th vacant slot.
     parents = jnp.argsort(jnp.where(candidate, -pull.mean, jnp.inf))
@@ -115,7 +115,7 @@ def divide(
     return eqx.tree_at(lambda g: (g.means, g.log_scales), copied, (means, log_scales)), new | split
 
 
-def with_low_opacities(gaussians: Gaussians) -> Gaussians:
+def reset_opacities(gaussians: Gaussians) -> Gaussians:
     """The Gaussians with opacities limited to `RESET_OPACITY`."""
     most = jnp.log(RESET_OPACITY) - jnp.log1p(-RESET_OPACITY)
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, jnp.minimum(gaussians.logit_opacities, most))

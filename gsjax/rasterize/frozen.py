@@ -71,11 +71,11 @@ def freeze_views(
         raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]
     seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
-    views = [filled_up(view, seen, pairs) for view in shown]
+    views = [padded_view(view, seen, pairs) for view in shown]
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *views), plan
 
 
-def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
+def padded_view(view: FrozenView, seen: int, pairs: int) -> FrozenView:
     """One view with `rows` and `ids` padded, so that views can be stacked: with the first of the N Gaussians,
     which no tile lists for it. On the host.
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from gsjax.optim.densification import EMPTY_LOGIT, is_alive
-from gsjax.optim.splitting import RESET_OPACITY, SHRINK, Pull, divide, wanted, watch_pull, with_low_opacities
+from gsjax.optim.splitting import (
+    RESET_OPACITY,
+    SHRINK,
+    Pull,
+    divide,
+    reset_opacities,
+    strongly_pulled,
+    watch_pull,
+)
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
@@ -103,10 +111,10 @@ def test_pull_is_the_mean_over_the_steps_that_pulled_and_moves_nothing():
     np.testing.assert_array_equal(params.nudges, 0.0)
     assert float(params.a) < 1.0
     alive = scene([0.05] * 3, slots=3)
-    np.testing.assert_array_equal(wanted(alive, pull, 5.0), [True, False, False])
+    np.testing.assert_array_equal(strongly_pulled(alive, pull, 5.0), [True, False, False])
 
 
 def test_a_reset_lowers_opacities_and_raises_none():
     before = scene([0.05] * 2, slots=3)
-    after = with_low_opacities(before)
+    after = reset_opacities(before)
     np.testing.assert_allclose(after.opacities, [RESET_OPACITY, RESET_OPACITY, 1e-6], rtol=1e-4)

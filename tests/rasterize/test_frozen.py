@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.rasterize.frozen import filled_up, freeze_views, paint, strip_of
+from gsjax.rasterize.frozen import freeze_views, padded_view, paint, strip_of
 from gsjax.rasterize.rasterization import rasterization
 
 
@@ -39,7 +39,7 @@ def test_the_padding_of_a_view_is_not_seen(frozen):
     scene, views, plan = frozen
     view = jax.tree.map(lambda a: a[1], views)
     seen, pairs = len(view.rows) + 7, len(view.ids) + 50
-    longer = jax.tree.map(jnp.asarray, filled_up(view, seen, pairs))
+    longer = jax.tree.map(jnp.asarray, padded_view(view, seen, pairs))
     assert {len(a) for a in (longer.rows, longer.means2d, longer.conics, longer.opacities)} == {seen}
     assert len(longer.ids) == pairs
     values = jnp.asarray(np.random.default_rng(4).normal(size=(len(scene["means"]), 3)), jnp.float32)

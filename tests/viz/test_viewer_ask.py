@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsjax.scene.gaussians import concatenate
-from gsjax.viz.viewer import Asking, Found, Viewable, moved, open_viewer
+from gsjax.viz.viewer import Answer, Asking, Viewable, moved, open_viewer
 from gsjax.viz.viewer.ask_folder import heat_of
 from gsjax.viz.viewer.viewable import redone
 from tests.viz.test_viewer_edit import GREEN, RED, ball, rising
@@ -35,11 +35,11 @@ class Answers:
         if text != "green":
             raise ValueError(f"no class <{text}>")
         scores = np.repeat([0.1, 0.9] if frame < 2 else [0.9, 0.1], 150)
-        return Found(text, scores, 0.5, "better than each negative", 0.02)
+        return Answer(text, scores, 0.5, "better than each negative", 0.02)
 
     def like(self, row, frame):
         self.asked.append(row)
-        return Found(
+        return Answer(
             f"like {row}", np.repeat([0.9, 0.1] if row < 150 else [0.1, 0.9], 150), 0.5, "Otsu", 0.01
         )
 
@@ -203,7 +203,7 @@ def test_a_part_of_a_partly_moving_scene(scene):
 
 
 def test_heat_is_bright_above_the_threshold_and_grey_below(scene):
-    found = Found("x", np.linspace(0, 1, 300), 0.5, "", 0.0)
+    found = Answer("x", np.linspace(0, 1, 300), 0.5, "", 0.0)
     colors = heat_of(scene.gaussians, found, found.scores > 0.5)
     assert colors.shape == (300, 3)
     assert colors[found.scores > 0.5].mean() > 2 * colors[found.scores < 0.3].mean()

@@ -8,12 +8,12 @@ ask_folder, page, server.
 
 from gsjax.viz.viewer.pick import Picked, pick
 from gsjax.viz.viewer.server import Viewer, open_viewer
-from gsjax.viz.viewer.viewable import Asking, Editing, Found, Motion, Preview, Shots, Viewable, moved
+from gsjax.viz.viewer.viewable import Answer, Asking, Editing, Motion, Preview, Shots, Viewable, moved
 
 __all__ = [
+    "Answer",
     "Asking",
     "Editing",
-    "Found",
     "Motion",
     "Picked",
     "Preview",

@@ -14,7 +14,7 @@ from gsjax.viz.colors import heat
 from gsjax.viz.viewer import markup
 from gsjax.viz.viewer.debounce import Debouncer
 from gsjax.viz.viewer.drawing import recolored
-from gsjax.viz.viewer.viewable import Asking, Found, Showing, Viewable, redone
+from gsjax.viz.viewer.viewable import Answer, Asking, Showing, Viewable, redone
 
 _TYPED_S = 0.7  # since the last key press
 _SETTLE_S, _PATIENCE_S = 0.05, 0.3  # delays while the threshold slides
@@ -51,7 +51,7 @@ class AskFolder:
         self._scene, self._asking, self._show, self._picked = scene, asking, show, picked
         self._frame, self._in_colour = frame, in_colour
         self._lock, self._num_queries = threading.Lock(), 0  # queries so far
-        self._found: Found | None = None
+        self._found: Answer | None = None
         self._rows: Int[np.ndarray, "shown"] | None = None  # rows of the scene that are shown; None: all
         with gui.add_folder("Ask"):
             self._text = gui.add_text("What", "", hint=asking.hint)
@@ -89,7 +89,7 @@ class AskFolder:
         like = None if row is None else (lambda: self._asking.like(row, self._frame()))
         self._answer(like, _PICK_FIRST)
 
-    def _answer(self, ask: Callable[[], Found] | None, otherwise: str) -> None:
+    def _answer(self, ask: Callable[[], Answer] | None, otherwise: str) -> None:
         """Ask and show the heat of the answer, unless a newer query arrived meanwhile; runs in its own thread
         or in one of viser's."""
         if ask is None:
@@ -110,7 +110,7 @@ class AskFolder:
             if number == self._num_queries:
                 self._accept(found)
 
-    def _accept(self, found: Found) -> None:
+    def _accept(self, found: Answer) -> None:
         """Replace the previous answer."""
         low, high = (
             float(np.floor(100 * found.scores.min()) / 100),
@@ -128,7 +128,7 @@ class AskFolder:
             self._in_colour()
         self._display_worker.request()
 
-    def _selected(self, found: Found) -> Bool[np.ndarray, "n"]:
+    def _selected(self, found: Answer) -> Bool[np.ndarray, "n"]:
         return found.scores > self._threshold.value
 
     def _update_view(self) -> None:
@@ -172,7 +172,7 @@ class AskFolder:
             self._save_status.content = markup.as_lines([f"{error}"], _RED)
 
 
-def heat_of(gaussians: Gaussians, found: Found, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+def heat_of(gaussians: Gaussians, found: Answer, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
     """A colour for each Gaussian by its score, RGB 0 to 1: bright above the threshold; below it dark, over
     dimmed grey scene colours.
 

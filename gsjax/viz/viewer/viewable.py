@@ -115,7 +115,7 @@ class Editing:
     save: Callable[[Sequence[str], str, str, Callable[[int, int], bool]], Path]
 
 
-class Found(NamedTuple):
+class Answer(NamedTuple):
     """The answer to a query.
 
     Attributes:
@@ -150,8 +150,8 @@ class Asking:
     """
 
     hint: str
-    ask: Callable[[str, int], Found]
-    like: Callable[[int, int], Found]
+    ask: Callable[[str, int], Answer]
+    like: Callable[[int, int], Answer]
     save: Callable[[Bool[np.ndarray, "n"], str, int], Path]
 
 
