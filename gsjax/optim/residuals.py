@@ -24,7 +24,7 @@ def block_residual(
         block: width in pixels of the blocks over which differences are averaged. How a single rendered pixel
             changes depends on the Gaussian whose edge it lies on; this is unrelated to the motion, but counts
             in J^T J like image gradients, which makes steps short. Pixels outside full blocks are left out.
-        softness: where rounding starts, as a share of the limit.
+        softness: share of the limit below which differences are rounded off.
     """
     total = _summed(weights, block)
     mean = _summed(difference * weights, block) / jnp.maximum(total, 1e-6)

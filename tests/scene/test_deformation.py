@@ -172,7 +172,7 @@ def test_a_field_of_features_needs_them():
     with pytest.raises(ValueError, match="feature_size"):
         init_deformation(jax.random.key(0), config, BOX)
     field = init_deformation(jax.random.key(0), config, BOX, 2)
-    with pytest.raises(ValueError, match="features: this field"):
+    with pytest.raises(ValueError, match="features: expected an array, as this field"):
         field(jnp.zeros((1, 3)), jnp.asarray(0.0))
     with pytest.raises(ValueError, match="bounds"):
         init_deformation(jax.random.key(0), DeformationConfig(**SMALL), np.array([[0, 0, 0], [1, 0, 1]]))
