@@ -1,6 +1,6 @@
-"""Checkpoints: the arrays of any pytree in one .npz, with JSON metadata and a checksum; never pickle.
+"""Checkpoints: the arrays of any pytree in one .npz file, with JSON metadata and a checksum, without pickle.
 
-The file holds arrays only, so the structure comes from `like`: a tree of the same kind, of any values.
+The file holds arrays only, so the structure comes from `like`: a tree of the same structure, with any values.
 """
 
 import hashlib
@@ -26,20 +26,21 @@ Tree = TypeVar("Tree")
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is damaged or does not fit the tree wanted; the message names what differs."""
+    """A checkpoint is damaged or does not match the requested tree; the message names the difference."""
 
 
 def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write the arrays and numbers of `tree`, and `metadata`, to `path`; atomic.
+    """Write the arrays and numbers of `tree`, and `metadata`, to `path`, atomically.
 
-    Leaves of other kinds (functions, strings) are left out: loading takes them from `like`.
+    Other leaves (functions, strings) are not saved: loading takes them from `like`.
 
     Args:
-        tree: any pytree. Random keys and low-precision floats are kept exactly.
-        metadata: what JSON can hold.
+        path: the file.
+        tree: any pytree. Random keys and low-precision floats are stored exactly.
+        metadata: JSON-serialisable values.
 
     Raises:
-        TypeError: `metadata` holds something that JSON cannot.
+        TypeError: `metadata` is not JSON-serialisable.
     """
     arrays = {name: _to_stored(leaf) for name, leaf in _named_leaves(tree).items()}
     header = {
@@ -49,30 +50,32 @@ def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, A
         "sha256": _checksum({name: array for name, (array, _) in arrays.items()}),
     }
     stored = {name: array for name, (array, _) in arrays.items()}
-    # Uncompressed: optimizers' floats shrink by a tenth, in sixty times the time.
+    # Uncompressed: compression shrinks optimizer states by only a tenth but takes sixty times as long.
     write_npz(path, stored | {_HEADER: np.array(json.dumps(header))}, compress=False)
 
 
 def load_checkpoint(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
-    """The tree that was saved at `path`, in the structure of `like`, and the metadata.
+    """Load the tree saved at `path`, in the structure of `like`, and the metadata.
 
     Args:
-        like: a tree of the wanted structure, shapes and dtypes (`jax.eval_shape` makes one for nothing).
+        path: the file.
+        like: a tree with the expected structure, shapes and dtypes (`jax.eval_shape` makes one for free).
 
     Raises:
         FileNotFoundError: there is no file at `path`.
-        CheckpointError: the file is damaged, or leaves are missing, left over, or of another shape or dtype.
+        CheckpointError: the file is damaged, or leaves are missing, unexpected, or of another shape or dtype.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a checkpoint, found no file. Check the path")
     stored, header = _read(path)
-    wanted = _named_leaves(like)
-    _check_names(path, wanted, stored)
-    loaded = {name: _from_stored(stored[name], header["dtypes"][name], leaf) for name, leaf in wanted.items()}
+    expected = _named_leaves(like)
+    _check_names(path, expected, stored)
+    dtypes = header["dtypes"]
+    loaded = {name: _from_stored(stored[name], dtypes[name], leaf) for name, leaf in expected.items()}
     differing = [
-        f"{name}: stored {_describe(loaded[name])}, wanted {_describe(leaf)}"
-        for name, leaf in wanted.items()
+        f"{name}: expected {_describe(leaf)}, found {_describe(loaded[name])}"
+        for name, leaf in expected.items()
         if _describe(loaded[name]) != _describe(leaf)
     ]
     if differing:
@@ -83,7 +86,7 @@ def load_checkpoint(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str
 
 
 def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
-    """The metadata that was saved at `path`.
+    """The metadata saved at `path`.
 
     Raises:
         CheckpointError: the file is damaged.
@@ -92,7 +95,7 @@ def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header of a checkpoint whose checksum is right."""
+    """The arrays and the header of a checkpoint, after its checksum is verified."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             stored = {name: archive[name] for name in archive.files}
@@ -110,27 +113,27 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     ) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint, found a file that cannot be read as one ({error}). "
-            "It may be cut off or damaged: take another one"
+            "It may be cut off or damaged: use another one"
         ) from error
     if not intact:
         raise CheckpointError(
             f"{path}: expected format {_FORMAT} and a matching checksum, found format {header['format']} "
-            "or changed content. Take another checkpoint"
+            "or changed content. Use another checkpoint"
         )
     return stored, header
 
 
-def _check_names(path: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    missing, left_over = sorted(wanted.keys() - stored.keys()), sorted(stored.keys() - wanted.keys())
-    if missing or left_over:
+def _check_names(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
+    missing, unexpected = sorted(expected.keys() - stored.keys()), sorted(stored.keys() - expected.keys())
+    if missing or unexpected:
         raise CheckpointError(
-            f"{path}: the checkpoint does not fit: it lacks {missing or 'nothing'} "
-            f"and has {left_over or 'nothing'} beyond what is wanted. Was it saved with other options?"
+            f"{path}: the checkpoint does not fit: missing {missing or 'nothing'}, "
+            f"unexpected {unexpected or 'nothing'}. Was it saved with other options?"
         )
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of a tree that are arrays, specs of arrays, or numbers, by their path."""
+    """The leaves of a tree that are arrays, array specs or numbers, by their path."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     kept = (np.ndarray, np.generic, jax.Array, jax.ShapeDtypeStruct, *_SCALARS)
     return {jax.tree_util.keystr(key): leaf for key, leaf in leaves if isinstance(leaf, kept)}
@@ -141,17 +144,17 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_stored(leaf: Any) -> tuple[np.ndarray, str]:
-    """A leaf as an array that .npz can hold, and the name of its true dtype."""
+    """A leaf as an array that .npz can store, and the name of its actual dtype."""
     if _is_key(leaf):
         return np.asarray(jax.random.key_data(leaf)), f"key<{jax.random.key_impl(leaf)}>"
     array = np.asarray(leaf)
-    # bfloat16 and its like are no dtypes of numpy's own; .npz would turn them into nameless bytes.
+    # bfloat16 and the like are not native NumPy dtypes; .npz would store them as raw void bytes.
     plain = array if array.dtype.isbuiltin == 1 else array.view(np.dtype(f"u{array.dtype.itemsize}"))
     return plain, str(array.dtype)
 
 
 def _from_stored(array: np.ndarray, dtype: str, like: Any) -> Any:
-    """The inverse of `_to_stored`, of the kind of `like` (JAX array, numpy array, Python number)."""
+    """The inverse of `_to_stored`, as the kind of `like` (JAX array, NumPy array, Python number)."""
     if dtype.startswith("key<"):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=dtype[len("key<") : -1])
     array = (
@@ -163,14 +166,14 @@ def _from_stored(array: np.ndarray, dtype: str, like: Any) -> Any:
 
 
 def _describe(leaf: Any) -> str:
-    """Shape and dtype of an array, the type of a number."""
+    """Dtype and shape of an array, or the type of a number."""
     if hasattr(leaf, "dtype"):
         return f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
     return type(leaf).__name__
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 over the names, dtypes, shapes and bytes of arrays, in order of name."""
+    """SHA-256 of the names, dtypes, shapes and bytes of arrays, in order of name."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
