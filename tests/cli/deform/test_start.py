@@ -110,7 +110,7 @@ def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
     np.testing.assert_array_equal(sequence.viewmats[1, 0], some.viewmats[7])
     sizes = some.sizes.copy()
     sizes[3] += 2
-    with pytest.raises(DataError, match="frames of 48x36 as the first, found 50x38 in"):
+    with pytest.raises(DataError, match="frames of 48x36 like the first, found 50x38 in"):
         in_order(replace(some, sizes=sizes))
 
 
