@@ -17,7 +17,7 @@ from gsjax.cli.recording import expect_enough_left, open_recording, parse_frames
 from gsjax.cli.run.files import read_options
 from gsjax.cli.run.folder import expect_dataset
 from gsjax.data.errors import DataWarning
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
+from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.methods.reconstruction import View
 
@@ -50,7 +50,7 @@ def choose_photographs(
             folder of a run.
     """
     expect_dataset(dataset)
-    if is_of_photographs(dataset) or not is_recording(dataset):
+    if is_photographs(dataset) or not is_recording(dataset):
         photographs = open_photographs(dataset, read)
         for option, ids in (("--cameras", cameras), ("--eval-cameras", eval_cameras)):
             if ids:

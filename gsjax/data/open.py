@@ -160,7 +160,7 @@ def is_recording(path: str | Path) -> bool:
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
-def is_of_photographs(path: str | Path) -> bool:
+def is_photographs(path: str | Path) -> bool:
     """Whether a path holds photographs of a static scene rather than a recording over time. EndoNeRF folders
     are both: `open_photographs` reads the left eye's frames, `open_sequence` everything."""
     if str(path).startswith(SIMULATED_PREFIX):

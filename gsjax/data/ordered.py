@@ -7,20 +7,20 @@ import numpy as np
 
 from gsjax.data.errors import DataError
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs, open_sequence
+from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
 
 
-def open_in_time(dataset: str, read: ReadOptions | None = None) -> Sequence:
+def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
     """Open a recording, or a set of photographs as one, as `gsjax poses` writes it for a video.
 
     Raises:
         DataError: the data cannot be read, or photographs differ in size.
     """
-    if is_of_photographs(dataset) and not is_recording(dataset):
-        return in_order(open_photographs(dataset, read))
+    if is_photographs(dataset) and not is_recording(dataset):
+        return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
 
 
@@ -29,7 +29,7 @@ def _by_numbers(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def in_order(photographs: Photographs) -> Sequence:
+def sequence_of(photographs: Photographs) -> Sequence:
     """The photographs as frames of camera 0, in order of their times or, without times, of their names.
     Pixels that masks exclude are labelled as tool. Lengths stay in the photographs' unit.
 

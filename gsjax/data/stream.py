@@ -1,7 +1,7 @@
 """Live streams of frames: the consumer always gets the newest; those it is too slow for are dropped.
 
 A source is any iterator of `Snapshot`s that blocks until one is available: a recording replayed in real time,
-cameras read through OpenCV, or a user-defined iterator. `Newest` reads it in a thread of its own.
+cameras read through OpenCV, or a user-defined iterator. `NewestSnapshots` reads it in a thread of its own.
 """
 
 import threading
@@ -59,7 +59,7 @@ class Counts:
     longest_gap_s: float = 0.0
 
 
-class Newest:
+class NewestSnapshots:
     """Iterates over the newest snapshots of a source, each at most once, while a thread keeps reading.
 
     Args:

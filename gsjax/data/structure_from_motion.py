@@ -72,7 +72,7 @@ class MotionConfig:
             raise ValueError(f"mapping_threads: expected 1 or more, or -1, found {self.mapping_threads}")
 
 
-class Placed(NamedTuple):
+class SfmResult(NamedTuple):
     """The result of structure from motion.
 
     Attributes:
@@ -128,7 +128,7 @@ def list_photographs(folder: Path) -> list[str]:
     return good
 
 
-def place_photographs(
+def reconstruct_cameras(
     folder: Path,
     names: Sequence[str],
     work: Path,
@@ -136,7 +136,7 @@ def place_photographs(
     *,
     in_order: bool = False,
     stage: Callable[[str], AbstractContextManager] = lambda description: nullcontext(),
-) -> Placed:
+) -> SfmResult:
     """Estimate the cameras of photographs and the 3D points that they see.
 
     The world's axes and unit are arbitrary, as COLMAP chooses them: photographs alone determine neither.
@@ -192,7 +192,7 @@ def place_photographs(
     if config.refine_center and _fewest_photographs_per_camera(best) >= _ENOUGH_FOR_CENTER:
         timed("refining", "refining cameras", lambda: _refine(pycolmap, best, config))
     registered = sorted(best.images[i].name for i in best.reg_image_ids())
-    return Placed(
+    return SfmResult(
         model=best,
         names=tuple(registered),
         left_out=tuple(sorted(set(names) - set(registered))),
@@ -204,7 +204,7 @@ def place_photographs(
     )
 
 
-def few_of(names: Sequence[str]) -> str:
+def shortened(names: Sequence[str]) -> str:
     """Names joined for a message, shortened to the first few if there are many."""
     return ", ".join(names[:_NAMED_AT_MOST]) + (", ..." if len(names) > _NAMED_AT_MOST else "")
 

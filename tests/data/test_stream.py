@@ -11,7 +11,7 @@ import pytest
 
 from gsjax.data import DataError
 from gsjax.data.opencv_cameras import calibrated_camera, open_camera, snapshots
-from gsjax.data.stream import Newest, Snapshot, StreamStalled, back_and_forth, replay
+from gsjax.data.stream import NewestSnapshots, Snapshot, StreamStalled, back_and_forth, replay
 from gsjax.geometry.cameras import Camera
 from gsjax.scene.frame import Frame
 
@@ -30,7 +30,7 @@ def test_a_consumer_that_keeps_up_loses_nothing():
             yield snapshot(stamp)
             taken.acquire()
 
-    newest, stamps = Newest(source()), []
+    newest, stamps = NewestSnapshots(source()), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
         taken.release()
@@ -47,7 +47,7 @@ def test_a_slow_consumer_gets_only_the_newest():
         yield from map(snapshot, range(1, 9))
         rest.set()
 
-    newest, stamps = Newest(source()), []
+    newest, stamps = NewestSnapshots(source()), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
         if arrival.snapshot.stamp == 0:  # processing that takes as long as eight frames
@@ -66,7 +66,7 @@ def test_snapshots_out_of_order_or_out_of_sync_are_dropped_and_counted():
             if shot.stamp in (1, 3):
                 taken.acquire(timeout=1)
 
-    newest, stamps = Newest(source(), max_skew=0.02), []
+    newest, stamps = NewestSnapshots(source(), max_skew=0.02), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
         taken.release(2)
@@ -83,7 +83,7 @@ def test_a_stalled_stream_raises_an_error():
         never.wait(5)
 
     with pytest.raises(StreamStalled, match=r"nothing for 0.1 s after 1 frames"):
-        received.extend(arrival.snapshot.stamp for arrival in Newest(source(), patience=0.1))
+        received.extend(arrival.snapshot.stamp for arrival in NewestSnapshots(source(), patience=0.1))
     never.set()
 
 
@@ -93,7 +93,7 @@ def test_an_exception_of_the_source_is_raised_in_the_consumer():
         raise DataError("camera 0", "a picture", "none", "Check its connection.")
 
     with pytest.raises(DataError, match="camera 0"):
-        list(Newest(source()))
+        list(NewestSnapshots(source()))
 
 
 def test_a_recording_goes_back_and_forth_without_jumps():

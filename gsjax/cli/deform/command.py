@@ -26,8 +26,8 @@ from gsjax.cli.run.ending import exit_code, finish
 from gsjax.cli.run.folder import RunFolder, expect_dataset
 from gsjax.cli.run.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.data import Photographs
-from gsjax.data.open import is_of_photographs, is_recording, open_photographs
-from gsjax.data.ordered import open_in_time
+from gsjax.data.open import is_photographs, is_recording, open_photographs
+from gsjax.data.ordered import open_as_sequence
 from gsjax.io.ply import write_ply
 from gsjax.methods.surgical import (
     PRESETS,
@@ -149,8 +149,8 @@ def run(options: Options) -> int:
 def _recording(options: Options, notes: Notes) -> Deep:
     """The recording, the camera that is learned from first, with its depth."""
     told = (options.frames, options.read, options.scale)
-    whole = open_recording(options.dataset, (), (), *told, opened=open_in_time).judged
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    whole = open_recording(options.dataset, (), (), *told, opened=open_as_sequence).judged
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):

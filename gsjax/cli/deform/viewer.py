@@ -16,7 +16,7 @@ from gsjax.cli.deform.prompts import Wanted, wanted_like, wanted_text
 from gsjax.cli.messages import Notes, describe
 from gsjax.cli.query.selected import EXTRACTED, keep_part
 from gsjax.cli.run.files import reopen
-from gsjax.data.ordered import open_in_time
+from gsjax.data.ordered import open_as_sequence
 from gsjax.methods.surgical.query import most_likely
 from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
 
@@ -103,7 +103,7 @@ def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
     """The cameras of all frames, with what they saw if that is still there."""
     load = None
     try:
-        sequence = reopen(path / "config.yml", _AGAIN, opened=open_in_time)[0].judged
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
         if found != (wanted := (len(stored.times), *stored.size)):
             raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")

@@ -15,7 +15,7 @@ from gsjax.cli.options import Common, OneDataset, Reading
 from gsjax.cli.run.folder import expect_dataset
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.errors import MissingFile
-from gsjax.data.open import is_of_photographs, is_recording
+from gsjax.data.open import is_photographs, is_recording
 from gsjax.methods.reconstruction import extent_of
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -41,7 +41,7 @@ def run(options: Options) -> int:
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
     expect_dataset(options.dataset)
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):
         sequence = open_sequence(options.dataset, options.read)

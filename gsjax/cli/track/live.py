@@ -23,7 +23,7 @@ from gsjax.cli.run.ending import ended, exit_code
 from gsjax.cli.run.folder import RunFolder
 from gsjax.cli.track.scoring import budget_metrics
 from gsjax.data.opencv_cameras import open_camera, snapshots
-from gsjax.data.stream import Arrival, Newest, Snapshot, replay
+from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.methods.object_tracker import PRESETS, Tracked, TrackedScene, start_scene, track
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
@@ -274,7 +274,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         console: shows how far it is.
     """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
-    newest = Newest(source.snapshots, patience=options.patience)
+    newest = NewestSnapshots(source.snapshots, patience=options.patience)
     arrived: list[Arrival] = []
 
     def frames() -> Iterator[Frame]:
