@@ -25,6 +25,7 @@ from tests.data.faulty import (
     frame,
     gone,
     holds,
+    load_all,
     moved,
     patch,
     picture,
@@ -226,10 +227,10 @@ DYNERF = (
 )
 
 PHOTOGRAPHS = {
-    "nerfstudio": Layout(build_transforms, lambda r: all_of(open_photographs(r)), TRANSFORMS),
-    "Blender": Layout(build_blender, lambda r: all_of(open_photographs(r)), BLENDER),
-    "COLMAP text": Layout(build_colmap_text, lambda r: all_of(open_photographs(r)), COLMAP_TEXT),
-    "COLMAP binary": Layout(build_colmap_binary, lambda r: all_of(open_photographs(r)), COLMAP_BINARY),
-    "LLFF": Layout(build_llff, lambda r: all_of(read_llff(r, "endonerf")), LLFF),
-    "DyNeRF": Layout(build_dynerf, lambda r: all_of(read_dynerf(r, "endonerf")), DYNERF),
+    "nerfstudio": Layout(build_transforms, lambda r: load_all(open_photographs(r)), TRANSFORMS),
+    "Blender": Layout(build_blender, lambda r: load_all(open_photographs(r)), BLENDER),
+    "COLMAP text": Layout(build_colmap_text, lambda r: load_all(open_photographs(r)), COLMAP_TEXT),
+    "COLMAP binary": Layout(build_colmap_binary, lambda r: load_all(open_photographs(r)), COLMAP_BINARY),
+    "LLFF": Layout(build_llff, lambda r: load_all(read_llff(r, "endonerf")), LLFF),
+    "DyNeRF": Layout(build_dynerf, lambda r: load_all(read_dynerf(r, "endonerf")), DYNERF),
 }
