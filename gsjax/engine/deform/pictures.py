@@ -11,13 +11,12 @@ from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.engine.deform.file import StoredDeformation
-from gsjax.engine.deform.prompts import Wanted
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.selected import Changes
 from gsjax.geometry.cameras import Camera
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
+from gsjax.methods.deform import DeformResult, Wanted
 from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
@@ -57,7 +56,7 @@ class _Seen(NamedTuple):
 
 def draw(
     folder: Path,
-    stored: StoredDeformation,
+    result: DeformResult,
     pictured: Sequence[int],
     wanted: Wanted,
     threshold: float,
@@ -69,7 +68,7 @@ def draw(
 
     Args:
         folder: for them.
-        stored: the scene.
+        result: the scene.
         pictured: positions of the frames.
         wanted: what is asked for.
         threshold: of the score of a Gaussian, and of a pixel.
@@ -80,15 +79,15 @@ def draw(
         How many pixels each mask has.
     """
     pixels: dict[str, int] = {}
-    with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, console):
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
             assert seen.gaussians.features is not None
             selected = wanted.scores(seen.gaussians.features) > threshold
-            both = {f"frame {stored.frame_ids[seen.t]}": to_uint8(seen.colors)}
+            both = {f"frame {result.timeline.frame_ids[seen.t]}": to_uint8(seen.colors)}
             both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
             video.write(in_rows(both, 2, _PANEL_HEIGHT))
             if seen.t in pictured:
-                name = f"{stored.frame_ids[seen.t]:06d}"
+                name = f"{result.timeline.frame_ids[seen.t]:06d}"
                 mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
                 write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
                 pixels[name] = int(mask.sum())
@@ -101,48 +100,53 @@ def draw(
 
 
 def draw_labels(
-    folder: Path, stored: StoredDeformation, pictured: Sequence[int], console: Console
+    folder: Path, result: DeformResult, pictured: Sequence[int], console: Console
 ) -> dict[str, dict[str, float]]:
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
     beside what each pixel most likely is.
 
     Args:
         folder: for them.
-        stored: what a run learned.
+        result: what a run learned.
         pictured: frames, counted from 0.
         console: shows how far it is.
 
     Returns:
         By frame, which share of the picture each name has.
     """
-    assert stored.meaning is not None
-    codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
+    assert result.meaning is not None
+    codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
-    with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, console):
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
             said = np.asarray(probabilities_of(seen.features, codebook))
             labels = np.where(seen.there, 1 + most_likely(said), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
             panel = in_rows(
-                {f"frame {stored.frame_ids[seen.t]}": colors, "what is what": over}, 2, _PANEL_HEIGHT
+                {f"frame {result.timeline.frame_ids[seen.t]}": colors, "what is what": over}, 2, _PANEL_HEIGHT
             )
             video.write(panel)
             if seen.t in pictured:
-                name = f"{stored.frame_ids[seen.t]:06d}"
+                name = f"{result.timeline.frame_ids[seen.t]:06d}"
                 write_png(folder / "masks" / f"{name}.png", labels.astype(np.uint8))
                 write_png(folder / "frames" / f"{name}.png", panel)
                 shares[name] = {
-                    word: float((labels == label).mean()) for label, word in enumerate(stored.names, 1)
+                    word: float((labels == label).mean()) for label, word in enumerate(result.names, 1)
                 }
     return shares
 
 
-def _frames(stored: StoredDeformation, console: Console) -> Iterator[_Seen]:
+def _frame_rate(result: DeformResult) -> int:
+    """Pictures a second of a film of all frames."""
+    return frame_rate(result.timeline.times * result.timeline.seconds)
+
+
+def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
     """All frames, one after the other."""
     plan = None
-    for t in track(range(len(stored.times)), "drawing", console=console, transient=True):
-        gaussians, camera = stored.at(stored.times[t]), stored.camera(t)
+    for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
+        gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
         drawn, plan = render_with_room(gaussians, camera, plan)
         assert drawn.features is not None
         there = np.asarray(drawn.alphas[0]) > _OPAQUE

@@ -13,15 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
 
-from gsjax.engine.deform.file import StoredDeformation
 from gsjax.engine.deform.pictures import draw, draw_labels, probabilities_of
-from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import parse_frames
 from gsjax.engine.selected import Changes, write_scenes, write_selection
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
+from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
 from gsjax.methods.deform.query import most_likely, region_feature
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
@@ -71,7 +70,7 @@ class DeformQuestion:
 
 def answer_deformation(
     path: Path,
-    stored: StoredDeformation,
+    result: DeformResult,
     question: DeformQuestion,
     changes: Changes,
     folder: Path,
@@ -95,17 +94,17 @@ def answer_deformation(
 
     Args:
         path: of the run.
-        stored: what it learned.
+        result: what it learned.
         question, changes, folder, notes, console: as for a field's `answer`.
 
     Raises:
         ValueError: the question cannot be understood, or means nothing of the scene.
         FileExistsError: something is in the folder that is no answer.
     """
-    t = _frame(stored, question.frame)
-    shown = sorted({t, *_pictured(stored, question)})
-    there = stored.at(stored.times[t])
-    if stored.meaning is None or there.features is None:
+    t = _frame(result, question.frame)
+    shown = sorted({t, *_pictured(result, question)})
+    there = result.at(result.timeline.times[t])
+    if result.meaning is None or there.features is None:
         raise ValueError(
             f"{path}: expected a scene that knows what is what in it, found none with features: there "
             "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
@@ -115,20 +114,20 @@ def answer_deformation(
         "text": question.text,
         "point": question.point,
         "box": question.box,
-        "features": stored.meaning.source.kind,
-        "names": stored.names,
-        "frame": int(stored.frame_ids[t]),
+        "features": result.meaning.source.kind,
+        "names": result.names,
+        "frame": int(result.timeline.frame_ids[t]),
         "of": there.num,
     }
     if question.text is None and question.region is None:
-        codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
+        codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
         said, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
         with replaced_folder(folder, OF_QUERY) as new:
-            found = _write_labels(new, stored, there, said)
-            told = about | found | {"shares": draw_labels(new, stored, shown, console), "notes": notes.all}
+            found = _write_labels(new, result, there, said)
+            told = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
             write_json(new / "query.json", told)
         return told
-    wanted = wanted_of(stored, question, t, there)
+    wanted = wanted_of(result, question, t, there)
     scores, about["query_seconds"] = _timed(lambda: wanted.scores(there.features))
     threshold = wanted.threshold(scores, question.threshold)
     selected = scores > threshold.value
@@ -137,7 +136,7 @@ def answer_deformation(
         every, scenes = np.arange(there.num), changes.of(there, selected)
         write_selection(new / "selection.npz", there, selected, scores, every, there.num)
         write_scenes(new, there, selected, scenes)
-        pixels = draw(new, stored, shown, wanted, threshold.value, changes, console)
+        pixels = draw(new, result, shown, wanted, threshold.value, changes, console)
         means = np.asarray(there.means)[selected]
         told = about | {
             "meant": wanted.meant,
@@ -182,24 +181,24 @@ def _check_count(
 
 
 def _write_labels(
-    folder: Path, stored: StoredDeformation, there: Gaussians, said: Float[np.ndarray, "n k"]
+    folder: Path, result: DeformResult, there: Gaussians, said: Float[np.ndarray, "n k"]
 ) -> dict[str, Any]:
     """Writes what all Gaussians most likely are; returns how many are what, and in which colour they stand in
     recolored.ply."""
     labels = 1 + most_likely(said)
-    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": said, "names": stored.names})
-    colors = {name: label_color(label) for label, name in enumerate(stored.names, 1)}
+    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": said, "names": result.names})
+    colors = {name: label_color(label) for label, name in enumerate(result.names, 1)}
     shades = np.array([INVALID, *colors.values()], np.float32) / 255
     write_ply(folder / "recolored.ply", recolored(there, shades[labels]), labels=labels)
-    counts = {name: int((labels == label).sum()) for label, name in enumerate(stored.names, 1)}
+    counts = {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)}
     return {"classes": counts, "colors": colors}
 
 
-def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
+def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
     """What a text, a point or a box is in the scene's channels.
 
     Args:
-        stored: what a run learned.
+        result: what a run learned.
         question: what is asked.
         t: the frame that is asked about.
         there: the scene at that frame.
@@ -208,29 +207,29 @@ def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there
         ValueError: the text cannot be read, or nothing of the scene lies there.
         FileNotFoundError: weights are not there.
     """
-    assert stored.meaning is not None
+    assert result.meaning is not None
     if question.region is None:
         assert question.text is not None
-        source = stored.meaning.source
+        source = result.meaning.source
         told = (question.negatives, lambda: source.encoder(question.weights))
-        return wanted_text(stored.meaning, question.text, *told)
-    drawn, _ = render_with_room(there, stored.camera(t))
+        return wanted_text(result.meaning, question.text, *told)
+    drawn, _ = render_with_room(there, result.camera(t))
     assert drawn.features is not None
     try:
         feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region)
     except ValueError as error:
         option = "--point" if question.box is None else "--box"
-        raise ValueError(f"{option}: {error} (frame {stored.frame_ids[t]})") from None
-    return wanted_like(stored.meaning, feature.astype(np.float64))
+        raise ValueError(f"{option}: {error} (frame {result.timeline.frame_ids[t]})") from None
+    return wanted_like(result.meaning, feature.astype(np.float64))
 
 
-def _frame(stored: StoredDeformation, frame: int | None) -> int:
+def _frame(result: DeformResult, frame: int | None) -> int:
     """The position of a frame.
 
     Raises:
         ValueError: the run had none that is called so.
     """
-    known = stored.frame_ids.tolist()
+    known = result.timeline.frame_ids.tolist()
     if frame is None:
         return 0
     if frame not in known:
@@ -238,13 +237,13 @@ def _frame(stored: StoredDeformation, frame: int | None) -> int:
     return known.index(frame)
 
 
-def _pictured(stored: StoredDeformation, question: DeformQuestion) -> list[int]:
+def _pictured(result: DeformResult, question: DeformQuestion) -> list[int]:
     """Positions of the frames that pictures are made of."""
     if question.frames is None:
-        return stored.held_out.tolist()
-    chosen = list(range(len(stored.times))[parse_frames(question.frames)])
+        return result.timeline.held_out.tolist()
+    chosen = list(range(len(result.timeline.times))[parse_frames(question.frames)])
     if not chosen:
         raise ValueError(
-            f"--frames: {question.frames} holds no frame of the run, which has {len(stored.times)}"
+            f"--frames: {question.frames} holds no frame of the run, which has {len(result.timeline.times)}"
         )
     return chosen
