@@ -137,7 +137,7 @@ def draw_labels(
     return shares
 
 
-def _frame_rate(result: DeformResult) -> int:
+def _frame_rate(result: DeformResult) -> float:
     """Pictures a second of a film of all frames."""
     return frame_rate(result.timeline.times * result.timeline.seconds)
 

@@ -18,7 +18,7 @@ from gsjax.engine.messages import Notes, describe
 from gsjax.engine.selected import EXTRACTED, keep_part
 from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
 from gsjax.methods.deform.query import most_likely
-from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
+from gsjax.viz.viewer import Answer, Asking, Motion, Shots, Viewable
 
 _AGAIN = "reconstruct it again with this version of gsjax"
 
@@ -39,7 +39,7 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
     kind = None if result.meaning is None else result.meaning.source.kind
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
-    first, labels = result.at(0.0), None
+    first, labels, times = result.at(0.0), None, result.timeline.times
     if result.meaning is not None and first.features is not None:
         said = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
         labels = 1 + most_likely(np.asarray(said))
@@ -48,10 +48,8 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
         first,
         labels,
         dict(enumerate(result.names, 1)),
-        motion=Motion(
-            len(result.timeline.times), first.num, lambda frame: result.at(result.timeline.times[frame])
-        ),
-        times=result.timeline.times * result.timeline.seconds,
+        motion=Motion(len(times), first.num, lambda frame: result.at(times[frame])),
+        times=times * result.timeline.seconds,
         shots=_shots(path, result, notes),
         unit="m" if result.timeline.metric else "",
         asking=None if labels is None else asking_of(path, result, weights),
@@ -75,30 +73,28 @@ def asking_of(path: Path, result: DeformResult, weights: Path | None = None) -> 
         assert features is not None
         return features
 
-    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Found:
+    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Answer:
         jax.block_until_ready(wanted.scores(features))  # what compiles is no answer's time
         begun = perf_counter()
         scores = np.asarray(wanted.scores(features))
         seconds = perf_counter() - begun
-        return Found(words, scores, *wanted.threshold(scores), seconds)
+        return Answer(words, scores, *wanted.threshold(scores), seconds)
 
     one_by_one, encoder = threading.Lock(), cache(lambda: meaning.source.encoder(weights))
 
-    def ask(text: str, frame: int) -> Found:
+    def ask(text: str, frame: int) -> Answer:
         with one_by_one:  # several pages may ask before the encoder is loaded
             wanted = wanted_text(meaning, text, encoder=encoder)
         return answer(text, wanted, features_in(frame))
 
-    def like(row: int, frame: int) -> Found:
+    def like(row: int, frame: int) -> Answer:
         features = features_in(frame)
         wanted = wanted_like(meaning, np.asarray(features[row], np.float64))
         return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
-        there, called = (
-            result.at(result.timeline.times[frame]),
-            f"{name} frame {result.timeline.frame_ids[frame]}",
-        )
+        timeline = result.timeline
+        there, called = result.at(timeline.times[frame]), f"{name} frame {timeline.frame_ids[frame]}"
         return keep_part(path / EXTRACTED, called, there, selected)
 
     return Asking(meaning.hint(weights), ask, like, save)
