@@ -9,19 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gsjax
-from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.deform import (
     DeformConfig,
     DeformingScene,
     DeformRatesConfig,
-    begin_deform,
     deform_loss,
-    of_step,
-    reconstruct,
     refined_viewmats,
 )
 from gsjax.scene.deformation import DeformationConfig
-from tests.methods.tissue import looks_of
 
 TINY = DeformationConfig(resolution=16, time_resolution=4, levels=1, channels=4, hidden=16)
 CONFIG = DeformConfig(
