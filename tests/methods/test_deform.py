@@ -90,7 +90,7 @@ class TestStart:
         with pytest.raises(ValueError, match="masks: in no frame does any pixel count; are they inverted"):
             method.start([replace(frame, masks=np.zeros_like(frame.masks)) for frame in frames])
         with pytest.raises(ValueError, match="frames: expected one picture"):
-            method.start([frames[0], replace(frames[1], images=frames[1].images[:, :-2])])
+            method.start([frames[0], eqx.tree_at(lambda f: f.images, frames[1], frames[1].images[:, :-2])])
         with pytest.raises(ValueError, match="codebook: expected rows of 4 numbers, found 3"):
             method.start(frames, lesson._replace(codebook=np.eye(2, 3)))
         with pytest.raises(ValueError, match="expected ids of 1 rows of the codebook, or -1, found 1 in"):
@@ -98,7 +98,7 @@ class TestStart:
         with pytest.raises(ValueError, match="lesson: expected ids of 2 frames, found those of 5"):
             method.start(frames[:2], lesson)
         with pytest.raises(ValueError, match="frames: expected depths of"):
-            method.start([frames[0], replace(frames[1], depths=frames[1].depths[:, :-2])])
+            method.start([frames[0], eqx.tree_at(lambda f: f.depths, frames[1], frames[1].depths[:, :-2])])
         lone = np.zeros_like(frames[0].depths)
         lone[0, 20, 20] = 0.1
         with pytest.raises(ValueError, match="depth: expected a scene of some extent"):
@@ -155,8 +155,8 @@ class TestLearning:
 
     def test_the_field_opens_after_the_warm_up_and_the_graph_comes_later(self, learned):
         *_, infos = learned
-        assert [i for i, info in enumerate(infos) if "planes" in info][0] == 8
-        assert [i for i, info in enumerate(infos) if "node" in info][0] == 8 + 35
+        assert next(i for i, info in enumerate(infos) if "planes" in info) == 8
+        assert next(i for i, info in enumerate(infos) if "node" in info) == 8 + 35
 
     def test_depth_that_is_no_number_is_unknown(self, frames):
         depths = frames[0].depths.copy()
