@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,14 +10,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gsjax
+from gsjax.engine.drive import drive
 from gsjax.methods.deform import (
+    Deform,
     DeformConfig,
     DeformingScene,
     DeformRatesConfig,
+    Kept,
+    batch_of,
     deform_loss,
     refined_viewmats,
+    times_of,
 )
 from gsjax.scene.deformation import DeformationConfig
+from tests.methods.tissue import frames_of
 
 TINY = DeformationConfig(resolution=16, time_resolution=4, levels=1, channels=4, hidden=16)
 CONFIG = DeformConfig(
