@@ -12,7 +12,8 @@ import pytest
 
 from gsjax.engine.drive import drive
 from gsjax.losses.extra import extra_terms
-from gsjax.methods.deform import Deform, DeformConfig, batch_of, deform_loss, with_field
+from gsjax.methods.deform import Deform, DeformConfig, deform_loss, with_field
+from gsjax.methods.deform import batch_of as deform_batch_of
 from gsjax.methods.fit import Fit, FitConfig, StartConfig, fit_loss
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.refine import RefineBatch as PartsBatch
@@ -227,7 +228,7 @@ class TestOtherMethods:
         config = DeformConfig(start_pixels=2.0, deformation=TINY)
         problem, run = Deform(config).start(over_time(photographs))
         scene, _ = with_field(config, problem, run.params)
-        added = slope_added(lambda extra: deform_loss(config, extra), scene, batch_of(problem, run, 0))
+        added = slope_added(lambda extra: deform_loss(config, extra), scene, deform_batch_of(problem, run, 0))
         np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
         assert np.any(added.field.layers[-1].weight)  # through the deformation
 
