@@ -19,7 +19,6 @@ from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import with_depth
 from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.drive import Drive, Tick, drive
-from gsjax.engine.fit.start import start_from
 from gsjax.engine.messages import Notes
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
@@ -49,6 +48,8 @@ def fit(
         ValueError: as `gsjax.methods.fit.Fit.start`.
         DataError: a photograph cannot be read.
     """
+    from gsjax.engine.fit.start import start_from  # matching is seldom needed, and slow to import
+
     frames = [photographs.frame(i) for i in range(photographs.num)]
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
