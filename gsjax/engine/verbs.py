@@ -8,22 +8,18 @@ is its `result`:
     now.result
 """
 
-import warnings
+from typing import TYPE_CHECKING, Literal
 
-from rich.console import Console
-
-from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
-from gsjax.engine.deform.data import Tools, deform_data
-from gsjax.engine.deform.depth import with_depth
-from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.drive import Drive, Tick, drive
-from gsjax.engine.messages import Notes
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.fit import Fit, FitConfig
 from gsjax.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsjax.engine.distill.choice import TeacherChoice
 
 
 def fit(
@@ -61,8 +57,8 @@ def deform(
     sequence: Sequence,
     config: DeformConfig | None = None,
     *,
-    teacher: TeacherChoice | str | None = None,
-    tools: Tools = "leave-out",
+    teacher: "TeacherChoice | str | None" = None,
+    tools: Literal["leave-out", "draw"] = "leave-out",
     tool_values: tuple[int, ...] = (),
     first: int | None = None,
     gaussians: Gaussians | None = None,
@@ -97,27 +93,8 @@ def deform(
         DataError: a picture, depth or mask cannot be read.
         FileNotFoundError: weights or feature files are not there.
     """
-    notes = Notes(Console(quiet=True))
+    from gsjax.engine.deform.start import start_from  # teachers are slow to import
+
     method = Deform(DeformConfig() if config is None else config, extra_losses)
-    choice = TeacherChoice(teacher or "auto") if not isinstance(teacher, TeacherChoice) else teacher
-    choice = None if choice.features == "none" else choice
-    if choice is not None:
-        choice.check(also=("none",))
-    seen, source = with_depth(sequence, "auto", method.config.plane_depth, notes)
-    data = deform_data(
-        seen, 0, tools, choice, method.config.channels, tool_values, notes, Console(quiet=True)
-    )
-    if first is not None and first not in data.train:
-        raise ValueError(f"first: expected one of the frames to learn from, {data.train}, found {first}")
-    begun_with = data.first if first is None else data.train.index(first)
-    problem, run = method.start(
-        data.frames,
-        data.lesson,
-        first=begun_with,
-        gaussians=gaussians,
-        timeline=data.timeline(metric=source != "plane"),
-    )
-    for note in notes.all:
-        if note.startswith("Warning: "):
-            warnings.warn(note.removeprefix("Warning: "), DataWarning, stacklevel=2)
+    problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
     return drive(method, problem, run if after is None else after.run)

@@ -21,6 +21,7 @@ from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.deform.poses import as_refined
 from gsjax.engine.deform.results import print_results, write_results
 from gsjax.engine.deform.scores import judge
+from gsjax.engine.deform.start import NOBODY
 from gsjax.engine.distill.choice import TeacherChoice, TeacherOptions
 from gsjax.engine.drive import drive
 from gsjax.engine.ending import exit_code, finish
@@ -34,8 +35,6 @@ from gsjax.io.ply import write_ply
 from gsjax.methods.deform import PRESETS, Deform, DeformConfig
 from gsjax.methods.deform.method import PLAN
 
-NOBODY = "none"
-"""The name of `--features` without a teacher."""
 _LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
 _HARDLY = 0.95  # of the error of a scene that stands still
 _UNLIKE = 0.6  # an IoU
