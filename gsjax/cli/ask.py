@@ -33,7 +33,7 @@ HELP = (
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax ask` is told."""
+    """Options of `gsjax ask`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax deform`."""
@@ -70,13 +70,13 @@ def run(options: Options) -> int:
         facts = facts_of_run(result, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
-        told = {
+        found = {
             "question": options.question,
             "type": asked.kind,
             **answer._asdict(),
             "facts": _used(asked, facts),
         }
-        print(json.dumps(told, indent=1))
+        print(json.dumps(found, indent=1))
     else:
         print(answer.text)
     return 0
@@ -96,8 +96,8 @@ def facts_of_run(result: DeformResult, rows: list[int]) -> SceneFacts:
     cameras = Camera(viewmats, Ks, *result.timeline.size, result.timeline.near)
     frames = result.timeline.frame_ids[rows].tolist()
     times = result.timeline.times[rows]
-    told = (times, cameras, result.meaning.codebook, result.names, frames)
-    return scene_facts(result.scene, result.moving, *told, metric=result.timeline.metric)
+    seen = (times, cameras, result.meaning.codebook, result.names, frames)
+    return scene_facts(result.scene, result.moving, *seen, metric=result.timeline.metric)
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:

@@ -34,9 +34,9 @@ class DeformData:
         train: indices of frames to learn from.
         test: indices of frames that are held out.
         frames: what the camera saw in the former.
-        lesson: what a teacher says of these; None without a teacher.
-        held_out: what the teacher says of frames in `test`.
-        taught: digest of what the teacher says, in hexadecimal.
+        lesson: a teacher's labels of these; None without a teacher.
+        held_out: the teacher's labels of frames in `test`.
+        taught: digest of what the teacher teaches, in hexadecimal.
         tool_values: mask values that are tools; those with names of tools where there is none.
     """
 
@@ -88,7 +88,7 @@ class DeformData:
         return found.hexdigest()
 
     def labels(self, t: int) -> Labels | None:
-        """What the teacher says of a frame; None where that is nothing."""
+        """The teacher's labels of a frame; None where it has none."""
         if self.lesson is None or t not in self.train:
             return self.held_out.get(t)
         return Labels(self.lesson.ids[self.train.index(t)], self.lesson.codebook)

@@ -1,4 +1,4 @@
-"""Pictures of what a query means of a deforming scene: masks, the scene beside its edits, and a film."""
+"""Pictures of a query of a deforming scene: masks, the scene beside its edits, and a film."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ from gsjax.viz.colors import in_rows, overlay_labels, to_uint8
 
 _PANEL_HEIGHT = 240  # pixels, at least
 _OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
-_SAID = {"recolored": "recoloured", "moved": "moved"}
+_WORDS = {"recolored": "recoloured", "moved": "moved"}
 
 probabilities_of = jax.jit(prompt_probabilities)
 """`prompt_probabilities` of Gaussians or of a picture, compiled."""
@@ -69,14 +69,14 @@ def draw(
     Args:
         folder: for them.
         result: the scene.
-        pictured: positions of the frames.
-        wanted: what is asked for.
+        pictured: indices of the frames.
+        wanted: what is looked for.
         threshold: of the score of a Gaussian, and of a pixel.
-        changes: what else is done with what is meant.
-        console: shows how far it is.
+        changes: edits of what is meant.
+        console: shows progress.
 
     Returns:
-        How many pixels each mask has.
+        The number of pixels of each mask.
     """
     pixels: dict[str, int] = {}
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
@@ -93,7 +93,7 @@ def draw(
                 pixels[name] = int(mask.sum())
                 scenes = {"it alone": hidden(seen.gaussians, ~selected)}
                 changed = changes.of(seen.gaussians, np.asarray(selected))
-                scenes |= {_SAID[edit]: scene for edit, scene in changed.items()}
+                scenes |= {_WORDS[edit]: scene for edit, scene in changed.items()}
                 panels = both | {words: _picture(scene, seen) for words, scene in scenes.items()}
                 write_png(folder / "frames" / f"{name}.png", in_rows(panels, 2, _PANEL_HEIGHT))
     return pixels
@@ -107,20 +107,20 @@ def draw_labels(
 
     Args:
         folder: for them.
-        result: what a run learned.
-        pictured: frames, counted from 0.
-        console: shows how far it is.
+        result: of a run.
+        pictured: indices of the frames.
+        console: shows progress.
 
     Returns:
-        By frame, which share of the picture each name has.
+        By frame, the share of the picture that each name has.
     """
     assert result.meaning is not None
     codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
     with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
         for seen in _frames(result, console):
-            said = np.asarray(probabilities_of(seen.features, codebook))
-            labels = np.where(seen.there, 1 + most_likely(said), 0)
+            likely = np.asarray(probabilities_of(seen.features, codebook))
+            labels = np.where(seen.there, 1 + most_likely(likely), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
             panel = in_rows(

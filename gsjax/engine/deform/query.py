@@ -3,6 +3,7 @@ them are, at every time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,18 +31,18 @@ from gsjax.viz.viewer.drawing import recolored
 
 @dataclass(frozen=True)
 class DeformQuestion:
-    """What is asked of a deforming scene: one of text, point and box; without any, what everything is.
+    """A query of a deforming scene: one of text, point and box; without any, what everything is.
 
     Attributes:
-        text: one of the scene's names, or what the encoder of its features reads.
+        text: one of the scene's names, or a text for the encoder of its features.
         point: x, y in pixels of a frame, as the scene was learned.
         box: x0, y0, x1, y1, likewise.
-        frame: what the recording calls the frame in which point and box lie, and whose Gaussians are written;
-            the first unless given.
-        frames: of which pictures are made, as Python slices them; the held-out ones unless given.
-        threshold: of the score; by a rule unless given.
-        negatives: texts that a text is held against, where an encoder reads it; its own unless given.
-        weights: of CLIP, where they are now.
+        frame: the recording's number of the frame in which point and box lie, and whose Gaussians are written
+            (default: the first).
+        frames: those that pictures are made of, as a Python slice (default: the held-out ones).
+        threshold: of the score (default: by a rule).
+        negatives: texts that a text is held against, where an encoder reads it (default: the encoder's own).
+        weights: folder of CLIP's, where they are now.
     """
 
     text: str | None = None
@@ -60,7 +61,7 @@ class DeformQuestion:
 
     @property
     def words(self) -> str:
-        """What was asked, in short."""
+        """The query in short."""
         if self.point is not None:
             return "what is at {:g},{:g}".format(*self.point)
         if self.box is not None:
@@ -77,11 +78,11 @@ def answer_deformation(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Ask, and write what is found into a folder; returns what query.json says.
+    """Answer a query and write what is found into a folder; returns the content of query.json.
 
         query/
-          query.json          what was asked, how many Gaussians are meant, where, how large; pixels by frame
-          selection.npz       as a field's, of the frame that was asked about (rows of the run's scene.ply)
+          query.json          the query; the Gaussians that are meant: count, place, size; pixels by frame
+          selection.npz       as a field's, of the frame in question (rows of the run's scene.ply)
           object.ply          what was found, in that frame; without.ply the scene without it, recolored.ply
                               with it in another colour, moved.ply with it elsewhere
           masks/FRAME.png     255 where a pixel's own features mean it
@@ -94,7 +95,7 @@ def answer_deformation(
 
     Args:
         path: of the run.
-        result: what it learned.
+        result: its scene.
         question, changes, folder, notes, console: as for a field's `answer`.
 
     Raises:
@@ -121,12 +122,12 @@ def answer_deformation(
     }
     if question.text is None and question.region is None:
         codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
-        said, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
+        likely, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
         with replaced_folder(folder, OF_QUERY) as new:
-            found = _write_labels(new, result, there, said)
-            told = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
-            write_json(new / "query.json", told)
-        return told
+            found = _write_labels(new, result, there, likely)
+            answer = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
+            write_json(new / "query.json", answer)
+        return answer
     wanted = wanted_of(result, question, t, there)
     scores, about["query_seconds"] = _timed(lambda: wanted.scores(there.features))
     threshold = wanted.threshold(scores, question.threshold)
@@ -138,7 +139,7 @@ def answer_deformation(
         write_scenes(new, there, selected, scenes)
         pixels = draw(new, result, shown, wanted, threshold.value, changes, console)
         means = np.asarray(there.means)[selected]
-        told = about | {
+        answer = about | {
             "meant": wanted.meant,
             "against": wanted.against,
             "threshold": threshold.value,
@@ -150,12 +151,12 @@ def answer_deformation(
             "pixels": pixels,
             "notes": notes.all,
         }
-        write_json(new / "query.json", told)
-    return told
+        write_json(new / "query.json", answer)
+    return answer
 
 
 def _timed(score: Callable[[], Float[jax.Array, "*n"]]) -> tuple[Float[np.ndarray, "*n"], float]:
-    """Scores, and the seconds that they took; what compiles is no answer's time."""
+    """Scores, and the seconds that they took, without compiling."""
     jax.block_until_ready(score())
     begun = perf_counter()
     return np.asarray(score()), perf_counter() - begun
@@ -169,7 +170,7 @@ def _check_count(
     frame: int,
     notes: Notes,
 ) -> None:
-    """Raises a ValueError where nothing is meant, and says where all is."""
+    """Raises a ValueError where nothing is meant, and warns where everything is."""
     if not selected.any():
         raise ValueError(
             f"{question.words} means nothing of this scene in frame {frame}: the best score is "
@@ -181,12 +182,12 @@ def _check_count(
 
 
 def _write_labels(
-    folder: Path, result: DeformResult, there: Gaussians, said: Float[np.ndarray, "n k"]
+    folder: Path, result: DeformResult, there: Gaussians, likely: Float[np.ndarray, "n k"]
 ) -> dict[str, Any]:
-    """Writes what all Gaussians most likely are; returns how many are what, and in which colour they stand in
+    """Writes what all Gaussians most likely are; returns the number of each name, and its colour in
     recolored.ply."""
-    labels = 1 + most_likely(said)
-    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": said, "names": result.names})
+    labels = 1 + most_likely(likely)
+    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": likely, "names": result.names})
     colors = {name: label_color(label) for label, name in enumerate(result.names, 1)}
     shades = np.array([INVALID, *colors.values()], np.float32) / 255
     write_ply(folder / "recolored.ply", recolored(there, shades[labels]), labels=labels)
@@ -195,12 +196,12 @@ def _write_labels(
 
 
 def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
-    """What a text, a point or a box is in the scene's channels.
+    """A text, a point or a box in the scene's channels.
 
     Args:
-        result: what a run learned.
-        question: what is asked.
-        t: the frame that is asked about.
+        result: of a run.
+        question: the query.
+        t: index of the frame in question.
         there: the scene at that frame.
 
     Raises:
@@ -211,8 +212,8 @@ def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gau
     if question.region is None:
         assert question.text is not None
         source = result.meaning.source
-        told = (question.negatives, lambda: source.encoder(question.weights))
-        return wanted_text(result.meaning, question.text, *told)
+        encoder = partial(source.encoder, question.weights)
+        return wanted_text(result.meaning, question.text, question.negatives, encoder)
     drawn, _ = render_with_room(there, result.camera(t))
     assert drawn.features is not None
     try:
@@ -224,10 +225,10 @@ def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gau
 
 
 def _frame(result: DeformResult, frame: int | None) -> int:
-    """The position of a frame.
+    """The index of a frame.
 
     Raises:
-        ValueError: the run had none that is called so.
+        ValueError: the run had none of this number.
     """
     known = result.timeline.frame_ids.tolist()
     if frame is None:
@@ -238,7 +239,7 @@ def _frame(result: DeformResult, frame: int | None) -> int:
 
 
 def _pictured(result: DeformResult, question: DeformQuestion) -> list[int]:
-    """Positions of the frames that pictures are made of."""
+    """Indices of the frames that pictures are made of."""
     if question.frames is None:
         return result.timeline.held_out.tolist()
     chosen = list(range(len(result.timeline.times))[parse_frames(question.frames)])

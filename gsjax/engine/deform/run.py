@@ -13,7 +13,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data import Photographs, Sequence
-from gsjax.data.open import is_of_photographs, is_recording, open_photographs
+from gsjax.data.open import is_photographs, is_recording, open_photographs
 from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import Depth, DepthSource, with_depth
@@ -143,7 +143,7 @@ def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
     """The recording, the camera that is learned from first, with its depth, and where that is from."""
     chosen = (options.frames, options.read, options.scale)
     whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):

@@ -1,4 +1,4 @@
-"""A reconstruction of a recording, begun as `gsjax deform` begins it, but of all frames and without a word."""
+"""A reconstruction of a recording, begun as `gsjax deform` begins it, but of all frames and silently."""
 
 import warnings
 

@@ -31,7 +31,7 @@ _ALIKE = 0.98  # cosine of directions that are of one kind
 
 
 class Labels(NamedTuple):
-    """What a teacher says of a frame.
+    """A teacher's labels of a frame.
 
     Attributes:
         ids: row of the codes of each of the teacher's pixels, -1 for none; a grid of any size.

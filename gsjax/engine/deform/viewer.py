@@ -1,4 +1,4 @@
-"""A run of `gsjax deform` in the viewer: over time, and how it is asked."""
+"""A run of `gsjax deform` in the viewer, over time, with queries."""
 
 import threading
 from functools import cache
@@ -29,7 +29,7 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
 
     Args:
         path: of the run.
-        notes: told of what is odd.
+        notes: receives what is odd.
         weights: of CLIP, where they are now.
 
     Raises:
@@ -41,8 +41,8 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
         raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
     first, labels, times = result.at(0.0), None, result.timeline.times
     if result.meaning is not None and first.features is not None:
-        said = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
-        labels = 1 + most_likely(np.asarray(said))
+        likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
+        labels = 1 + most_likely(np.asarray(likely))
     return Viewable(
         path.absolute().name,
         first,

@@ -24,8 +24,8 @@ class Meaning:
     """What features mean, apart from any frame.
 
     Attributes:
-        source: what made the features that were learned, which knows who reads texts in their space
-            (`gsjax.engine.distill.source.Source`).
+        source: what made the features that were learned, which knows the encoder that reads texts in their
+            space (`gsjax.engine.distill.source.Source`).
         names: of what the features tell apart: classes, or groups of features that are alike.
         codebook: the feature of each name.
         basis: orthonormal columns that bring the source's vectors of D numbers into the scene's channels.
@@ -48,13 +48,13 @@ class Meaning:
 
 
 class Lesson(NamedTuple):
-    """What a teacher says of frames, pixel by pixel.
+    """A teacher's labels of frames, pixel by pixel.
 
     Attributes:
         ids: of each frame, the row of the codebook of each of the teacher's pixels, -1 for none; a grid of
             any size, the same in all frames.
         codebook: the teacher's features, in the scene's channels.
-        meaning: what these mean; None where nobody asks.
+        meaning: what these mean; None without names.
     """
 
     ids: Sequence[Int[np.ndarray, "h w"]]
@@ -84,7 +84,7 @@ class Wanted(NamedTuple):
 
     Attributes:
         vectors: in the scene's channels, a row a candidate: directions, or what the channels have of them.
-        row: which of them is asked for.
+        row: of the one that is looked for.
         meant: the name that it has or is the most like; None of a text that an encoder reads.
         against: the others, in words.
         least: the encoder's own threshold of a cosine; None where it has none.
@@ -138,7 +138,7 @@ def wanted_text(
 
     Args:
         meaning: of the scene's features.
-        text: what is asked for.
+        text: what is looked for.
         negatives: texts that it is held against (default: the source's own). Of no use for names.
         encoder: loads the encoder that reads texts (default: the source's own). Not called for names.
 

@@ -1,4 +1,4 @@
-"""The reconstruction as one value: which frame is next, when the field opens, who moves, and the graph."""
+"""The reconstruction as one value: the next frame, when the field opens, what moves, and the graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -32,7 +32,7 @@ from gsjax.scene.render import plan_render
 PLAN = "view"
 """The name in `Run.plans` of the plan that frames are drawn with."""
 _OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
-_GATE_AFTER = 0.25  # of the steps with deformation: until then it is seen who moves
+_GATE_AFTER = 0.25  # of the steps with deformation: until then all may move
 _THIN = 0.2  # radii: a scene is taken to reach this far along an axis at least, as a plane does not
 _MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
 
@@ -42,7 +42,7 @@ class Problem(NamedTuple):
 
     Attributes:
         frames: what a camera saw, on the host.
-        lesson: what the teacher says of them; None without a teacher.
+        lesson: the teacher's labels of them; None without a teacher.
         seen: the same frames on the device.
         ids: the teacher's ids of pixels that count, on the device; None without.
         codebook: of the teacher, on the device; None without.
@@ -106,7 +106,7 @@ class Deform:
         Args:
             frames: what one camera saw over time, all of one size, on the host. Where none has depth, the
                 scene begins on a plane.
-            lesson: what a teacher says of these frames, in `config.channels` numbers.
+            lesson: a teacher's labels of these frames, with codes of `config.channels` numbers.
             first: index of the frame that the canonical scene is like (default: the first with depth where a
                 pixel counts, or where one counts if none has depth).
             gaussians: canonical scene to begin with, less what cannot be drawn (default: made of depth, or on
@@ -155,7 +155,7 @@ class Deform:
         return self.config.warmup + self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Opens the field after the warm-up, settles who deforms, and makes the graph."""
+        """Opens the field after the warm-up, chooses the Gaussians that go on moving, and makes the graph."""
         config, step = self.config, run.step
         if step == config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
@@ -248,7 +248,7 @@ def _graph_from(config: DeformConfig) -> int:
 
 
 def _gate_from(config: DeformConfig) -> int:
-    """The step before which it is settled who deforms."""
+    """The step before which the Gaussians that go on moving are chosen."""
     return config.warmup + round(_GATE_AFTER * config.iterations)
 
 
