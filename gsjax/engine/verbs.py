@@ -8,10 +8,18 @@ is its `result`:
     now.result
 """
 
+from typing import TYPE_CHECKING, Literal
+
 from gsjax.data.photographs import Photographs
+from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.losses.extra import ExtraLosses
+from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.fit import Fit, FitConfig
+from gsjax.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsjax.engine.distill.choice import TeacherChoice
 
 
 def fit(
@@ -42,4 +50,51 @@ def fit(
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
+    return drive(method, problem, run if after is None else after.run)
+
+
+def deform(
+    sequence: Sequence,
+    config: DeformConfig | None = None,
+    *,
+    teacher: "TeacherChoice | str | None" = None,
+    tools: Literal["leave-out", "draw"] = "leave-out",
+    tool_values: tuple[int, ...] = (),
+    first: int | None = None,
+    gaussians: Gaussians | None = None,
+    after: Tick | None = None,
+    extra_losses: ExtraLosses = (),
+) -> Drive:
+    """Reconstruct a scene that deforms, seen by one camera (SurstSplat, GaussianClin).
+
+    Args:
+        sequence: from `gsjax.open_sequence`; all frames of its first camera are learned from (`select`
+            chooses). Depth is the camera's own, else matched with the second camera's pictures, else the
+            scene begins on a plane.
+        config: how it is learned; the default settings unless given.
+        teacher: whose features are learned beside colours: "classes" of masks, "closed", a folder of feature
+            files, "none", or a `TeacherChoice` with weights and masks. By default classes, where there are
+            two or more among the pixels that count.
+        tools: whether tools, by the names of mask values, are left out ("leave-out") or drawn ("draw").
+        tool_values: mask values that are tools, whatever their names are.
+        first: index of the frame that the canonical scene is like (default: with classes the earliest that
+            shows most of them, else the first in which a pixel counts).
+        gaussians: canonical scene to begin with (default: made of depth).
+        after: a tick of an earlier reconstruction of the same sequence, to go on from.
+        extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
+
+    Returns:
+        ticks, whose `result` is a `DeformResult`: `at(time)` are the `Gaussians` at a time, 0 to 1, and
+        `query(text)` scores them.
+
+    Raises:
+        ValueError: as `gsjax.methods.deform.Deform.start`; the teacher does not fit the recording; or `first`
+            is not learned from.
+        DataError: a picture, depth or mask cannot be read.
+        FileNotFoundError: weights or feature files are not there.
+    """
+    from gsjax.engine.deform.start import start_from  # teachers are slow to import
+
+    method = Deform(DeformConfig() if config is None else config, extra_losses)
+    problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
     return drive(method, problem, run if after is None else after.run)

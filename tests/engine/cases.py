@@ -5,8 +5,10 @@ from functools import cache
 
 import jax.numpy as jnp
 
+from gsjax.methods.deform import Deform
 from gsjax.methods.fit import Fit, FitConfig, StartConfig
 from tests.methods.photographed_blobs import photographed_blobs
+from tests.methods.tissue import CONFIG, tissue
 
 FIT = FitConfig(
     steps=40, cap=120, sh_degree=1, sh_every=20, coarse_until=0.3, start=StartConfig(count=100), seed=1
@@ -38,4 +40,15 @@ def fit_step_case():
     return step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
 
 
-STEPS = {"fit": fit_step_case}
+def deform_step_case():
+    """With deformation, features and a graph."""
+    frames, lesson = tissue()
+    method = Deform(replace(CONFIG, warmup=0, graph=replace(CONFIG.graph, after=0)))
+    problem, run = method.start(frames, lesson)
+    run = method.between(problem, run, 0.0)
+    batch, _ = method.batch(problem, run, 0.0)
+    sick = batch._replace(codebook=batch.codebook * jnp.nan)
+    return method.step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
+
+
+STEPS = {"fit": fit_step_case, "deform": deform_step_case}
