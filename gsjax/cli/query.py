@@ -119,7 +119,7 @@ def run(options: Options) -> int:
     # A tracked run answers over time, but not to what only fields can.
     tracked, of_field = (
         (options.run / "trajectory.npz").is_file(),
-        _first_given(options.gaussians, options.distill),
+        _first_given(options.gaussians, options.field),
     )
     try:
         if (options.run / DEFORMATION).is_file():
@@ -175,7 +175,7 @@ def _ask_field(options: Options, field: Path, console: Console) -> int:
     folder = options.run / "query"
     with Notes(console) as notes:
         with stage(console, "reading the field"):
-            now = Whereabouts(options.distill.scene, options.distill.images, options.weights)
+            now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(field, notes, now)
         told = answer(found, question, changes, folder, notes, console)
     _print(question.words, found.unit, "photographs", told, perf_counter() - begun)
@@ -256,7 +256,7 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
         ValueError: more than one of text, point and box, or options that such a scene has no use for.
     """
     asked, deform = options.gaussians, options.deform
-    others = {"camera": options.camera, **vars(options.distill)}
+    others = {"camera": options.camera, **vars(options.field)}
     others |= {n: v for n, v in vars(options.track).items() if v != getattr(TrackOptions(), n)}
     if unused := [name for name, value in others.items() if value is not None]:
         name = unused[0].replace("_", "-")
@@ -278,7 +278,7 @@ def _question(options: Options) -> Question:
     Raises:
         ValueError: not one of text, --image and --point, or options that a field has no use for.
     """
-    asked, of_field = options.gaussians, options.distill
+    asked, of_field = options.gaussians, options.field
     ways = [options.text is not None, of_field.image is not None, asked.point is not None]
     if sum(ways) != 1:
         raise ValueError(
@@ -311,7 +311,7 @@ def _asked(options: Options) -> ObjectQuery:
     Raises:
         ValueError: it cannot be asked of one.
     """
-    if (name := _first_given(options.gaussians, options.distill)) is not None:
+    if (name := _first_given(options.gaussians, options.field)) is not None:
         raise ValueError(
             f"--{name}: {options.run} has no field that could be asked so; gsjax distill {options.run} "
             "makes one"

@@ -8,11 +8,19 @@ is its `result`:
     now.result
 """
 
+from rich.console import Console
+
 from gsjax.data.photographs import Photographs
+from gsjax.engine.distill.cache import FeatureCache
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.distill.source import Source
+from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.fit.start import start_from
 from gsjax.losses.extra import ExtraLosses
+from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig
+from gsjax.scene.gaussians import Gaussians
 
 
 def fit(
@@ -41,4 +49,49 @@ def fit(
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
+    return drive(method, problem, run if after is None else after.run)
+
+
+def distill(
+    scene: Gaussians,
+    photographs: Photographs,
+    teacher: Teacher | TeacherChoice | str = "auto",
+    config: DistillConfig | None = None,
+    *,
+    rasterize_mode: str = "classic",
+    after: Tick | None = None,
+) -> Drive:
+    """Distil a semantic field for a static scene, which answers queries in 3D (FD-3DGS).
+
+    Args:
+        scene: the Gaussians, from any fit; they do not change.
+        photographs: views of the scene, posed in its world; all of them teach (`select` chooses).
+        teacher: features of the photographs' pixels: "classes" of their masks, "closed" for colours and
+            outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
+            a `TeacherChoice` with weights of CLIP or SAM, or your own `Teacher` of the same photographs.
+            Outputs of encoders and segmenters are kept in the user's cache folder.
+        config: settings (default: the paper's).
+        rasterize_mode: "antialiased" for a scene that was fitted with it.
+        after: a tick of an earlier distillation of the same scene and photographs, to go on from.
+
+    Returns:
+        ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, `write(path)` makes a
+        field.npz for `gsjax query` and `gsjax view`.
+
+    Raises:
+        ValueError: the teacher does not fit the photographs, or as `gsjax.methods.distill.Distill.start`.
+        DataError: a photograph or its masks cannot be read.
+        FileNotFoundError: weights or feature files are not there.
+    """
+    method = Distill(DistillConfig() if config is None else config)
+    every = range(photographs.num)
+    if isinstance(teacher, Teacher):
+        source = Source("files")
+    else:
+        choice = TeacherChoice(teacher) if isinstance(teacher, str) else teacher
+        choice.check()
+        teaching = Teaching(photographs, every, choice, FeatureCache(), Console(quiet=True))
+        teacher, source = teaching.teacher, teaching.source
+    cameras = [photographs.camera(i) for i in every]
+    problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
     return drive(method, problem, run if after is None else after.run)

@@ -15,7 +15,7 @@ from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.cache import FeatureCache, content_digest, folder_digest
 from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import SAID, Source
+from gsjax.engine.distill.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder, Segmenter
@@ -94,7 +94,7 @@ class Teaching:
             {label + 1: name for label, name in names.items()},
             None if where is None else str(where.resolve()),
         )
-        self.about = SAID[kind] + (", and its vectors of patches" if asked.second == "maskclip" else "")
+        self.about = ABOUT[kind] + (", and its vectors of patches" if asked.second == "maskclip" else "")
         # To an encoder labels are 1 to n, whatever numbers they bear; CLIP knows no names.
         self._named = () if kind == "clip" else tuple(names)
         named = {n: names[label] for n, label in enumerate(self._named, start=1)}
