@@ -37,8 +37,7 @@ def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tm
     before = load(tmp_path / "run.npz")
     assert before.result.source == now.result.source
     assert np.isfinite(before.result.query("can")).all()
-    for again in distill(scene, photographs, "classes", SMALL, after=before):
-        pass
+    *_, again = distill(scene, photographs, "classes", SMALL, after=before)
     assert again.step == 4
     np.testing.assert_array_equal(again.result.query("can"), scores)
     now.result.write(tmp_path / "field.npz")
