@@ -16,7 +16,6 @@ from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.distill.source import Source
 from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.drive import Drive, Tick, drive
-from gsjax.engine.fit.start import start_from
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig
@@ -45,6 +44,8 @@ def fit(
         ValueError: as `gsjax.methods.fit.Fit.start`.
         DataError: a photograph cannot be read.
     """
+    from gsjax.engine.fit.start import start_from  # matching is seldom needed, and slow to import
+
     frames = [photographs.frame(i) for i in range(photographs.num)]
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
