@@ -8,18 +8,19 @@ is its `result`:
     now.result
 """
 
-from rich.console import Console
+from typing import TYPE_CHECKING, Any
 
 from gsjax.data.photographs import Photographs
-from gsjax.engine.distill.cache import FeatureCache
-from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import Source
-from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig
 from gsjax.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsjax.engine.distill.choice import TeacherChoice
+else:
+    TeacherChoice = Any  # slow to import, as all that finds a teacher is
 
 
 def fit(
@@ -84,15 +85,10 @@ def distill(
         DataError: a photograph or its masks cannot be read.
         FileNotFoundError: weights or feature files are not there.
     """
+    from gsjax.engine.distill.teacher import teacher_for
+
     method = Distill(DistillConfig() if config is None else config)
-    every = range(photographs.num)
-    if isinstance(teacher, Teacher):
-        source = Source("files")
-    else:
-        choice = TeacherChoice(teacher) if isinstance(teacher, str) else teacher
-        choice.check()
-        teaching = Teaching(photographs, every, choice, FeatureCache(), Console(quiet=True))
-        teacher, source = teaching.teacher, teaching.source
-    cameras = [photographs.camera(i) for i in every]
+    teacher, source = teacher_for(photographs, teacher)
+    cameras = [photographs.camera(i) for i in range(photographs.num)]
     problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
     return drive(method, problem, run if after is None else after.run)

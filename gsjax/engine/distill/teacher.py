@@ -232,6 +232,25 @@ class Teaching:
         return [tuple(self._photographs.sizes[i][::-1].tolist()) for i in indices]
 
 
+def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str) -> tuple[Teacher, Source]:
+    """A teacher of all photographs, and the source of its features.
+
+    Args:
+        photographs: of the scene.
+        wanted: the teacher itself, a choice of one, or its features as `TeacherChoice.features` has them.
+
+    Raises:
+        ValueError, FileNotFoundError: as `TeacherChoice.check` and `Teaching`.
+    """
+    if isinstance(wanted, Teacher):
+        return wanted, Source("files")
+    choice = TeacherChoice(wanted) if isinstance(wanted, str) else wanted
+    choice.check()
+    every, quiet = range(photographs.num), Console(quiet=True)
+    teaching = Teaching(photographs, every, choice, FeatureCache(), quiet)
+    return teaching.teacher, teaching.source
+
+
 def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
     """Which features and whose masks it is to be.
 

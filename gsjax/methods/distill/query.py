@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from skimage.filters import threshold_otsu
 
 from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
 from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
@@ -151,6 +150,8 @@ def threshold_for(
     scores = scores[np.isfinite(scores)]
     if not len(scores) or scores.max() - scores.min() < 1e-6:
         return Threshold(float("inf"), "Otsu; all scores are alike")
+    from skimage.filters import threshold_otsu  # slow to import
+
     return Threshold(float(threshold_otsu(scores)), "Otsu")
 
 
