@@ -282,7 +282,8 @@ class _Display:
         self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, minutes: float | None
     ):
         self._console, self._schedule, self._progress = console, schedule, progress
-        self._ticks, self._minutes, self._at, self._line = ticks, minutes, 0.0, int(_LINES * self._share())
+        self._ticks, self._minutes, self._at = ticks, minutes, 0.0
+        self._line = int(_LINES * self._share())
         columns = (
             TextColumn(schedule.doing),
             BarColumn(),
