@@ -100,11 +100,11 @@ class Distill:
         return self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run as it is: shapes never change, and views are frozen."""
+        """The run as it is: shapes never change, and views are frozen. Arguments as for `Method.between`."""
         return run
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The view whose turn it is. It has its own plan, which is never too small."""
+        """The view whose turn it is, which has its own plan. Arguments as for `Method.batch`."""
         return problem.views[shuffled_index(self.config.seed, run.step, len(problem.views))], ()
 
     def result(self, problem: Problem, run: Run) -> DistillResult:
