@@ -15,11 +15,12 @@ from benchmarks.metrics import Metric
 from benchmarks.timing import compile_program, median_and_p95, sample
 from benchmarks.workloads import ball
 from gsjax.data import open_sequence
+from gsjax.engine.drive import drive
 from gsjax.engine.verbs import deform as deform_steps
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
 from gsjax.methods.deform import DeformConfig, GraphConfig
-from gsjax.methods.distill import DistillConfig, begin_distill, distill, teacher_of_objects
+from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
 from gsjax.methods.track import PRESETS, start_scene, track
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
@@ -89,11 +90,12 @@ def field(repeats: int) -> StepTimes:
     camera = Camera(scene.viewmat, scene.K, width, height)
     thing = np.indices((height, width)).sum(axis=0) // 40 % 3  # stripes
     teacher = teacher_of_objects([thing], [np.eye(3, 512, dtype=np.float32)])
-    config = DistillConfig(iterations=repeats + 1, contrast_after=0.0)
-    updates = list(distill(*begin_distill(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
+    method = Distill(DistillConfig(iterations=repeats + 1, contrast_after=0.0))
+    problem, run = method.start(gaussians_from_activated(*scene[:5]), [camera], teacher)
+    updates = list(drive(method, problem, run))
     if any(bool(update.info["skipped"]) for update in updates):
         raise RuntimeError("a step of the distillation was skipped: a number was not finite")
-    what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {config.channels} channels"
+    what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {method.config.channels} channels"
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 

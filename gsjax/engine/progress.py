@@ -224,7 +224,8 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         ValueError: it is made from something else.
     """
     wrong, damaged = None, []
-    for path in reversed(_saved(folder)):
+    # A version before saved to state.npz, which is refused rather than overlooked.
+    for path in reversed(_saved(folder) or sorted(folder.glob("state.npz"))):
         try:
             found, stored = load_checkpoint(path)
         except CheckpointError as error:

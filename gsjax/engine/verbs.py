@@ -8,18 +8,21 @@ is its `result`:
     now.result
 """
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
+from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig
 from gsjax.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from gsjax.engine.distill.choice import TeacherChoice
+else:
+    TeacherChoice = Any  # slow to import, as all that finds a teacher is
 
 
 def fit(
@@ -97,4 +100,44 @@ def deform(
 
     method = Deform(DeformConfig() if config is None else config, extra_losses)
     problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
+    return drive(method, problem, run if after is None else after.run)
+
+
+def distill(
+    scene: Gaussians,
+    photographs: Photographs,
+    teacher: Teacher | TeacherChoice | str = "auto",
+    config: DistillConfig | None = None,
+    *,
+    rasterize_mode: str = "classic",
+    after: Tick | None = None,
+) -> Drive:
+    """Distil a semantic field for a static scene, which answers queries in 3D (FD-3DGS).
+
+    Args:
+        scene: the Gaussians, from any fit; they do not change.
+        photographs: views of the scene, posed in its world; all of them teach (`select` chooses).
+        teacher: features of the photographs' pixels: "classes" of their masks, "closed" for colours and
+            outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
+            a `TeacherChoice` with weights of CLIP or SAM, or your own `Teacher` of the same photographs.
+            Outputs of encoders and segmenters are kept in the user's cache folder.
+        config: settings (default: the paper's).
+        rasterize_mode: "antialiased" for a scene that was fitted with it.
+        after: a tick of an earlier distillation of the same scene and photographs, to go on from.
+
+    Returns:
+        ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, `write(path)` makes a
+        field.npz for `gsjax query` and `gsjax view`.
+
+    Raises:
+        ValueError: the teacher does not fit the photographs, or as `gsjax.methods.distill.Distill.start`.
+        DataError: a photograph or its masks cannot be read.
+        FileNotFoundError: weights or feature files are not there.
+    """
+    from gsjax.engine.distill.teacher import teacher_for
+
+    method = Distill(DistillConfig() if config is None else config)
+    teacher, source = teacher_for(photographs, teacher)
+    cameras = [photographs.camera(i) for i in range(photographs.num)]
+    problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
     return drive(method, problem, run if after is None else after.run)

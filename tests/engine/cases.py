@@ -3,15 +3,25 @@
 from dataclasses import replace
 from functools import cache
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsjax.methods.deform import Deform
+from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
 from gsjax.methods.fit import Fit, FitConfig, StartConfig
+from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.initialize import gaussians_from_points
+from tests.methods.around import cameras_around
 from tests.methods.photographed_blobs import photographed_blobs
 from tests.methods.tissue import CONFIG, tissue
 
 FIT = FitConfig(
     steps=40, cap=120, sh_degree=1, sh_every=20, coarse_until=0.3, start=StartConfig(count=100), seed=1
+)
+
+GRID = FeatureGridConfig(
+    levels=2, least_resolution=4, most_resolution=8, log2_entries=9, features=2, hidden=8
 )
 
 
@@ -51,4 +61,19 @@ def deform_step_case():
     return method.step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
 
 
-STEPS = {"fit": fit_step_case, "deform": deform_step_case}
+def distill_step_case():
+    """A distillation draws frozen views, so there is no plan that is too small."""
+    random = np.random.default_rng(0)
+    means, colors = random.uniform(-0.5, 0.5, (40, 3)), random.uniform(size=(40, 3))
+    scene = jax.tree.map(jnp.asarray, gaussians_from_points(means, colors))
+    thing = np.indices((24, 32)).sum(axis=0) // 8 % 3
+    teacher = teacher_of_objects([thing], [np.eye(3, 5, dtype=np.float32)])
+    method = Distill(
+        DistillConfig(iterations=20, channels=4, grid=GRID, contrast_after=0.1, contrast_patch=4)
+    )
+    _, run, batch = started(lambda: (method, *method.start(scene, cameras_around([0.3], 32, 24), teacher)))
+    sick = batch._replace(codebook=batch.codebook.at[0, 0].set(jnp.nan))
+    return method.step, run.params, batch, sick
+
+
+STEPS = {"fit": fit_step_case, "distill": distill_step_case, "deform": deform_step_case}

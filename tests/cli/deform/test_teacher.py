@@ -93,7 +93,7 @@ def test_what_files_taught_is_asked_by_place_and_without_a_prompt(learned):
 def test_nobody_reads_a_text_in_the_space_of_files(learned, capsys):
     assert main(["query", str(learned), "tool"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert re.search("nobody here reads texts.*--point.*or by a name: group 1, group 2", said)
+    assert re.search("no encoder of their texts.*--point.*or by a name: group 1, group 2", said)
 
 
 def test_masks_with_embeddings_are_rows_of_one_codebook(tmp_path):
