@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.cli import fit as fit_command
-from gsjax.cli.parts import FIT as FIT  # for settings that differ from it in one thing
 from gsjax.cli.parts import Options
 from gsjax.cli.parts import run as run_parts
 from gsjax.data import Sequence
 from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.parts.start import FIT as FIT  # for settings that differ from it in one thing
 from gsjax.engine.parts.views import part_views
 from gsjax.methods.parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores

@@ -17,45 +17,44 @@ from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import OF_NO_BEARING, OfRecording, SamWeights, Seeded, checked
-from gsjax.engine.parts.loop import Following, follow_parts, refine_parts
+from gsjax.engine.parts.loop import Loop, resumed
 from gsjax.engine.parts.results import finished, print_results, write_results
-from gsjax.engine.parts.resume import Saver, load
+from gsjax.engine.parts.start import FIT
+from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
+from gsjax.engine.records import digest
 from gsjax.io.ply import read_ply
-from gsjax.methods.fit import FitConfig, StartConfig
+from gsjax.methods.fit import FitConfig
 from gsjax.methods.parts import (
     Anchor,
+    Parts,
     PartsConfig,
     Start,
     begin,
     choose_anchor,
-    first_parts,
     masks_of_labels,
     moved_pixels,
-    without_needless,
 )
 from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
-FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000))
-"""How the canonical scene is fitted unless told."""
 _EVERYTHING = 0.6  # share of pixels that change
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Seeded, SamWeights, OfRecording):
-    """What `gsjax parts` is told."""
+    """Options of `gsjax parts`."""
 
     anchor: int | None = None
-    """Which of those frames is canonical, counted from 0. Unless given, the one that differs most."""
+    """Index of the canonical frame among those frames, from 0. Default: the one that differs most."""
     masks: Literal["segment", "files"] = "segment"
-    """Who says what belongs together in the anchor's pictures: a segmenter, or the recording's own masks,
-    whose labels must mean the same in all cameras."""
+    """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
+    labels must mean the same in all cameras."""
     scene: Path | None = None
-    """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Fitted unless
-    given, into RUN/canonical."""
+    """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Default: it is
+    fitted, into RUN/canonical."""
     fit: FitConfig = FIT
     """How the canonical scene is fitted."""
     parts: PartsConfig = field(default_factory=PartsConfig)
@@ -79,7 +78,8 @@ def run(options: Options) -> int:
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
             folder.check_config(settings, but=OF_NO_BEARING)
-        given = None if options.scene is None else _read_scene(options.scene)
+        scene = None if options.scene is None else _ply_of(options.scene)
+        gaussians = None if scene is None else _read_scene(scene)
         seconds: dict[str, float] = {}
         tracked = recording.tracked
         with stage(console, "looking for what moves"):
@@ -98,38 +98,37 @@ def run(options: Options) -> int:
             f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
         )
         at = perf_counter()
-        gaussians = _fitted(settings, folder, anchor, recording, console) if given is None else given
-        if gaussians is None:
-            return 130
+        if scene is None or gaussians is None:
+            scene = _fitted(settings, folder, anchor, recording, console)
+            if scene is None:
+                return 130
+            gaussians = _read_scene(scene)
         seconds["canonical"], at = perf_counter() - at, perf_counter()
         with stage(console, "finding what may move, in all views"):
             key = jax.random.key(options.parts.seed)
             start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
-        _say_if_odd(start, moved.mean(), options, notes)
-        parts = first_parts(start, tracked.num_frames, options.parts)
+        _warn_if_odd(start, moved.mean(), options, notes)
+        method = Parts(options.parts)
+        problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
-        following = Following(parts)
+        progress = Progress({"the canonical scene": digest(scene)})
         if options.resume:
-            following = load(folder.resume, following)
-            notes.add(f"Resumed after {int(following.parts.done.sum())} frames of an earlier run.")
-        following = follow_parts(tracked, start, following, options.parts, Saver(folder.resume), console)
-        seconds |= {"updates": sum(following.update_s), "compile": following.compile_s}
-        parts, at = following.parts, perf_counter()
-        if following.stopped is None:
-            with stage(console, "leaving out parts that no picture needs"):
-                parts, pairs = without_needless(tracked, parts, options.parts)
-                following.joined += pairs
-            seconds["finish"], at = perf_counter() - at, perf_counter()
-            if not np.asarray(parts.weights)[:, 1:].any():
-                notes.warn("no part is left that any picture needs; the outcome is the canonical scene")
-            parts = refine_parts(tracked, parts, following, options.parts, notes, console)
-            seconds["refine"] = perf_counter() - at
-        found = finished(folder, recording, start, parts, following, options.parts, seconds, notes, console)
+            first, progress = resumed(folder, first, progress)
+            followed = int(method.result(problem, first).done.sum())
+            notes.add(f"Resumed after {followed} frames of an earlier run.")
+        loop = Loop(method, problem, first, progress, seconds, folder, notes, console)
+        loop.follow()
+        if progress.stopped is None:
+            loop.finish()
+            loop.refine()
+        last = method.brought_up_to_date(problem, loop.run)
+        outcome = method.result(problem, last)
+        found = finished(folder, recording, start, last, outcome, progress, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
         found["notes"] = notes.all
         finish(folder, found, write_results)
     print_results(folder, found)
-    return exit_code(following.stopped)
+    return exit_code(progress.stopped)
 
 
 def _check(options: Options, recording: Recording) -> None:
@@ -165,7 +164,7 @@ def _segmenter(options: Options) -> Segmenter:
 def _masks(
     sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C H W"], options: Options
 ) -> Int[np.ndarray, "C H W"] | None:
-    """What moves by the recording's own masks; None where a segmenter is to say."""
+    """What moves by the recording's own masks; None where a segmenter finds it."""
     if options.masks == "segment":
         return None
     labels = [sequence.mask(anchor.frame, c) for c in range(sequence.num_cameras)]
@@ -187,22 +186,26 @@ def _masks(
 
 def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
-) -> Gaussians | None:
-    """The scene at the anchor frame; None where fitting was stopped by Ctrl-C."""
+) -> Path | None:
+    """The PLY file of the scene at the anchor frame; None where fitting was stopped by Ctrl-C."""
     path = folder.path / "canonical"
     if not RunFolder(path, overwrite=True).finished:
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
         code = fit_command.run(_fit_options(options, path, anchor, recording))
         if code == 130:
             return None
-    return _read_scene(path)
+    return _ply_of(path)
+
+
+def _ply_of(path: Path) -> Path:
+    """The PLY file itself, or that of a run of `gsjax fit`."""
+    if path.is_dir():
+        expect_run(path, "`gsjax fit`")
+        return path / "scene.ply"
+    return path
 
 
 def _read_scene(path: Path) -> Gaussians:
-    """The Gaussians of a PLY file, or of a run of `gsjax fit`."""
-    if path.is_dir():
-        expect_run(path, "`gsjax fit`")
-        path = path / "scene.ply"
     return jax.tree.map(jnp.asarray, read_ply(path)[0])
 
 
@@ -221,8 +224,8 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
     )
 
 
-def _say_if_odd(start: Start, moved: float, options: Options, notes: Notes) -> None:
-    """Warn of what makes parts doubtful; `moved` is the share of pixels that change."""
+def _warn_if_odd(start: Start, moved: float, options: Options, notes: Notes) -> None:
+    """Warn where parts are doubtful; `moved` is the share of pixels that change."""
     pieces = int(start.masks.max())
     if moved > _EVERYTHING:
         notes.warn(

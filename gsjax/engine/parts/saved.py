@@ -14,9 +14,8 @@ import yaml
 from gsjax.engine.files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
-from gsjax.methods.parts import PartScene, trajectory_of
+from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
-from gsjax.methods.parts.follow import order_of_frames
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
 
