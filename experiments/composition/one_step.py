@@ -1,6 +1,6 @@
-"""Three methods as one jitted step: the object tracker (papers/000), a teacher's features distilled into what
-is tracked (papers/002 to 004), and the graph of SurstSplat or GaussianClin over them (papers/003, 004).
-docs/composition.md has `composed` as it stands here."""
+"""Three methods as one jitted step: the tracker of Object-Aware Gaussian Splatting for Robotic Manipulation,
+a teacher's features distilled into what is tracked (FD-3DGS, SurstSplat, GaussianClin), and the graph of
+SurstSplat or GaussianClin over them. docs/composition.md has `composed` as it stands here."""
 
 from typing import NamedTuple
 

@@ -26,7 +26,7 @@ from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, stage
-from gsjax.engine.options import OF_NO_BEARING, OfDataset, checked, preset_options
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, preset_options
 from gsjax.engine.recording import located, open_recording
 from gsjax.io.ply import write_ply
 from gsjax.methods.deform import (
@@ -87,7 +87,7 @@ def run(options: Options) -> int:
         elsewhere = {} if asked is None else asked.located()
         settings = replace(options, dataset=located(options.dataset), **elsewhere)
         if options.resume:
-            folder.check_config(settings, but=OF_NO_BEARING)
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
         deep = _recording(options, notes)
         told = (options.test_every, options.tools, asked, options.deform.channels)
         data = deform_data(deep.sequence, *told, options.tool_values, notes, console)

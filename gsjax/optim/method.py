@@ -54,7 +54,7 @@ class Run(eqx.Module):
         return self.having(plans=plans)
 
 
-Problem = TypeVar("Problem")
+Problem = TypeVar("Problem", contravariant=True)
 
 
 @runtime_checkable

@@ -22,14 +22,17 @@ from tests.data.faulty import Fault
 LAYOUTS = PHOTOGRAPHS | RECORDINGS | SURGERY
 CASES = [(name, fault) for name, layout in LAYOUTS.items() for fault in layout.faults]
 PAGE = Path(__file__).parents[2] / "docs" / "data-errors.md"
-HEAD = """# What readers say
+HEAD = """# Reader errors
 
-What each reader says of data that is damaged or incomplete. `DATA` stands for the folder. *Refused* is an
-error (`DataError`, or another `ValueError` or `OSError`; exit code 2 on the command line); *used without it*
-is a `DataWarning`, and the rest is read; *used* is one too, and all is read as it is. Words of other
-libraries and sizes of files are left out (`...`).
-`python -m tests.data.test_reader_errors` writes this page, and a test compares it.
+What each reader reports about damaged or incomplete data. `DATA` is the folder, `FILE` the path of the file
+at fault, `...` a size or another library's words. Messages that differ only in names and numbers are listed
+once.
+
+Most are errors (`DataError`, or another `ValueError` or `OSError`; exit code 2 on the command line).
+*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes
+this page; a test compares it.
 """
+SHARED = "Several layouts"
 
 # What others say of a file, and how many bytes an encoder wrote, differ from version to version.
 _FOREIGN = re.compile(
@@ -71,17 +74,45 @@ def _plain(text: str, root: Path) -> str:
     return _BYTES.sub(r"... \1", _FOREIGN.sub(r"\1 (...)", text))
 
 
+class Case(NamedTuple):
+    layout: str
+    what: str
+    text: str
+
+
 def page(scratch: Path) -> str:
-    """docs/data-errors.md."""
-    parts = [HEAD]
+    """docs/data-errors.md: a table of the messages of several layouts, then one of each layout's own."""
+    alike: dict[tuple[str, str], list[Case]] = {}
     for number, (layout, fault) in enumerate(CASES):
-        if LAYOUTS[layout].faults[0] is fault:
-            parts.append(f"\n## {layout}\n\n| what is wrong | | what is said |\n| --- | --- | --- |\n")
         refused, text = said_of(layout, fault, scratch / str(number))
-        used = "used without it" if "left out" in text else "used"
-        outcome, escaped = "refused" if refused else used, text.replace("|", r"\|")
-        parts.append(f"| {fault.what} | {outcome} | `{escaped}` |\n")
-    return "".join(parts)
+        outcome = "" if refused else "rest used" if "left out" in text else "all used"
+        alike.setdefault((outcome, _pattern(text)), []).append(Case(layout, fault.what, text))
+    sections: dict[str, list[str]] = {name: [] for name in (SHARED, *LAYOUTS)}
+    for (outcome, _), cases in alike.items():
+        section = SHARED if len({case.layout for case in cases}) > 1 else cases[0].layout
+        same = len({case.text for case in cases}) == 1
+        text = cases[0].text if same else _LEADING_PATH.sub("FILE", cases[0].text)
+        problem = _problem(cases, section == SHARED) + (f" (*{outcome}*)" if outcome else "")
+        sections[section].append(problem + " | `" + text.replace("|", r"\|") + "`\n")
+    head = "\n## {}\n\nproblem | message\n--- | ---\n"
+    return HEAD + "".join(head.format(name) + "".join(rows) for name, rows in sections.items() if rows)
+
+
+_LEADING_PATH = re.compile(r"^DATA[\w./*-]*")
+
+
+def _pattern(text: str) -> str:
+    """A message without its files' names and its numbers."""
+    named = re.sub(r"\([\w./]+\)|[\w./]+\.(png|txt|bin)", "NAME", _LEADING_PATH.sub("FILE", text))
+    return re.sub(r"\d+", "N", named)
+
+
+def _problem(cases: list[Case], name_layouts: bool) -> str:
+    """The faults that have one message, with the layouts in which each occurs if there are several."""
+    layouts: dict[str, list[str]] = {}
+    for case in cases:
+        layouts.setdefault(case.what, []).append(case.layout)
+    return "; ".join(f"{what} ({', '.join(of)})" if name_layouts else what for what, of in layouts.items())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -49,8 +49,8 @@ def hard_parts(
     cameras: int = 8,
 ) -> Sequence:
     """A part that is hard to find, and a box that is not: RGB-D, labels, optical flow, exact poses, and the
-    joint of the part; 15 Hz. The failures of MotionSplicer (papers/001, figure 9), as hard as one likes. A
-    sequence of fewer frames is the beginning of the longer one; after frame 15 all is at rest.
+    joint of the part; 15 Hz. The failures of MotionSplicer, figure 9, as hard as requested. A sequence of
+    fewer frames is the beginning of the longer one; after frame 15 all is at rest.
 
     Labels are 0 scene (a floor and a wall), 1 the part, 2 a box that slides by 0.2 m and turns. Cameras stand
     on an arc before the wall.

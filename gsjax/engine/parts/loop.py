@@ -45,13 +45,12 @@ class Loop:
         steps, frames = self.method.config.stream.iterations, self.problem.sequence.num_frames
         total, progress = self.method.steps_of_frames(self.problem), self.progress
 
-        def found(now: Tick) -> dict[str, Any] | None:
+        def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
             """What the row of a frame has, after its last step."""
-            if now.step % steps:
-                return None
             kept: Discovery = now.run.kept
             return {
                 "frame": kept.frame,
+                "losses": _losses(infos),
                 "found": kept.count + 2,  # with the anchor and this one
                 "parts": int(np.asarray(kept.canonical.alive).sum()) - 1,
                 "update_s": progress.seconds - sum(update_seconds(progress)),
@@ -61,7 +60,7 @@ class Loop:
             loss = "" if row["losses"] is None else f", loss {row['losses'][1]:.4f}"
             return f"{row['found']} of {frames} frames, {counted(row['parts'], 'part')}{loss}"
 
-        self._watch(Schedule("following parts", total, _losses, in_words, every=steps), found)
+        self._watch(Schedule("following parts", total, row, in_words, every=steps))
         self.seconds |= {"updates": sum(update_seconds(progress)), "compile": progress.compile_seconds}
 
     def finish(self) -> None:
@@ -100,7 +99,7 @@ class Loop:
                 f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite"
             )
 
-    def _watch(self, schedule: Schedule, look: Any = None) -> None:
+    def _watch(self, schedule: Schedule) -> None:
         """Go on to the last step of a schedule."""
         ticks = drive(
             self.method,
@@ -110,7 +109,7 @@ class Loop:
             headroom=self.method.config.headroom,
         )
         try:
-            watch(ticks, self.progress, schedule, self.folder, self.console, look=look)
+            watch(ticks, self.progress, schedule, self.folder, self.console)
         finally:
             self.run = ticks.run
 
@@ -137,8 +136,8 @@ def update_seconds(progress: Progress) -> list[float]:
     return [row["update_s"] for row in progress.rows if "update_s" in row]
 
 
-def _losses(infos: list[Mapping[str, Any]]) -> dict[str, Any]:
+def _losses(infos: list[Mapping[str, Any]]) -> list[float] | None:
     """The losses of a frame's picture at its first and at its last steps; None where none was finite."""
     losses = np.array([float(info["now"]) for info in infos])
     few = max(1, len(losses) // 8)
-    return {"losses": [losses[:few].mean(), losses[-few:].mean()] if len(losses) else None}
+    return [float(losses[:few].mean()), float(losses[-few:].mean())] if len(losses) else None

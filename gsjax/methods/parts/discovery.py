@@ -1,5 +1,5 @@
-"""How far a discovery is: the scene, which parts there are, and where they were in all frames found so far. Now
-and then parts become one or two (MotionSplicer, section 3.2)."""
+"""How far a discovery is: the scene, which parts there are, and where they were in all frames found so far.
+Now and then parts become one or two (MotionSplicer, section 3.2)."""
 
 from typing import NamedTuple
 

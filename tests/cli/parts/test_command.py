@@ -7,7 +7,7 @@ from html import unescape
 import numpy as np
 import pytest
 
-import gsjax.cli.parts
+import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Drive
@@ -192,7 +192,7 @@ def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
         recording = chosen_recording(options)
         return replace(recording, tracked=replace(recording.tracked, load_mask=None))
 
-    monkeypatch.setattr(gsjax.cli.parts, "chosen_recording", maskless)
+    monkeypatch.setattr(gsjax.engine.parts.run, "chosen_recording", maskless)
     code, said = gsjax_parts("--frames", "0:24:8", "--masks", "files")
     assert code == 2
     assert "--masks files: expected a mask of frame" in said
