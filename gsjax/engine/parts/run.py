@@ -66,7 +66,7 @@ def run(options: Options) -> int:
     """Find the parts of a recording and report on them; returns the exit code.
 
     Raises:
-        ValueError, OSError: what was asked cannot be done; everything found before that is on disk.
+        ValueError, OSError: an option cannot be met; everything found before that is on disk.
     """
     options = checked(options)
     console, begun = Console(stderr=True, highlight=False), perf_counter()

@@ -52,7 +52,7 @@ class PartsRun:
     blend: Blend
 
     def camera(self, camera: int | None) -> int:
-        """The id of a camera of the run; the first held out one, else the first, unless given.
+        """The id of a camera of the run; default: the first held out one, else the first.
 
         Raises:
             ValueError: the run had no such camera.
