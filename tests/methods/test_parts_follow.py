@@ -90,7 +90,9 @@ def bodies_of(views, parts):
 def errors_mm(views, followed, t):
     """Of the Gaussians of each box, in the median."""
     parts = followed.parts
-    moved = skin(parts.canonical.movable, followed.weights, parts.canonical.centers, parts.pose(t)).means
+    moved = skin(
+        parts.canonical.movable, jnp.asarray(followed.weights), parts.canonical.centers, parts.pose(t)
+    ).means
     true = np.asarray(views.at(t).means)[parts.order[: len(moved)]]
     off = 1000 * np.linalg.norm(np.asarray(moved) - true, axis=1)
     bodies = bodies_of(views, parts)
@@ -150,7 +152,7 @@ def test_the_result_moves_as_the_parts_did_and_can_be_edited(boxes, halves):
     np.testing.assert_array_equal(result.at(3).means, gaussians_at(scene, moment(trajectory, 3)).means)
     moved = result.at(3).means[parts.order[: parts.canonical.movable.num]]
     labels = np.asarray(scene.labels)[parts.order[: parts.canonical.movable.num]]
-    weights = settled(halves.weights, np.asarray(parts.canonical.alive))
+    weights = jnp.asarray(settled(halves.weights, np.asarray(parts.canonical.alive)))
     expected = skin(parts.canonical.movable, weights, parts.canonical.centers, parts.pose(3)).means
     np.testing.assert_allclose(moved[labels > 0], np.asarray(expected)[labels > 0], atol=2e-5)
     assert result.poses(3).quats.shape == (3, 4)

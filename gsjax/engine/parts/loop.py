@@ -60,7 +60,8 @@ class Loop:
             loss = "" if row["losses"] is None else f", loss {row['losses'][1]:.4f}"
             return f"{row['found']} of {frames} frames, {counted(row['parts'], 'part')}{loss}"
 
-        self._watch(Schedule("following parts", total, row, in_words, every=steps))
+        if self.run.step < total:
+            self._watch(Schedule("following parts", total, row, in_words, every=steps))
         self.seconds |= {"updates": sum(update_seconds(progress)), "compile": progress.compile_seconds}
 
     def finish(self) -> None:
@@ -82,7 +83,8 @@ class Loop:
         skipped = self.progress.skipped
 
         def in_words(row: Mapping[str, Any]) -> str:
-            return "" if row.get("loss") is None else f"loss {row['loss']:.4f}"
+            losses = row.get("losses") or [row.get("loss")]  # at first the newest row is a frame's
+            return "no finite loss" if losses[-1] is None else f"loss {losses[-1]:.4f}"
 
         if steps:
             self._watch(Schedule("refining the scene over all frames", total, means_of(), in_words))
