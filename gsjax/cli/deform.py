@@ -12,8 +12,8 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data import Photographs
-from gsjax.data.open import is_of_photographs, is_recording, open_photographs
-from gsjax.data.ordered import open_in_time
+from gsjax.data.open import is_photographs, is_recording, open_photographs
+from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.data import DeformData, Tools, deform_data
 from gsjax.engine.deform.depth import Deep, Depth, with_depth
 from gsjax.engine.deform.file import NAME, StoredDeformation, write_deformation
@@ -149,8 +149,8 @@ def run(options: Options) -> int:
 def _recording(options: Options, notes: Notes) -> Deep:
     """The recording, the camera that is learned from first, with its depth."""
     told = (options.frames, options.read, options.scale)
-    whole = open_recording(options.dataset, (), (), *told, opened=open_in_time).judged
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    whole = open_recording(options.dataset, (), (), *told, opened=open_as_sequence).judged
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):

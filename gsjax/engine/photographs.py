@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.errors import DataWarning
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
+from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_options
 from gsjax.engine.folder import expect_dataset
@@ -50,7 +50,7 @@ def choose_photographs(
             folder of a run.
     """
     expect_dataset(dataset)
-    if is_of_photographs(dataset) or not is_recording(dataset):
+    if is_photographs(dataset) or not is_recording(dataset):
         photographs = open_photographs(dataset, read)
         for option, ids in (("--cameras", cameras), ("--eval-cameras", eval_cameras)):
             if ids:

@@ -1,4 +1,4 @@
-"""Photographs of every layout, and what may be wrong with them."""
+"""Photographs in every layout, and their faults."""
 
 import json
 import struct
@@ -17,7 +17,6 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     array,
     change,
     cut,
@@ -26,6 +25,7 @@ from tests.data.faulty import (
     frame,
     gone,
     holds,
+    load_all,
     moved,
     patch,
     picture,
@@ -162,7 +162,7 @@ COLMAP_TEXT = (
 COLMAP_BINARY = (
     Fault("list missing", gone(BINARY["images"]), ("sparse/0/images.bin",)),
     *(Fault(f"{name}.bin is cut off", cut(BINARY[name], 0.9), (f"{name}.bin",)) for name in BINARY),
-    Fault("something else", holds(BINARY["images"], b"SQLite format 3\0" + bytes(99)), ("images.bin",)),
+    Fault("another format", holds(BINARY["images"], b"SQLite format 3\0" + bytes(99)), ("images.bin",)),
     Fault("no camera", holds(BINARY["cameras"], bytes(8)), ("cameras.bin",)),
     Fault("no photograph", holds(BINARY["images"], bytes(8)), ("images.bin",)),
     Fault("model unknown to OpenCV", patch(BINARY["cameras"], 12, b"\x63"), ("cameras.bin",)),
@@ -205,7 +205,7 @@ def mirror(rows: np.ndarray) -> np.ndarray:
 
 ROWS = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),
-    Fault("no array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
+    Fault("not an array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
     Fault("pickled objects", array("poses_bounds.npy", lambda a: a.astype(object)), ("poses_bounds.npy",)),
     Fault("wrong shape", array("poses_bounds.npy", lambda a: a[:, :16]), ("poses_bounds.npy",)),
     Fault("no row", array("poses_bounds.npy", lambda a: a[:0]), ("poses_bounds.npy",)),
@@ -227,10 +227,10 @@ DYNERF = (
 )
 
 PHOTOGRAPHS = {
-    "nerfstudio": Layout(build_transforms, lambda r: all_of(open_photographs(r)), TRANSFORMS),
-    "Blender": Layout(build_blender, lambda r: all_of(open_photographs(r)), BLENDER),
-    "COLMAP text": Layout(build_colmap_text, lambda r: all_of(open_photographs(r)), COLMAP_TEXT),
-    "COLMAP binary": Layout(build_colmap_binary, lambda r: all_of(open_photographs(r)), COLMAP_BINARY),
-    "LLFF": Layout(build_llff, lambda r: all_of(read_llff(r, "endonerf")), LLFF),
-    "DyNeRF": Layout(build_dynerf, lambda r: all_of(read_dynerf(r, "endonerf")), DYNERF),
+    "nerfstudio": Layout(build_transforms, lambda r: load_all(open_photographs(r)), TRANSFORMS),
+    "Blender": Layout(build_blender, lambda r: load_all(open_photographs(r)), BLENDER),
+    "COLMAP text": Layout(build_colmap_text, lambda r: load_all(open_photographs(r)), COLMAP_TEXT),
+    "COLMAP binary": Layout(build_colmap_binary, lambda r: load_all(open_photographs(r)), COLMAP_BINARY),
+    "LLFF": Layout(build_llff, lambda r: load_all(read_llff(r, "endonerf")), LLFF),
+    "DyNeRF": Layout(build_dynerf, lambda r: load_all(read_dynerf(r, "endonerf")), DYNERF),
 }

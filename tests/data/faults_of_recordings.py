@@ -1,4 +1,4 @@
-"""Recordings with depth of every layout, scenes of Gaussians, and what may be wrong with them."""
+"""Recordings with depth in every layout, scenes of Gaussians, and their faults."""
 
 from pathlib import Path
 
@@ -20,13 +20,13 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     change,
     cut,
     deep,
     drawn,
     gone,
     holds,
+    load_all,
     moved,
     picture,
     swap,
@@ -140,7 +140,7 @@ def build_gaussians(root: Path) -> None:
 SCENE = "scene.ply"
 GAUSSIANS = (
     Fault("missing", gone(SCENE), (SCENE,)),
-    Fault("something else", holds(SCENE, b"PK\3\4"), (SCENE,)),
+    Fault("another format", holds(SCENE, b"PK\3\4"), (SCENE,)),
     Fault("cut off", cut(SCENE, 0.9), (SCENE,)),
     Fault(
         "point cloud",
@@ -151,9 +151,9 @@ GAUSSIANS = (
 )
 
 RECORDINGS = {
-    "Open3D RGB-D": Layout(build_open3d, lambda r: all_of(read_open3d(r, K)), OPEN3D),
-    "TUM RGB-D": Layout(build_tum, lambda r: all_of(open_sequence(r)), TUM),
-    "7-Scenes": Layout(build_seven_scenes, lambda r: all_of(open_sequence(r)), SEVEN_SCENES),
-    "Panoptic": Layout(build_panoptic, lambda r: all_of(open_sequence(r)), PANOPTIC),
+    "Open3D RGB-D": Layout(build_open3d, lambda r: load_all(read_open3d(r, K)), OPEN3D),
+    "TUM RGB-D": Layout(build_tum, lambda r: load_all(open_sequence(r)), TUM),
+    "7-Scenes": Layout(build_seven_scenes, lambda r: load_all(open_sequence(r)), SEVEN_SCENES),
+    "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }

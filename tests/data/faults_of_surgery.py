@@ -1,4 +1,4 @@
-"""Recordings of surgery, and what may be wrong with them."""
+"""Recordings of surgery, and their faults."""
 
 import json
 import shutil
@@ -19,13 +19,13 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     array,
     change,
     cut,
     drawn,
     gone,
     holds,
+    load_all,
     picture,
     swap,
 )
@@ -34,7 +34,7 @@ TOOL = np.where(np.arange(WIDTH) < WIDTH // 4, 255, 0).astype(np.uint8) * np.one
 
 
 def every(folder: str, edit: Callable[[np.ndarray], np.ndarray]) -> Damage:
-    """Changes each picture of a folder."""
+    """Edits each picture of a folder."""
 
     def damage(root: Path) -> None:
         for path in (root / folder).iterdir():
@@ -112,7 +112,7 @@ def build_endovis17(root: Path) -> None:
 TRUE = "ground_truth/Left_Prograsp_Forceps_labels"
 ENDOVIS_17 = (
     Fault("no calibration", gone("camera_calibration.txt"), ("camera_calibration.txt", "--read.K")),
-    Fault("no text", holds("camera_calibration.txt", b"\xff\xfe\x80"), ("camera_calibration.txt",)),
+    Fault("binary data", holds("camera_calibration.txt", b"\xff\xfe\x80"), ("camera_calibration.txt",)),
     Fault(
         "NaN as focal length",
         swap("camera_calibration.txt", "F: 30", "F: nan"),
@@ -161,7 +161,7 @@ def build_endovis18(root: Path) -> None:
 
 
 ENDOVIS_18 = (
-    Fault("no names of colours", gone("labels.json"), ("labels.json",)),
+    Fault("no colour names", gone("labels.json"), ("labels.json",)),
     Fault("names without colours", holds("labels.json", '[{"name": "tissue"}]'), ("labels.json",)),
     Fault(
         "colours without names",
@@ -205,11 +205,11 @@ VIDEO = (
     Fault("no video", gone("clip.mp4"), ("clip.mp4",)),
 )
 
-TOLD = ReadOptions(K=K)
+OPTIONS = ReadOptions(K=K)
 SURGERY = {
-    "EndoNeRF": Layout(build_endonerf, lambda r: all_of(open_sequence(r)), ENDONERF),
-    "EndoVis 2017": Layout(build_endovis17, lambda r: all_of(open_sequence(r)), ENDOVIS_17),
-    "EndoVis 2018": Layout(build_endovis18, lambda r: all_of(open_sequence(r)), ENDOVIS_18),
-    "frames with masks": Layout(build_clip, lambda r: all_of(open_sequence(r, TOLD)), FRAMES_WITH_MASKS),
-    "video": Layout(build_video, lambda r: all_of(open_sequence(r / "clip.mp4", TOLD)), VIDEO),
+    "EndoNeRF": Layout(build_endonerf, lambda r: load_all(open_sequence(r)), ENDONERF),
+    "EndoVis 2017": Layout(build_endovis17, lambda r: load_all(open_sequence(r)), ENDOVIS_17),
+    "EndoVis 2018": Layout(build_endovis18, lambda r: load_all(open_sequence(r)), ENDOVIS_18),
+    "frames with masks": Layout(build_clip, lambda r: load_all(open_sequence(r, OPTIONS)), FRAMES_WITH_MASKS),
+    "video": Layout(build_video, lambda r: load_all(open_sequence(r / "clip.mp4", OPTIONS)), VIDEO),
 }

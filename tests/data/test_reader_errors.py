@@ -1,6 +1,6 @@
-"""Every reader and what may be wrong with its files: each message names the file and says what to do.
+"""Faults in the files of every reader: each message names the file and says what to do.
 
-docs/data-errors.md is written from these messages: `python -m tests.data.test_reader_errors`.
+docs/data-errors.md is generated from these messages: `python -m tests.data.test_reader_errors`.
 """
 
 import re
@@ -34,39 +34,40 @@ this page; a test compares it.
 """
 SHARED = "Several layouts"
 
-# What others say of a file, and how many bytes an encoder wrote, differ from version to version.
+# Messages of other libraries, and file sizes of encoders, differ from version to version.
 _FOREIGN = re.compile(
-    r"(bad JSON|bad data|something else|no text|one that cannot be parsed|cut off) \((?:[^()]|\([^()]*\))*\)"
+    r"(bad JSON|bad data|something else|binary data|one that cannot be parsed|cut off) "
+    r"\((?:[^()]|\([^()]*\))*\)"
 )
 _BYTES = re.compile(r"\d+ (bytes|items)")
 
 
-class Said(NamedTuple):
+class Outcome(NamedTuple):
     refused: bool
-    text: str
+    message: str
 
 
 @cache
 def _sound(layout: str) -> Path:
-    """A recording with which nothing is wrong, made once."""
-    folder = Path(tempfile.mkdtemp()) / "freiburg3_DATA"  # TUM's reader takes its camera from the name
+    """A recording without faults, made once."""
+    folder = Path(tempfile.mkdtemp()) / "freiburg3_DATA"  # TUM's reader identifies the camera by the name
     folder.mkdir()
     LAYOUTS[layout].build(folder)
     return folder
 
 
-def said_of(layout: str, fault: Fault, scratch: Path) -> Said:
-    """What reading a recording with this fault says, paths replaced."""
+def outcome_of(layout: str, fault: Fault, scratch: Path) -> Outcome:
+    """The outcome of reading a recording with this fault, with paths replaced in the message."""
     root = Path(shutil.copytree(_sound(layout), scratch / "freiburg3_DATA"))
     fault.damage(root)
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
             LAYOUTS[layout].read(root)
         except (ValueError, OSError) as error:
-            return Said(True, _plain(str(error), root))
-    texts = [str(warning.message) for warning in heard if issubclass(warning.category, DataWarning)]
-    return Said(False, _plain("; ".join(texts), root))
+            return Outcome(True, _plain(str(error), root))
+    messages = [str(warning.message) for warning in caught if issubclass(warning.category, DataWarning)]
+    return Outcome(False, _plain("; ".join(messages), root))
 
 
 def _plain(text: str, root: Path) -> str:
@@ -84,7 +85,7 @@ def page(scratch: Path) -> str:
     """docs/data-errors.md: a table of the messages of several layouts, then one of each layout's own."""
     alike: dict[tuple[str, str], list[Case]] = {}
     for number, (layout, fault) in enumerate(CASES):
-        refused, text = said_of(layout, fault, scratch / str(number))
+        refused, text = outcome_of(layout, fault, scratch / str(number))
         outcome = "" if refused else "rest used" if "left out" in text else "all used"
         alike.setdefault((outcome, _pattern(text)), []).append(Case(layout, fault.what, text))
     sections: dict[str, list[str]] = {name: [] for name in (SHARED, *LAYOUTS)}
@@ -116,7 +117,7 @@ def _problem(cases: list[Case], name_layouts: bool) -> str:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_there_is_nothing_to_say_of_sound_data(layout):
+def test_sound_data_raises_no_warnings(layout):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)
         LAYOUTS[layout].read(_sound(layout))
@@ -126,17 +127,17 @@ def test_there_is_nothing_to_say_of_sound_data(layout):
     ("layout", "fault"), [pytest.param(*case, id=f"{case[0]}-{case[1].what}") for case in CASES]
 )
 def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
-    refused, text = said_of(layout, fault, tmp_path)
-    assert all(name in text for name in fault.names), text
+    refused, message = outcome_of(layout, fault, tmp_path)
+    assert all(name in message for name in fault.names), message
     if refused:
-        said, _, advice = text.rpartition("found ") if "found " in text else ("", "", text)
-        assert re.search(r"[.!?] [A-Z][^.]*[a-z].*[.?]?$", advice), text
-        assert not said or "expected " in said, text
+        before, _, advice = message.rpartition("found ") if "found " in message else ("", "", message)
+        assert re.search(r"[.!?] [A-Z][^.]*[a-z].*[.?]?$", advice), message
+        assert not before or "expected " in before, message
     else:
-        assert "left out" in text or re.search(r"[.;?] .*\b(give|set) ", text), text
+        assert "left out" in message or re.search(r"[.;?] .*\b(give|set) ", message), message
 
 
-def test_the_page_in_the_docs_is_what_readers_say(tmp_path):
+def test_the_page_in_the_docs_is_up_to_date(tmp_path):
     written = PAGE.read_text(encoding="utf-8")
     assert written == page(tmp_path), "run python -m tests.data.test_reader_errors"
 

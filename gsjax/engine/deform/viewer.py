@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gsjax.data.ordered import open_in_time
+from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation
 from gsjax.engine.deform.pictures import probabilities_of
 from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
@@ -103,7 +103,7 @@ def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
     """The cameras of all frames, with what they saw if that is still there."""
     load = None
     try:
-        sequence = reopen(path / "config.yml", _AGAIN, opened=open_in_time)[0].judged
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
         if found != (wanted := (len(stored.times), *stored.size)):
             raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
