@@ -85,7 +85,11 @@ class Parts:
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """Keeps the pose of a frame whose last step was made, makes parts one or two, and opens the next
-        frame; after the last one leaves out parts that no picture needs, and begins to refine the scene."""
+        frame; after the last one leaves out parts that no picture needs, and begins to refine the scene.
+
+        Args:
+            problem, run, progress: as in `gsjax.optim.method.Method`; progress is not used.
+        """
         run = self.brought_up_to_date(problem, run)
         if not isinstance(run.params, RefineParams):
             discovery: Discovery = run.kept
@@ -109,7 +113,11 @@ class Parts:
     def batch(
         self, problem: Problem, run: Run, progress: float
     ) -> tuple[StreamBatch | RefineBatch, tuple[str, ...]]:
-        """One camera of the frame that is being found and pictures of the past; or any picture."""
+        """One camera of the frame that is being found and pictures of the past; or any picture.
+
+        Args:
+            problem, run, progress: as in `gsjax.optim.method.Method`; progress is not used.
+        """
         if isinstance(run.params, RefineParams):
             return self._batch_of_all(problem, run)
         config, discovery = self.config.stream, run.kept
