@@ -15,14 +15,12 @@ import jax
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
-from gsjax.engine.fit.start import start_from
 from gsjax.engine.parts.start import FIT, without_needless
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.fit import Fit, FitConfig
 from gsjax.methods.parts import Parts, PartsConfig, begin, choose_anchor, moved_pixels
 from gsjax.methods.parts.pictures import problem_of
 from gsjax.methods.protocols import Segmenter
-from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
 
@@ -48,6 +46,8 @@ def fit(
         ValueError: as `gsjax.methods.fit.Fit.start`.
         DataError: a photograph cannot be read.
     """
+    from gsjax.engine.fit.start import start_from  # matching is seldom needed, and slow to import
+
     frames = [photographs.frame(i) for i in range(photographs.num)]
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)
@@ -87,6 +87,8 @@ def parts(
             nothing is found that moves.
         DataError: a picture cannot be read.
     """
+    from gsjax.perception.segmenters import PieceSegmenter  # slow to import
+
     method = Parts(PartsConfig() if config is None else config, extra_losses)
     config, eval_cameras = method.config, tuple(eval_cameras)
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
