@@ -18,7 +18,7 @@ from gsjax.methods.fit import Fit, FitConfig, StartConfig, fit_loss
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.refine import RefineBatch as PartsBatch
 from gsjax.methods.parts.refine import RefineParams, refine_step
-from gsjax.methods.parts.stream import StreamParams, skinning_weights, stream_loss
+from gsjax.methods.parts.stream import skinning_weights, stream_loss
 from gsjax.methods.track import AlignConfig, track
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
@@ -27,7 +27,7 @@ from gsjax.scene.deformation import DeformationConfig
 from gsjax.scene.handles import at_rest
 from tests.methods.ball_before_wall import batch_after
 from tests.methods.photographed_blobs import photographed_blobs
-from tests.methods.two_boxes import batch_of, shifted, soft, two_boxes
+from tests.methods.two_boxes import batch_of, params_of, shifted, soft, two_boxes
 
 FIT = FitConfig(steps=4, cap=60, sh_degree=0, coarse_until=0.0, start=StartConfig(count=50))
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
@@ -198,7 +198,7 @@ class TestOtherMethods:
     @pytest.mark.slow
     def test_of_parts(self, pictures):
         batch, bodies = batch_of(pictures)
-        params = StreamParams(shifted(0.01), soft(bodies))
+        params = params_of(shifted(0.01), soft(bodies), bodies)
         added = slope_added(lambda extra: stream_loss(StreamConfig(), extra), params, batch)
         share = np.asarray(skinning_weights(params.field, batch.canonical)).sum(0)
         share = share / (batch.canonical.movable.num + batch.canonical.fixed.num)
@@ -211,12 +211,12 @@ class TestOtherMethods:
         scene, config = batch.canonical, PartsConfig()
         poses = jax.tree.map(lambda a: jnp.stack([a, a]), at_rest(len(scene.alive)))
         params = RefineParams(scene.movable, scene.fixed, poses)
-        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), batch.plan)
+        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), 0.0, batch.plan)
 
         @partial(jax.jit, static_argnums=0)
         def after(extra):
             step = refine_step(config, extra)
-            return step.update(params, step.init(params), given, step=0.0, key=None)
+            return step.update(params, step.init(params), given, step=0, key=None)
 
         (plain, _, _), (pulled, _, info) = after(()), after((height,))
         assert np.all(pulled.movable.means[:, 2] <= plain.movable.means[:, 2])
