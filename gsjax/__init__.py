@@ -3,7 +3,7 @@
 rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
 data        open_sequence, Sequence
-tracking    start_scene, scene_from_shapes, track, track_step, TrackConfig
+tracking    start_scene, scene_from_shapes, track, TrackConfig
 files       read_ply, write_ply
 speed       host_options, keep_freed_memory, keep_programs
 """
@@ -13,15 +13,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gsjax.data import Sequence, open_sequence
+    from gsjax.engine.track.tracking import track
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
-    from gsjax.methods.track import (
-        TrackConfig,
-        scene_from_shapes,
-        start_scene,
-        track,
-        track_step,
-    )
+    from gsjax.methods.track import TrackConfig, scene_from_shapes, start_scene
     from gsjax.optim.compiler import host_options, keep_freed_memory, keep_programs
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
@@ -36,15 +31,10 @@ __version__ = "0.1.0"
 # Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
 _HOMES = {
     "gsjax.data": ("Sequence", "open_sequence"),
+    "gsjax.engine.track.tracking": ("track",),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
-    "gsjax.methods.track": (
-        "TrackConfig",
-        "track_step",
-        "scene_from_shapes",
-        "start_scene",
-        "track",
-    ),
+    "gsjax.methods.track": ("TrackConfig", "scene_from_shapes", "start_scene"),
     "gsjax.optim.compiler": ("host_options", "keep_freed_memory", "keep_programs"),
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),
@@ -78,7 +68,6 @@ __all__ = [
     "sharded_rasterization",
     "start_scene",
     "track",
-    "track_step",
     "write_ply",
 ]
 

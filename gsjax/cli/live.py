@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, Newest, Snapshot, replay
+from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
@@ -24,7 +25,8 @@ from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
 from gsjax.engine.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.engine.track.scoring import budget_metrics
-from gsjax.methods.track import PRESETS, Tracked, TrackedScene, start_scene, track
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 
@@ -169,31 +171,29 @@ class Log:
         self.late, self.skipped, self.counts, self.chosen, self.plans = 0, 0, {}, None, set()
         self._memory_at = 0.0
 
-    def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
+    def add(self, now: Tick, arrival: Arrival, budget: float) -> None:
         """One update.
 
         Args:
-            update: what the tracker says.
+            now: the tracker after it.
             arrival: the frame, and when it came.
             budget: seconds, beyond which an update is late.
         """
-        now = perf_counter()
-        self.times.append(now)
+        time, info = perf_counter(), now.info
+        self.times.append(time)
         self.stamps.append(arrival.snapshot.stamp)
-        self.latencies.append(now - arrival.time)
-        self.seconds.append(update.seconds)
-        self.late += update.seconds > budget
-        self.skipped += bool(update.info["skipped"])
-        self.everywhere.append(update.everywhere)
-        self.chosen = update.chosen
-        self.plans.add(update.plan)
-        self.lost.append(np.asarray(update.info["lost"]))
-        self.turn_known.append(np.asarray(update.info["turn_known"]))
-        self.poses.append(
-            self._carried(*jax.device_get((update.info["motion"].twists, update.info["centers"])))
-        )
-        if now - self._memory_at > _MEMORY_EVERY_S:
-            self._memory_at = now
+        self.latencies.append(time - arrival.time)
+        self.seconds.append(now.seconds)
+        self.late += now.seconds > budget
+        self.skipped += bool(info["skipped"])
+        self.everywhere.append(int(info["looked_for"].sum()))
+        self.chosen = now.run.kept.chosen
+        self.plans.add(now.run.plans[PLAN])
+        self.lost.append(np.asarray(info["lost"]))
+        self.turn_known.append(np.asarray(info["turn_known"]))
+        self.poses.append(self._carried(*jax.device_get((info["motion"].twists, info["centers"]))))
+        if time - self._memory_at > _MEMORY_EVERY_S:
+            self._memory_at = time
             self.memory_mb.append(resident_mb())
 
     def _carried(self, twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
@@ -290,11 +290,10 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         console.print(MEASURING)
         # Drawn between updates: a thread of its own would make some of them late.
         with Live(console=console, auto_refresh=False, transient=True) as shown:
-            updates = track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms)
-            for update in updates:
+            for now in track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms):
                 if not arrived:
                     continue
-                log.add(update, arrived[0], budget_ms / 1e3)
+                log.add(now, arrived[0], budget_ms / 1e3)
                 if len(log.times) % 15 == 0:
                     worst, counts = 1e3 * max(log.latencies), newest.counts
                     words = f"{counts.used} frames, {counts.dropped} dropped, {worst:.0f} ms at worst"

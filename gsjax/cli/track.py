@@ -96,15 +96,14 @@ def run(options: Options) -> int:
         draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
-        after = None
         if options.resume:
-            tracking, after = load(folder.resume, first, options.track)
+            tracking = load(folder.resume, options.track)
             notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
         else:
             scene, seconds["start"] = _start(recording, first, mask, options.track, console, notes)
             tracking = begin(scene)
         saver = Saver(folder.resume, tracking.resumed)
-        how = {"budget_ms": options.budget_ms, "after": after, "saved": saver}
+        how = {"budget_ms": options.budget_ms, "saved": saver}
         tracking = follow(tracking, first, recording.tracked, options.track, console, **how)
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)

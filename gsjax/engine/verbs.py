@@ -11,6 +11,7 @@ is its `result`:
 from gsjax.data.photographs import Photographs
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.fit.start import start_from
+from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.fit import Fit, FitConfig
 

@@ -1,6 +1,5 @@
 """Layers drawn together: copies of parts, parts of elsewhere, and nothing that is never seen."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

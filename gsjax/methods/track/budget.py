@@ -47,7 +47,7 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 
     def rung(preset: TrackConfig) -> TrackConfig:
         grow = replace(preset.grow, slots=config.grow.slots)
-        return replace(preset, start=config.start, headroom=config.headroom, grow=grow)
+        return replace(preset, start=config.start, headroom=config.headroom, seed=config.seed, grow=grow)
 
     rungs = {name: rung(PRESETS[name]) for name in ("accurate", "balanced", "fast")}
     small = replace(rungs["fast"], shrink=2)

@@ -21,12 +21,12 @@ from gsjax.methods.track.points import Points, Sight, sum_of_three
 from gsjax.methods.track.reference import ReferencePoints, as_facing
 
 _LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
-_NEAR_HUNCH = 0.3  # radians; how a guess that goes on from a guess is turned
+_NEAR_GUESS = 0.3  # radians; how a guess that goes on from a guess is turned
 _STARTS = 8  # guesses that are aligned
 _ROUNDS = 2  # in which turns of the best are tried
 
 
-def since(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
+def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
     """The same places as after `twists`, from where groups are after `moved`, both about the same centres."""
     turns = jaxlie.SO3.exp(twists[..., 3:]) @ jaxlie.SO3.exp(moved[..., 3:]).inverse()
     return jnp.concatenate([twists[..., :3] - moved[..., :3], turns.log()], axis=-1)
@@ -172,6 +172,6 @@ def guesses(
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
     strange = (jnp.arange(count) % 2 == 1) & any_there
     far = jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
-    nearly = _NEAR_HUNCH * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
+    nearly = _NEAR_GUESS * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
     near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(guess, far.shape))
     return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -30,6 +31,7 @@ from gsjax.methods.track.motion import Motion, first_pose, move
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
@@ -276,11 +278,13 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
     still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
     rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0, background_rate=0.0)
-    while True:
-        motion, _, info = _refine_rigidly()(still, RefineBatch(scene, frame, plan, pose, centers, roi), rates)
-        if not info["overflow"]:
-            break
-        plan = plan.grown(int(info["needed"]), config.headroom)
+
+    def refined(plan):
+        batch = RefineBatch(scene, frame, plan, pose, centers, roi)
+        motion, _, info = _refine_rigidly()(still, batch, rates)
+        return motion, SimpleNamespace(**info)
+
+    motion, _ = with_room(refined, plan, config.headroom)
     moved = move(pose, motion, centers, groups)
     count = scene.num_moving
     gaussians = eqx.tree_at(
