@@ -1,1 +1,1 @@
-"""Measurements whose results are committed: each module says what it measures, results/ what it found."""
+"""Benchmarks whose results are committed, under results/."""

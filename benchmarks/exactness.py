@@ -1,9 +1,9 @@
-"""Images and all gradients against the float64 reference, over seeded scenes and every mode.
+"""Errors of images and all gradients against the float64 reference, over seeded scenes and all modes.
 
 Run it with
 
     python -m benchmarks.exactness              # 52 scenes; writes benchmarks/results/exactness.json
-    python -m benchmarks.exactness --scenes 5   # a quick look; writes nothing
+    python -m benchmarks.exactness --scenes 5   # a quick check; writes nothing
 """
 
 import argparse
@@ -27,7 +27,7 @@ def _worst(errors: dict[str, float], images: bool) -> tuple[float, str]:
 
 
 def summary(scenes: list[dict]) -> dict:
-    """Worst error of each array over all scenes, and the share of pixels left out."""
+    """Worst error of each array over all scenes, and the fraction of doubtful pixels, which are left out."""
     worst = {
         dtype: {
             name: max(s[dtype][name] for s in scenes if name in s[dtype])
@@ -77,7 +77,7 @@ def main() -> None:
                 f"{figures[0]:27} {figures[1]:27} {this.mode}",
                 flush=True,
             )
-            jax.clear_caches()  # every scene compiles its own programs; nothing is gained by keeping them
+            jax.clear_caches()  # every scene compiles its own programs, so caching them is useless
     bottom = summary(scenes)
     seconds = time.perf_counter() - began
     print(json.dumps(bottom, indent=2), f"\n{seconds:.0f} s")
@@ -87,7 +87,7 @@ def main() -> None:
         RESULT.parent.mkdir(exist_ok=True)
         RESULT.write_text(json.dumps(record, indent=1) + "\n")
     if not bottom["passed"]:
-        raise SystemExit("an error is above its limit")
+        raise SystemExit("an error exceeds its limit")
 
 
 if __name__ == "__main__":

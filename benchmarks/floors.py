@@ -1,4 +1,4 @@
-"""What no implementation could undercut: exp for every pair, and moving the inputs and outputs once."""
+"""Lower bounds of any implementation: exp for every pair, and copying inputs and outputs once."""
 
 import math
 from collections.abc import Sequence
@@ -14,31 +14,31 @@ from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 
-TILE = 16  # of the rectangles, whatever tiles the rasterizer uses
-BLOCK = 2**20  # float32 values in 4 MB, which stay in cache
+TILE = 16  # of the rectangle pairs, independent of the rasterizer's tiles
+BLOCK = 2**20  # float32 values in 4 MB, which fit in the cache
 PASSES = 32
-COPY = 2**26  # float32 values in 256 MB, which do not
+COPY = 2**26  # float32 values in 256 MB, which do not fit
 CALM = 1.25  # a floor that changed by more than this while a workload ran makes it noisy
 
 
 class Floors(NamedTuple):
-    """Of the machine at one moment."""
+    """Floors of the machine at one time."""
 
-    exp_ns: float  # nanoseconds of exp for one float32
-    copy_gb_s: float  # gigabytes read, and as many written, in a second
+    exp_ns: float  # nanoseconds per exp of a float32
+    copy_gb_s: float  # gigabytes read, and the same amount written, per second
 
     def exp_ms(self, rectangle_pairs: int) -> float:
-        """Time of exp alone over all pixels of the rectangles' tiles."""
+        """Time of exp alone over all pixels of the rectangle pairs."""
         return 1e-6 * self.exp_ns * rectangle_pairs * TILE * TILE
 
     def copy_ms(self, num_bytes: int) -> float:
-        """Time to copy that many bytes."""
+        """Time to copy the given number of bytes."""
         return 1e-6 * num_bytes / self.copy_gb_s
 
 
 @cache
 def _programs():
-    # Negation, because XLA would leave out a copy that changes nothing; it splits this one over all cores.
+    # Negation, because XLA would remove a plain copy; it runs this on all cores.
     exp = jax.jit(
         lambda x: jax.lax.fori_loop(0, PASSES, lambda _, y: jnp.exp(-y), x),
         compiler_options=host_options() or None,
@@ -47,7 +47,7 @@ def _programs():
 
 
 def measure_floors(repeats: int = 9) -> Floors:
-    """Both floors now, on all cores."""
+    """Measure both floors now, on all cores."""
     exp, copy = _programs()
     block, large = jnp.linspace(0.0, 1.0, BLOCK), jnp.ones(COPY)
     exp_s = float(np.median(sample(lambda _: exp(block), repeats)))
@@ -56,12 +56,12 @@ def measure_floors(repeats: int = 9) -> Floors:
 
 
 def between(before: Floors, after: Floors) -> Floors:
-    """The geometric mean: what to hold the calls between two measurements against."""
+    """The geometric mean: the reference for calls between two measurements."""
     return Floors(*(math.sqrt(a * b) for a, b in zip(before, after, strict=True)))
 
 
 def is_calm(before: Floors, after: Floors) -> bool:
-    """Whether the exp floor stayed within 25 % of itself."""
+    """Whether the exp floor changed by at most 25 %."""
     return max(before.exp_ns, after.exp_ns) <= CALM * min(before.exp_ns, after.exp_ns)
 
 
@@ -73,14 +73,14 @@ def _project(means, quats, scales, opacities, viewmat, K, plan: Plan):
 
 
 def rectangle_pairs(gaussians: Sequence, viewmat, K, width: int, height: int) -> int:
-    """16x16 tiles in the bounding boxes of all visible Gaussians, added up.
+    """Total number of 16x16 tiles in the bounding boxes of all visible Gaussians.
 
-    This counts what a plain rasterizer would draw, so it depends on the scene alone, not on how we cull.
+    This is what a simple rasterizer would draw, so it depends only on the scene, not on our culling.
 
     Args:
         gaussians: means, quats, scales, opacities.
-        viewmat, K: of one camera, [4, 4] and [3, 3].
-        width, height: of its image.
+        viewmat, K: pose and intrinsics of one camera, [4, 4] and [3, 3].
+        width, height: size of its image, pixels.
     """
     projected = _project(*gaussians, viewmat, K, Plan(width, height, capacity=0))
     means2d, extents, visible = map(np.asarray, projected)

@@ -1,17 +1,18 @@
-"""Poison in every input of the rasterizer, over seeded scenes: is anything non-finite, or dropped in silence?
+"""Fuzz the rasterizer: poison every input over seeded scenes; look for non-finite output and silent drops.
 
-A case puts one value (NaN, an infinity, a denormal, a threshold, ...) into one input: a whole row or one
-number of it. Then every image and every gradient (or tangent) has to be finite, and
+A case puts one value (NaN, an infinity, a denormal, a threshold, ...) into one input: a whole row, or one
+element of it. Then every image and every gradient (or tangent) has to be finite, and
 
-- what cannot be drawn is counted in `meta.culled`, and all the rest is to the bit as in the scene without it;
-- what is not counted is drawn as the float64 reference draws it, or left out where that shows nothing;
-- `reads` changes no bit; a camera that is not finite sees nothing and counts every row; a background that
-  is not finite, or whose square is not, is black.
+- a Gaussian that cannot be drawn is counted in `meta.culled`, and the rest is bitwise equal to the scene
+  without it;
+- a Gaussian that is not counted is drawn as by the float64 reference, or left out if it is invisible there;
+- `reads` changes no bit; a camera that is not finite sees nothing and counts every row as culled; a
+  background that is not finite, or whose square is not, is black.
 
 Run it with
 
     python -m benchmarks.fuzz --minutes 5 --seed 0   # writes benchmarks/results/fuzz.json
-    python -m benchmarks.fuzz --case MODE:SEED:INPUT:ROW:COLUMN:POISON   # one again; column -1: the whole row
+    python -m benchmarks.fuzz --case MODE:SEED:INPUT:ROW:COLUMN:POISON   # one case; column -1: a whole row
 """
 
 import argparse
@@ -46,7 +47,7 @@ from gsjax.rasterize.rasterization import rasterization
 from gsjax.rasterize.reference import rasterization_reference
 
 RESULT = Path(__file__).parent / "results" / "fuzz.json"
-TOLERANCE = 1e-3  # of the image's largest value: far above rounding, far below one Gaussian left out
+TOLERANCE = 1e-3  # relative to the image's largest value: far above rounding, far below a missing Gaussian
 
 
 class Outcome(NamedTuple):
@@ -62,7 +63,7 @@ def _random_like(tree, seed: int):
 
 @functools.cache
 def _program(name: str):
-    """scene -> images, derivatives, culled: the one program of a mode."""
+    """The compiled program of a mode: scene -> images, derivatives, culled."""
     plan = plan_of(MODES[name])
 
     def images_of(scene, reads):
@@ -117,7 +118,7 @@ def _reference_program(name: str):
 
 @functools.cache
 def _in_float64(name: str):
-    """The rasterizer itself, for what the reference cannot tell; forward only."""
+    """The rasterizer itself in float64, for cases beyond the reference; forward only."""
     plan = plan_of(MODES[name])
 
     def images_of(scene):
@@ -130,7 +131,7 @@ def _in_float64(name: str):
 def _error(
     name: str, scene: dict[str, np.ndarray], images: list[np.ndarray], judge=_reference_program
 ) -> float:
-    """Largest error of images against a float64 program, of an image's largest value."""
+    """Largest error of the images against a float64 program, relative to the image's largest value."""
     exact = {k: np.asarray(v, np.float64) for k, v in scene.items() if k not in ("reads", "means2d_offset")}
     exact["opacities"] = np.clip(exact["opacities"], 0.0, 1.0)
     with jax.enable_x64(True):
@@ -156,67 +157,67 @@ def _absent(mode: str, seed: int, row: int) -> Outcome:
 
 
 def _differing(a: Outcome, b: Outcome) -> list[str]:
-    """What of two outcomes is not equal to the bit."""
+    """Names of the arrays that are not bitwise equal."""
     names = [f"image {i}" for i in range(3) if not np.array_equal(a.images[i], b.images[i])]
     return names + [k for k in a.derivatives if not np.array_equal(a.derivatives[k], b.derivatives[k])]
 
 
 def check(case: Case) -> tuple[str, str]:
-    """(what became of the poison, what is wrong with that or "")."""
+    """(what happened to the poisoned value, description of the failure or "")."""
     scene = poisoned(case)
     got = run(case.mode, scene)
     bad = [f"image {i}" for i, a in enumerate(got.images) if not np.isfinite(a).all()]
     bad += [k for k, a in got.derivatives.items() if not np.isfinite(np.float32(a)).all()]
     if bad:
         return "drawn", f"not finite: {', '.join(bad)}"
-    harmful = not np.isfinite(np.float32(scene[case.input])).all()
+    nonfinite = not np.isfinite(np.float32(scene[case.input])).all()
     if case.input == "reads":
-        return "ignored", _said("changed", _differing(got, _clean(case.mode, case.seed)))
+        return "ignored", _listed("changed", _differing(got, _clean(case.mode, case.seed)))
     with np.errstate(over="ignore"):
         overflows = ~np.isfinite(scene["backgrounds"] ** 2)
     if case.input == "backgrounds" and overflows.any():
         black = run(
             case.mode, scene | {"backgrounds": np.where(overflows, np.float32(0), scene["backgrounds"])}
         )
-        # What counts as black has no derivative; a black background has.
+        # A background treated as black has no derivative; one that is black does.
         own = ("backgrounds", "colors") if "alphas" in got.derivatives else ("backgrounds",)
-        return "black", _said("changed", [k for k in _differing(got, black) if k not in own])
-    if case.input in ("viewmats", "Ks") and harmful:
+        return "black", _listed("changed", [k for k in _differing(got, black) if k not in own])
+    if case.input in ("viewmats", "Ks") and nonfinite:
         sees = bool(got.images[1].any())
-        return "culled", f"{got.culled} of {NUM} counted" if got.culled < NUM else "it sees" * sees
+        return "culled", f"{got.culled} of {NUM} counted" if got.culled < NUM else "it is not blank" * sees
     if case.input in (*PER_GAUSSIAN, "means2d_offset"):
         absent = _absent(case.mode, case.seed, case.row)
         if got.culled:
             counted = "" if got.culled == 1 else f"{got.culled} counted; "
-            return "culled", counted + _said("neighbours touched", _differing(got, absent))
-        if harmful:
+            return "culled", counted + _listed("other Gaussians changed", _differing(got, absent))
+        if nonfinite:
             return "drawn", "neither drawn nor counted"
         if not _differing(got, absent):
-            fine = case.input != "means2d_offset" or abs(POISONS[case.poison]) > 1
-            if fine and _error(case.mode, scene, got.images) <= TOLERANCE:
+            comparable = case.input != "means2d_offset" or abs(POISONS[case.poison]) > 1
+            if comparable and _error(case.mode, scene, got.images) <= TOLERANCE:
                 return "invisible", ""
-    if case.input == "means2d_offset":  # the reference has no such input
+    if case.input == "means2d_offset":  # not an input of the reference
         value = float(POISONS[case.poison])
         if abs(value) > 1e6:
-            return "invisible", _said("neighbours touched", _differing(got, absent))
+            return "invisible", _listed("other Gaussians changed", _differing(got, absent))
         small = abs(value) < 1e-9
-        return "drawn", _said("changed", _differing(got, _clean(case.mode, case.seed))) if small else ""
-    if got.culled:  # a camera in which some Gaussians have no area
+        return "drawn", _listed("changed", _differing(got, _clean(case.mode, case.seed))) if small else ""
+    if got.culled:  # a camera in which some Gaussians have zero area
         return "culled", ""
     if case.input == "viewmats" and abs(POISONS[case.poison]) > 1e3:
-        # No rigid motion, or one beyond float32: finite and no more (docs/numerics.md has the distances).
+        # No rigid motion, or beyond float32: it only has to be finite (docs/numerics.md has the distances).
         return "drawn", ""
     error = _error(case.mode, scene, got.images)
     if error > TOLERANCE and case.input in ("scales", "Ks"):
-        # The reference multiplies covariances out: a needle's width is lost beside the square of its length.
+        # The reference forms full covariances, in which a needle's width is lost next to its squared length.
         error = _error(case.mode, scene, got.images, _in_float64)
     if error > TOLERANCE and case.poison in ("at near", "below near", "far"):
-        # On the very plane rounding decides.
+        # Exactly on the plane, rounding decides.
         error = _error(case.mode, _without(scene, case.row), got.images)
     return "drawn", "" if error <= TOLERANCE else f"off the reference by {error:.1e}"
 
 
-def _said(what: str, names: list[str]) -> str:
+def _listed(what: str, names: list[str]) -> str:
     return f"{what}: {', '.join(names)}" if names else ""
 
 
@@ -224,13 +225,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--case", type=Case.parse, help="one case as a failure printed it")
+    parser.add_argument("--case", type=Case.parse, help="a single case, as printed for a failure")
     arguments = parser.parse_args()
     if arguments.case:
         outcome, failure = check(arguments.case)
-        raise SystemExit(
-            f"{arguments.case}: {outcome}; {failure}" if failure else f"{outcome}, as it should be"
-        )
+        raise SystemExit(f"{arguments.case}: {outcome}; {failure}" if failure else f"{outcome}, as expected")
     print(machine.in_words(machine.describe()))
     began = time.perf_counter()
     for mode in MODES:
@@ -253,7 +252,7 @@ def main() -> None:
             print(f"python -m benchmarks.fuzz --case '{case}'  # {failure}", flush=True)
     seconds = time.perf_counter() - began
     for title, table in (("input", by_input), ("poison", by_poison)):
-        print(f"\n{title:15} {'cases':>7}  what became of them")
+        print(f"\n{title:15} {'cases':>7}  outcomes")
         for name, counts in table.items():
             words = ", ".join(f"{n} {outcome}" for outcome, n in counts.most_common())
             print(f"{name:15} {counts.total():7}  {words}")

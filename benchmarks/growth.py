@@ -1,4 +1,4 @@
-"""How time grows with Gaussians, pixels and channels: log-log, each beside its floors."""
+"""Plots of time over Gaussians, pixels and channels: log-log, with the floors."""
 
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,11 @@ AXES = {
 
 
 def draw_growth(rows: list[dict[str, Any]], sweeps: dict[str, tuple[str, ...]]) -> Figure | None:
-    """A panel for each sweep of which two points or more were measured; None where there is none.
+    """One panel for each sweep with at least two measured points; None without any.
 
     Args:
-        rows: of the table.
-        sweeps: of each workload, which ones it is a point of.
+        rows: rows of the table.
+        sweeps: for each workload, the sweeps that it belongs to.
     """
     panels = {}
     for sweep in AXES:
@@ -38,7 +38,7 @@ def draw_growth(rows: list[dict[str, Any]], sweeps: dict[str, tuple[str, ...]]) 
         _panel(axes, sweep, mine)
     all_axes[0].set_ylabel("ms, median of a call", color=FAINT, fontsize=10)
     handles, names = all_axes[0].get_legend_handles_labels()
-    # Programs first, then floors; the columns are filled one after the other.
+    # Programs first, then floors; legends are filled column by column.
     order = sorted(range(len(names)), key=lambda i: "floor" in names[i])
     handles, names = ([a[i] for i in order] for a in (handles, names))
     look = {"frameon": False, "labelcolor": INK, "fontsize": 9.5}
@@ -70,7 +70,7 @@ def _panel(axes, sweep: str, rows: list[dict[str, Any]]) -> None:
     fixed += [f"{r['width']}x{r['height']}" for r in rows[:1] if sweep != "pixels"]
     axes.set_title(f"over {label} ({', '.join(fixed)})", loc="left", fontsize=10.5, color=INK, weight="bold")
     axes.set_xlabel(label, color=FAINT, fontsize=10)
-    if sweep == "channels":  # too few for powers of ten
+    if sweep == "channels":  # too narrow a range for powers of ten
         axes.xaxis.set_major_locator(FixedLocator(sorted({value(r) for r in rows})))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.0f}"))
         axes.xaxis.set_minor_formatter(NullFormatter())

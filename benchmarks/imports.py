@@ -1,7 +1,7 @@
-"""How long imports take, each in a process of its own: `python -m benchmarks.imports [REPEATS]`.
+"""Time imports, each in a separate process: `python -m benchmarks.imports [REPEATS]`.
 
-Beside JAX's own import, which nothing here can shorten: a ratio means the same on a slow machine and a fast
-one. Files should be warm, so the first round is not counted.
+Times are also given relative to JAX's own import, so that they are comparable between machines. The first
+round warms the file cache and is not counted.
 """
 
 import statistics
@@ -30,26 +30,26 @@ print(b - a, perf_counter() - b)
 
 
 def import_times(program: str) -> tuple[float, float]:
-    """Seconds that `import jax` takes, and a program after it."""
+    """Seconds of `import jax`, and of a program after it."""
     command = [sys.executable, "-c", _TIMED.format(program=program)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    of_jax, beyond = map(float, done.stdout.split())
-    return of_jax, beyond
+    jax_seconds, seconds = map(float, done.stdout.split())
+    return jax_seconds, seconds
 
 
 def main(repeats: int = 7) -> None:
     """Print the median of `repeats` processes for each import.
 
     Raises:
-        ValueError: nothing would be measured.
+        ValueError: `repeats` is below 1.
     """
     if repeats < 1:
         raise ValueError(f"REPEATS: expected 1 or more, found {repeats}")
-    table = Table("after import jax", "s", "of jax's own s", "ratio")
+    table = Table("after import jax", "s", "import jax, s", "ratio")
     for name, program in AFTER_JAX.items():
         times = [import_times(program) for _ in range(repeats + 1)][1:]
-        of_jax, beyond = (statistics.median(column) for column in zip(*times, strict=True))
-        table.add_row(name, f"{beyond:.3f}", f"{of_jax:.3f}", f"{beyond / of_jax:.2f}")
+        jax_seconds, seconds = (statistics.median(column) for column in zip(*times, strict=True))
+        table.add_row(name, f"{seconds:.3f}", f"{jax_seconds:.3f}", f"{seconds / jax_seconds:.2f}")
     Console().print(table)
 
 

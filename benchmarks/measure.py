@@ -1,4 +1,4 @@
-"""One workload measured: every program, its floors, its memory, its pairs."""
+"""Measure one workload: every program, with floors, memory and pairs."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -17,7 +17,7 @@ from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import plan as make_plan
 
-MAX_ATTEMPTS = 3  # of a noisy workload
+MAX_ATTEMPTS = 3  # for a noisy workload
 GIB = 2**30
 PLAIN, UNREAD = ", plain jit", ", no reads"
 
@@ -36,14 +36,14 @@ class Timed:
     median_ms: float
     p95_ms: float
     exp_floor_ms: float
-    exp_floors: float  # the median as a multiple
+    exp_floors: float  # the median as a multiple of it
     copy_floor_ms: float
     copy_floors: float
     compile_s: float
     memory_gib: float
     pairs: int  # Gaussian-tile pairs drawn
     pixel_pairs: int
-    rectangle_pairs: int  # of 16x16 tiles
+    rectangle_pairs: int  # pairs of a Gaussian and a 16x16 tile in its bounding box
     ns_per_rectangle_pixel: float
     noisy: bool
 
@@ -59,7 +59,7 @@ class Timed:
 
 @dataclass(frozen=True)
 class Result:
-    """What a workload gave."""
+    """Results of a workload."""
 
     rows: list[Timed]
     floors: tuple[Floors, Floors]  # right before and right after
@@ -71,7 +71,7 @@ class Result:
             return []
         row = self.rows[0]
         pairs = Metric(f"{row.workload}/pairs", row.pairs, "pairs", "lower", 1e-3, True)
-        # It is of the scene alone: another number means that another scene was drawn.
+        # A property of the scene: another number means that another scene was rendered.
         drawn = Metric(f"{row.workload}/rectangle_pairs", row.rectangle_pairs, "pairs", "same", 1e-3, True)
         return [pairs, drawn, *(metric for row in self.rows for metric in row.metrics())]
 
@@ -80,7 +80,7 @@ class Result:
 
 
 def available_bytes() -> float:
-    """Memory that a program may take: of the host, since XLA says itself when a GPU has too little."""
+    """Memory available to a program on the host; on a GPU XLA itself reports a shortage."""
     meminfo = Path("/proc/meminfo")
     if jax.default_backend() != "cpu" or not meminfo.exists():
         return float("inf")
@@ -89,7 +89,7 @@ def available_bytes() -> float:
 
 
 def compile_all(workload: Workload, scene: Scene, inputs: dict, say: Callable) -> dict[str, Compiled]:
-    """Every program of a workload, and its variants, by name."""
+    """Compile every program of a workload and its variants, by name."""
     gaussians = (*scene[:4], scene.viewmat[None], scene.K[None], workload.width, workload.height)
     plans = {d: make_plan(*gaussians, derivative=d) for d in ("reverse", "forward")}
     reads = jnp.zeros((1, plans["reverse"].num_tiles), jnp.int32)
@@ -104,10 +104,10 @@ def compile_all(workload: Workload, scene: Scene, inputs: dict, say: Callable) -
 
 
 def run_program(compiled: Compiled, pool: list[dict], first_reads, repeats: int) -> tuple[list[float], int]:
-    """Seconds of each call, and the pairs of the last one. Each call gets the reads of the one before.
+    """Seconds of each call, and the pairs of the last one. Each call gets the reads of the previous one.
 
     Raises:
-        RuntimeError: a perturbed scene did not fit the plan, so the times are of a call that drew nothing.
+        RuntimeError: a perturbed scene did not fit the plan, so a call drew nothing.
     """
     last: list[Any] = [None, (first_reads, None, None)]
     overflows = []
@@ -120,7 +120,7 @@ def run_program(compiled: Compiled, pool: list[dict], first_reads, repeats: int)
 
     seconds = sample(call, repeats)
     if any(bool(overflow.any()) for overflow in overflows):
-        raise RuntimeError("the plan was too small for a perturbed scene; its headroom must grow")
+        raise RuntimeError("the plan was too small for a perturbed scene; increase its headroom")
     return seconds, int(last[1][1].sum())
 
 
@@ -131,7 +131,7 @@ def measure(
     say: Callable[[str], None] = lambda text: None,
     floors: Callable[[], Floors] = measure_floors,
 ) -> Result:
-    """All programs of a workload between two measurements of the floors; again, up to twice, if these differ.
+    """Time all programs of a workload between two measurements of the floors; repeat if these differ.
 
     Raises:
         FileNotFoundError: the workload's data are absent.
@@ -142,8 +142,8 @@ def measure(
     compiled = compile_all(workload, scene, pool[0], say)
     for name in list(compiled):
         if compiled[name].memory > available_bytes():
-            asked = compiled.pop(name).memory / GIB
-            notes.append(f"{workload.name}, {name}: not run, it needs {asked:.1f} GiB")
+            needed = compiled.pop(name).memory / GIB
+            notes.append(f"{workload.name}, {name}: not run, it needs {needed:.1f} GiB")
     tile = Plan(workload.width, workload.height, capacity=0)
     zeros = jnp.zeros((1, tile.num_tiles), jnp.int32)
     for attempt in range(1, MAX_ATTEMPTS + 1):

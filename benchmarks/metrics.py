@@ -1,4 +1,4 @@
-"""The metric contract: what was measured, which way is better, how far it may move before that is news."""
+"""The metric contract: what was measured, which direction is better, and which changes are significant."""
 
 import datetime
 import subprocess
@@ -21,11 +21,11 @@ class Metric:
     Attributes:
         key: workload/program/figure.
         value: the figure.
-        unit: of the value.
-        direction: "lower" or "higher" is better, or it should stay the "same".
-        rel_tol: relative change that is no news.
-        travels: it means the same on another machine of the same kind of device.
-        noisy: the machine was disturbed: the figure is shown, and neither judged nor kept as a baseline.
+        unit: unit of the value.
+        direction: whether "lower" or "higher" is better, or the value should stay the "same".
+        rel_tol: largest relative change that is insignificant.
+        travels: the figure is comparable across machines with the same kind of device.
+        noisy: the machine was disturbed; the figure is shown, but neither judged nor kept as a baseline.
     """
 
     key: str
@@ -38,13 +38,15 @@ class Metric:
 
     def __post_init__(self):
         if self.direction not in DIRECTIONS:
-            raise ValueError(f"{self.key}: direction {self.direction!r} is none of {', '.join(DIRECTIONS)}")
+            raise ValueError(
+                f"{self.key}: expected direction {', '.join(DIRECTIONS)}, found {self.direction!r}"
+            )
         if self.rel_tol < 0:
-            raise ValueError(f"{self.key}: rel_tol {self.rel_tol} must not be negative")
+            raise ValueError(f"{self.key}: expected rel_tol of 0 or more, found {self.rel_tol}")
 
 
 class Row(NamedTuple):
-    """One metric against its baseline."""
+    """One metric compared with its baseline."""
 
     key: str
     unit: str
@@ -54,7 +56,7 @@ class Row(NamedTuple):
 
     @property
     def change(self) -> float | None:
-        """Relative to the baseline."""
+        """Relative change from the baseline."""
         if self.value is None or not self.baseline:
             return None
         return self.value / self.baseline - 1
@@ -64,7 +66,7 @@ FAILING = ("worse", "missing")
 
 
 def rounded(value: Any) -> Any:
-    """Six significant digits: noise in the others would only make differences in git."""
+    """Round to six significant digits; noise in the others would only clutter diffs."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -73,7 +75,7 @@ def rounded(value: Any) -> Any:
 
 
 def make_record(metrics: Iterable[Metric], **details: Any) -> dict[str, Any]:
-    """Machine, versions, date and metrics, ready for JSON."""
+    """Machine, versions, date and metrics as a dictionary for JSON."""
     stored = {metric.key: asdict(metric) for metric in metrics}
     for entry in stored.values():
         del entry["key"]
@@ -95,7 +97,7 @@ def read_metrics(record: dict[str, Any]) -> dict[str, Metric]:
     """The metrics of a record, by key.
 
     Raises:
-        ValueError: an entry is no metric.
+        ValueError: an entry is not a metric.
     """
     try:
         return {key: Metric(key, **entry) for key, entry in record["metrics"].items()}
@@ -104,7 +106,7 @@ def read_metrics(record: dict[str, Any]) -> dict[str, Metric]:
 
 
 def judge(now: Metric, before: Metric) -> str:
-    """better, same or worse; what is allowed is the tolerance of the newer one."""
+    """better, same or worse, by the tolerance of the newer metric."""
     change = now.value - before.value
     if abs(change) <= now.rel_tol * abs(before.value):
         return "same"
@@ -116,8 +118,8 @@ def judge(now: Metric, before: Metric) -> str:
 def compare(record: dict[str, Any], baseline: dict[str, Any]) -> list[Row]:
     """Every metric of `record` against the baseline.
 
-    A metric that the baseline has and a workload of this run no longer gives is missing; workloads that did
-    not run are passed over. On another machine only what travels is judged.
+    A metric of the baseline that a workload of this run no longer reports is missing; workloads that did not
+    run are skipped. On another machine only metrics that travel are judged.
     """
     now, before = read_metrics(record), read_metrics(baseline)
     same_machine = record["machine_name"] == baseline["machine_name"]
@@ -139,15 +141,15 @@ def compare(record: dict[str, Any], baseline: dict[str, Any]) -> list[Row]:
 
 
 def merged(record: dict[str, Any], baseline: dict[str, Any] | None) -> dict[str, Any]:
-    """The new baseline: what this run measured without noise, and the old figures of what did not run.
+    """The new baseline: this run's figures without noise, and the old ones of workloads that did not run.
 
     Raises:
-        ValueError: the old figures are of another machine, so the two cannot stand in one file.
+        ValueError: the old figures are from another machine, so the two cannot be combined.
     """
     metrics = {k: m for k, m in record["metrics"].items() if not m["noisy"]}
     if baseline is not None:
         ran = {key.split("/")[0] for key in record["metrics"]}
-        # A figure that was noisy this time stays as it was; one that is no longer measured goes.
+        # A figure that was noisy this time keeps its old value; one that is no longer measured is dropped.
         kept = {
             key: metric
             for key, metric in read_metrics(baseline).items()
@@ -156,8 +158,8 @@ def merged(record: dict[str, Any], baseline: dict[str, Any] | None) -> dict[str,
         elsewhere = baseline["machine_name"] != record["machine_name"]
         if elsewhere and set(kept) - set(metrics):
             raise ValueError(
-                f"the baseline is of {baseline['machine_name']}, this is {record['machine_name']}, and not "
-                "all was measured here (a part of the suite, or noise); run all of it to replace the baseline"
+                f"expected a baseline from this machine ({record['machine_name']}), found one from "
+                f"{baseline['machine_name']}; run the whole suite without noise to replace it"
             )
         metrics = {key: baseline["metrics"][key] for key in kept} | metrics
     head = ("machine", "machine_name", "versions", "commit", "date")
@@ -165,7 +167,7 @@ def merged(record: dict[str, Any], baseline: dict[str, Any] | None) -> dict[str,
 
 
 def _commit() -> str:
-    """The checkout's commit, with a + where files differ from it; empty without git."""
+    """The checkout's commit, followed by + if files differ from it; empty without git."""
     try:
         run = subprocess.run(
             ["git", "describe", "--always", "--dirty=+"],

@@ -1,4 +1,4 @@
-"""What a run looks like: lines of a table as it goes, and results.md."""
+"""Output of a run: rows of a table while it runs, and results.md."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from benchmarks.floors import CALM, TILE
 from benchmarks.metrics import Row
 from benchmarks.programs import BACKWARD, FORWARD, PERTURBATION
 
-# head, width in a terminal, cell
+# heading, width in a terminal, cell
 COLUMNS = (
     ("workload", 27, lambda r: r["workload"]),
     ("program", 28, lambda r: r["program"] + (" (noisy)" if r["noisy"] else "")),
@@ -33,8 +33,8 @@ STEP_COLUMNS = (
     ("compile s", 9, lambda r: figure(r["compile_s"])),
 )
 LEGEND = (
-    "/ exp, / copy: multiples of the least time there is, that of exp for all pixels of the Gaussians' "
-    f"{TILE}x{TILE} tiles and that of moving inputs and outputs once, here and now; ns/pixel: of those pixels"
+    "/ exp, / copy: multiples of two lower bounds measured here and now: the time of exp for all pixels of "
+    f"the Gaussians' {TILE}x{TILE} tiles, and of copying inputs and outputs once; ns/pixel: per such pixel"
 )
 TEXT = ("workload", "program", "step", "of")
 GOALS = {FORWARD: 2, BACKWARD: 5}  # exp floors, garden, camera 0
@@ -42,7 +42,7 @@ FLAT_GOAL, MEMORY_GOAL = 1.5, 6
 
 
 def figure(value: float | None) -> str:
-    """Three digits, without exponents."""
+    """A number with three significant digits, without exponents."""
     if value is None:
         return "–"
     if value != 0 and abs(value) < 100:
@@ -52,7 +52,7 @@ def figure(value: float | None) -> str:
 
 
 def print_rows(console: Console, rows: list[dict[str, Any]], columns=COLUMNS, head: bool = False) -> None:
-    """Rows under columns of fixed width, so that those of the next workload stand in line with them."""
+    """Print rows in columns of fixed width, so that those of later workloads are aligned with them."""
     grid = Grid.grid(padding=(0, 1, 0, 0))
     for name, width, _ in columns:
         right = "left" if name in TEXT else "right"
@@ -67,21 +67,21 @@ def print_rows(console: Console, rows: list[dict[str, Any]], columns=COLUMNS, he
 
 
 def print_comparison(console: Console, rows: list[Row], baseline: dict[str, Any]) -> None:
-    """What changed, and how many figures did not."""
+    """Print what changed, and how many figures did not."""
     counts = {v: sum(r.verdict == v for r in rows) for v in dict.fromkeys(r.verdict for r in rows)}
-    told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    of = f"{baseline['date']} ({baseline['machine_name']})"
-    console.print(f"\n[bold]against the baseline[/] of {of}: {told}")
+    summary = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+    origin = f"{baseline['date']} ({baseline['machine_name']})"
+    console.print(f"\n[bold]compared with the baseline[/] of {origin}: {summary}")
     for row in rows:
         if row.verdict in ("better", "worse", "missing"):
             style = {"better": "green"}.get(row.verdict, "bold red")
             change = "" if row.change is None else f" ({row.change:+.1%})"
-            told = f"  {row.key}: {figure(row.baseline)} -> {figure(row.value)} {row.unit}{change}"
-            console.print(Text.assemble((f"{row.verdict:>7}", style), told), soft_wrap=True)
+            line = f"  {row.key}: {figure(row.baseline)} -> {figure(row.value)} {row.unit}{change}"
+            console.print(Text.assemble((f"{row.verdict:>7}", style), line), soft_wrap=True)
 
 
 def markdown(record: dict[str, Any], device: str) -> str:
-    """The results page: the bottom line, the method, the tables, where it is bad, and what was noisy."""
+    """The results page: summary, method, tables, counter-cases, and which workloads were noisy."""
     rows, steps = record["rows"], record["steps"]
     parts = ["# Benchmarks", *(f"- {line}" for line in bottom_line(record)), "", METHOD.strip(), ""]
     parts += [f"{device}. Commit {record['commit'] or 'unknown'}, {record['date']} UTC."]
@@ -93,16 +93,16 @@ def markdown(record: dict[str, Any], device: str) -> str:
         parts += ["", "## Update rates", "", _table(steps, STEP_COLUMNS)]
     parts += ["", "## Counter-cases", "", *(f"- {line}" for line in counter_cases(rows))]
     noisy = sorted({r["workload"] for r in rows if r["noisy"]} | {r["name"] for r in steps if r["noisy"]})
-    quiet = "Nothing: every floor stayed within its bounds."
-    told = f"After all repetitions still noisy (hollow in the plot): {', '.join(noisy)}." if noisy else quiet
-    parts += ["", "## Noise", "", told]
+    quiet = "None: every floor stayed within its bounds."
+    line = f"Still noisy after all repetitions (hollow in the plot): {', '.join(noisy)}." if noisy else quiet
+    parts += ["", "## Noise", "", line]
     if record["notes"]:
         parts += ["", "## Not measured", "", *(f"- {note}" for note in record["notes"])]
     return "\n".join(parts) + "\n"
 
 
 def bottom_line(record: dict[str, Any]) -> list[str]:
-    """The goals, and how far each is reached; a sentence each."""
+    """One line per goal, with the figure reached."""
     rows, lines = record["rows"], []
     by_name = {(r["workload"], r["program"]): r for r in rows}
     for program, goal in GOALS.items():
@@ -115,20 +115,20 @@ def bottom_line(record: dict[str, Any]) -> list[str]:
             )
     for program, flat in record["flatness"].items():
         lines.append(
-            f"Flatness, {program}: the dearest pixel pair costs {figure(flat['ratio'])} times the cheapest "
-            f"(goal {FLAT_GOAL}; {flat['cheapest']} to {flat['dearest']})."
+            f"Flatness, {program}: the costliest pixel pair takes {figure(flat['ratio'])} times as long as "
+            f"the cheapest (goal {FLAT_GOAL}; {flat['dearest']} against {flat['cheapest']})."
         )
     wide = [r for r in rows if r["channels"] == 512 and r["program"] == BACKWARD]
     lines += [f"512 channels, {BACKWARD}: {figure(r['memory_gib'])} GiB (goal {MEMORY_GOAL})." for r in wide]
     rates = ((r["name"].removeprefix("steps-"), figure(r["steps_per_s"])) for r in record["steps"])
-    lines += [f"Step of {name}: {rate} a second." for name, rate in rates]
+    lines += [f"{name}: {rate} steps per second." for name, rate in rates]
     if not record["complete"]:
-        lines.append("This is a part of the suite.")
+        lines.append("Only a part of the suite was run.")
     return lines
 
 
 def counter_cases(rows: list[dict[str, Any]]) -> list[str]:
-    """Where the rasterizer is furthest from its floor, and where the knobs buy nothing."""
+    """Workloads on which the rasterizer is farthest from its floor, or an optimisation does not pay off."""
     lines = []
     for program in GOALS:
         mine = sorted((r for r in rows if r["program"] == program), key=lambda r: -r["exp_floors"])
@@ -142,8 +142,8 @@ def counter_cases(rows: list[dict[str, Any]]) -> list[str]:
         unread = by_name.get((workload, f"{program}, no reads"))
         if unread and unread["median_ms"] < row["median_ms"]:
             saved = f"{figure(unread['median_ms'])} ms without, {figure(row['median_ms'])} ms with"
-            lines.append(f"{workload}, {program}: `reads` buys nothing here ({saved}).")
-    return lines or ["Too little was measured to say."]
+            lines.append(f"{workload}, {program}: `reads` does not pay off here ({saved}).")
+    return lines or ["Too little was measured to tell."]
 
 
 def _table(rows: list[dict[str, Any]], columns) -> str:
@@ -156,24 +156,25 @@ def _table(rows: list[dict[str, Any]], columns) -> str:
 METHOD = f"""
 ## Method
 
-Whole calls are timed: projection, binning, compositing; the plan is given, compiling is timed apart. Means
-and camera are perturbed (relative {PERTURBATION:g}) and differ from call to call; `reads` of a call are given
-to the next. Results are waited for; two calls warm up; *ms* is the median, *p95* the 95th percentile.
+Whole calls are timed: projection, binning and compositing, with a given plan; compilation is timed
+separately. Means and camera are perturbed (by {PERTURBATION:g}, relative) and differ from call to call; the
+`reads` of each call are passed to the next. Timing waits for the results, after two warm-up calls; *ms* is
+the median, *p95* the 95th percentile.
 
 - **forward**: colours, alphas and features. **forward+backward**: the gradient of sum(colors^2) + sum(alphas)
-  (+ sum(features^2)) to means, quats, scales, opacities, colors (and features). **jvp**: the images, and one
-  tangent of the camera's pose pushed through, in turn one of six. Channels beyond 3 are features beside the
-  colours.
-- **plain jit**: compiled as a user's `jax.jit` does, without `host_options()`. **no reads**: without the
-  `reads` of the call before. The process keeps freed memory (`keep_freed_memory()`), as every command does.
-- **/ exp**: multiple of the time that exp alone takes over all pixels of the rectangle pairs. Rectangle pairs
-  are the {TILE}x{TILE} tiles in the bounding boxes of the visible Gaussians: they belong to the scene, not
-  to the rasterizer. exp is of float32, in a block of 4 MB that stays in cache, on all cores.
-- **/ copy**: multiple of the time to copy the bytes of the program's arguments and outputs, at the rate at
-  which 256 MB are copied.
-- **GiB**: arguments, outputs and temporaries, as the compiler has laid them out. **pairs**: Gaussian-tile
-  pairs drawn; **pixel pairs**: those times the pixels of a tile. **ns/pixel**: median time over rectangle
+  (+ sum(features^2)) with respect to means, quats, scales, opacities, colors (and features). **jvp**: the
+  images, and their derivative along one of the six tangents of the camera's pose, in turn. Channels beyond 3
+  are features in addition to the colours.
+- **plain jit**: compiled by a plain `jax.jit`, without `host_options()`. **no reads**: without the `reads` of
+  the previous call. The process keeps freed memory (`keep_freed_memory()`), as every command does.
+- **/ exp**: multiple of the time of exp alone over all pixels of the rectangle pairs. Rectangle pairs are the
+  {TILE}x{TILE} tiles in the bounding boxes of the visible Gaussians: they are a property of the scene, not of
+  the rasterizer. exp is in float32, on blocks of 4 MB that stay in cache, on all cores.
+- **/ copy**: multiple of the time to copy the bytes of the program's arguments and outputs, at the bandwidth
+  of a copy of 256 MB.
+- **GiB**: arguments, outputs and temporaries, as laid out by the compiler. **pairs**: Gaussian-tile pairs
+  drawn; **pixel pairs**: these times the pixels of a tile. **ns/pixel**: median time over rectangle
   pairs x {TILE * TILE}.
-- Both floors are measured right before and right after a workload's calls. Where exp differs by more than
-  {CALM - 1:.0%} the workload is measured again, up to twice, and marked *noisy* if it still does.
+- Both floors are measured right before and right after a workload's calls. If exp differs by more than
+  {CALM - 1:.0%}, the workload is measured again, up to twice, and marked *noisy* if it still does.
 """

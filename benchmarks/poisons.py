@@ -1,4 +1,4 @@
-"""What the fuzzer poisons and with what: seeded scenes, the ends of what floats hold, and every place."""
+"""Cases of the fuzzer: seeded scenes, poisonous values at the limits of floats, and the inputs to poison."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ PER_GAUSSIAN = (*ARRAYS[:5], "features")
 
 
 class Mode(NamedTuple):
-    """One compiled program."""
+    """Options of one compiled program."""
 
     options: dict[str, Any]
     dtype: str = "float32"  # of colours and features
@@ -66,7 +66,7 @@ POISONS = {
     "1e5": 1e5,
     "1e10": 1e10,
 }
-# Places of a mean on the optical axis, as depths.
+# Depths at which a mean is placed on the optical axis.
 PLACES = {
     "at 0": 0.0,
     "at near": NEAR,
@@ -80,7 +80,7 @@ INPUTS = (*PER_GAUSSIAN, "means2d_offset", "viewmats", "Ks", "backgrounds", "rea
 
 
 class Case(NamedTuple):
-    """Which poison goes where. Printed with colons between, it is what `--case` takes."""
+    """One poisoned element. As a string, joined by colons, it is the value of `--case`."""
 
     mode: str
     seed: int
@@ -99,13 +99,13 @@ class Case(NamedTuple):
 
 
 def plan_of(mode: Mode) -> Plan:
-    """With room for every pair of its scenes."""
+    """A plan with capacity for all pairs of the scenes."""
     return Plan(WIDTH, HEIGHT, 4096, near_plane=NEAR, **mode.options)
 
 
 @functools.lru_cache(maxsize=8)
 def scene_of(name: str, seed: int) -> dict[str, np.ndarray]:
-    """A small scene that has every input."""
+    """A small scene with every input."""
     mode = MODES[name]
     fields = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB", "channels": 3}
     fields |= {"sh_degree": mode.options.get("sh_degree"), "feature_channels": mode.feature_channels}
@@ -119,7 +119,7 @@ def scene_of(name: str, seed: int) -> dict[str, np.ndarray]:
 
 
 def poisoned(case: Case) -> dict[str, np.ndarray]:
-    """The scene of a case."""
+    """The poisoned scene of a case."""
     scene = scene_of(case.mode, case.seed)
     array = scene[case.input].copy()
     rows = array if case.input in PER_GAUSSIAN else array[0]
@@ -135,7 +135,7 @@ def poisoned(case: Case) -> dict[str, np.ndarray]:
 
 
 def cases(seed: int) -> Iterator[Case]:
-    """Without end: scene after scene in every mode, every poison in a random row of every input."""
+    """An infinite sequence: for each scene and mode, every poison in a random row of every input."""
     for scene_seed in itertools.count(seed):
         for mode in MODES:
             rng = np.random.default_rng([scene_seed, len(mode)])

@@ -1,4 +1,4 @@
-"""What is timed: forward, forward+backward and a pushed pose, as functions of inputs that change."""
+"""The timed programs: forward, forward+backward, and the JVP of a pose, on changing inputs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,17 +13,17 @@ from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.rasterization import rasterization
 
 PERTURBATION = 1e-4
-POOL = 6  # one for each tangent of a pose
+POOL = 6  # inputs, one for each tangent of a pose
 TRAINED = ("means", "quats", "scales", "opacities", "colors", "features")
 FORWARD, BACKWARD, JVP = "forward", "forward+backward", "jvp"
 
 
 def make_pool(scene: Scene, size: int = POOL, relative: float = PERTURBATION) -> list[dict[str, Any]]:
-    """Inputs of `size` calls: means and camera perturbed a little, and a tangent of the pose for each.
+    """Inputs of `size` calls, each with slightly perturbed means and camera, and a tangent of the pose.
 
     Args:
-        scene: what all of them are near to.
-        size: how many; they take turns.
+        scene: the scene to perturb.
+        size: number of inputs; calls cycle through them.
         relative: standard deviation of the perturbation, relative.
     """
     rng = np.random.default_rng(0)
@@ -42,7 +42,7 @@ def make_pool(scene: Scene, size: int = POOL, relative: float = PERTURBATION) ->
 
 
 def make_programs(scene: Scene, plans: dict[str, Plan]) -> dict[str, Callable]:
-    """`program(inputs, reads) -> (what was asked for, (reads, pairs, overflow))`, by name."""
+    """`program(inputs, reads) -> (result, (reads, pairs, overflow))`, by name."""
 
     def draw(inputs, reads, derivative="reverse"):
         plan = plans[derivative]
@@ -61,19 +61,19 @@ def make_programs(scene: Scene, plans: dict[str, Plan]) -> dict[str, Callable]:
         return images, (meta.reads, meta.pairs, meta.overflow)
 
     def loss(trained, inputs, reads):
-        (colors, alphas, *features), told = draw({**inputs, **trained}, reads)
-        return jnp.sum(colors**2) + jnp.sum(alphas) + sum(jnp.sum(f**2) for f in features), told
+        (colors, alphas, *features), info = draw({**inputs, **trained}, reads)
+        return jnp.sum(colors**2) + jnp.sum(alphas) + sum(jnp.sum(f**2) for f in features), info
 
     def backward(inputs, reads):
         trained = {name: inputs[name] for name in TRAINED if inputs[name] is not None}
-        (value, told), gradients = jax.value_and_grad(loss, has_aux=True)(trained, inputs, reads)
-        return (value, gradients), told
+        (value, info), gradients = jax.value_and_grad(loss, has_aux=True)(trained, inputs, reads)
+        return (value, gradients), info
 
     def push(inputs, reads):
         def image(viewmats):
             return draw({**inputs, "viewmats": viewmats}, reads, "forward")
 
-        images, tangents, told = jax.jvp(image, (inputs["viewmats"],), (inputs["tangents"],), has_aux=True)
-        return (images, tangents), told
+        images, tangents, info = jax.jvp(image, (inputs["viewmats"],), (inputs["tangents"],), has_aux=True)
+        return (images, tangents), info
 
     return {FORWARD: draw, BACKWARD: backward, JVP: push}

@@ -1,4 +1,4 @@
-"""Seeded scenes, and the comparison with the float64 reference that tests and benchmarks share."""
+"""Seeded scenes, and their comparison with the float64 reference, shared by tests and benchmarks."""
 
 import dataclasses
 from functools import partial
@@ -24,7 +24,7 @@ Scene = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One scene of the exactness suite. Consecutive seeds go through all modes."""
+    """One scene of the exactness suite. Consecutive seeds cycle through all modes."""
 
     seed: int
     num: int
@@ -51,7 +51,7 @@ class Case:
 
 
 def case(seed: int, num: int | None = None) -> Case:
-    """The case of a seed: 5 render modes and 8 ways to paint meet within 40 seeds, the rest within 80."""
+    """The case of a seed. 40 seeds combine 5 render modes with 8 kinds of colours, 80 cover the rest."""
     sh_degree, channels = PAINTS[seed % len(PAINTS)]
     drawn = int(np.random.default_rng(seed + 1000).integers(500, 5001))
     width, height = SIZES[seed // 2 % len(SIZES)]
@@ -70,11 +70,11 @@ def case(seed: int, num: int | None = None) -> Case:
 
 
 def make_scene(case: Case) -> Scene:
-    """Arrays of one scene and one camera, float64 numpy whose values float32 holds exactly.
+    """Arrays of one scene and one camera, as float64 numpy arrays whose values are exact in float32.
 
-    Sizes are a fraction of a pixel to a few, opacities 0.002 to 1, the camera is off-centre and skewed, some
-    centres lie outside the image. Depths are stratified, so that none are tied. About 350 Gaussians crowd one
-    tile.
+    Gaussians range from a fraction of a pixel to a few pixels, opacities from 0.002 to 1; the camera is
+    off-centre and skewed, and some centres lie outside the image. Depths are stratified to avoid ties. About
+    350 Gaussians crowd one tile.
     """
     rng = np.random.default_rng(case.seed)
     n, width, height = case.num, case.width, case.height
@@ -110,7 +110,7 @@ def cast(scene: Scene, dtype) -> Scene:
 
 
 def draw(scene: Scene, case: Case, **options: Any):
-    """(colors, alphas, features or None), and meta."""
+    """Render a scene: (colors, alphas, features or None), and meta."""
     colors, alphas, meta = rasterization(**scene, width=case.width, height=case.height, **options)
     return (colors, alphas, meta.features), meta
 
@@ -132,7 +132,7 @@ def _draw_reference(scene: Scene, case: Case):
 
 
 def _weighted(images, weights, certain):
-    """A number whose gradient is the random cotangents `weights`, zeroed where a pixel is doubtful."""
+    """A scalar whose gradient is the random cotangents `weights`, zeroed at doubtful pixels."""
     terms = jax.tree.map(lambda a, w: jnp.sum(a * jnp.where(certain, w, 0).astype(a.dtype)), images, weights)
     return sum(jax.tree.leaves(terms))
 
@@ -159,7 +159,7 @@ def _ours(scene: Scene, weights, certain, case: Case, plan):
 
 @partial(jax.jit, static_argnames="plan")
 def longest_list(scene: Scene, plan):
-    """Entries of the longest tile list of the first camera."""
+    """Length of the longest tile list of the first camera."""
     usable = jnp.ones(scene["means"].shape[0], bool)
     gaussians = (scene[name] for name in ARRAYS[:4])
     projected = project_gaussians(*gaussians, usable, scene["viewmats"][0], scene["Ks"][0], plan)
@@ -177,10 +177,10 @@ def relative_error(got, want, where=True) -> float:
 
 
 def compare(case: Case, dtypes=("float64", "float32")) -> dict[str, Any]:
-    """Images and all gradients against the reference; call it with 64-bit types enabled.
+    """Compare images and all gradients with the reference; requires 64-bit types to be enabled.
 
     Returns:
-        the share of doubtful pixels, the longest list, and for each dtype the relative error of every array.
+        The fraction of doubtful pixels, the longest list, and per dtype the relative error of each array.
     """
     scene = make_scene(case)
     exact = cast(scene, np.float64)
@@ -190,7 +190,7 @@ def compare(case: Case, dtypes=("float64", "float32")) -> dict[str, Any]:
     want_images, doubtful, want = _reference(exact, weights, case)
     certain = ~np.asarray(doubtful)
     result: dict[str, Any] = {"doubtful_share": float(doubtful.mean())}
-    # Ample and known beforehand: asking gsjax.plan would compile one more program.
+    # Ample and known in advance; gsjax.plan would compile another program.
     ample = Plan(case.width, case.height, capacity=rung(8 * case.num), **case.options)
     for dtype in dtypes:
         inputs = cast(scene, np.dtype(dtype))

@@ -1,4 +1,4 @@
-"""How often each method's step runs in a second. A method joins by adding one function to `STEPS`."""
+"""Update rate of each method's step. To add a method, add a function to `STEPS`."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -34,7 +34,7 @@ RATES = {"means": 1e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 2e
 
 @dataclass(frozen=True)
 class StepTimes:
-    """Seconds of a method's updates after the first, and of compiling one."""
+    """Seconds of each update of a method after the first, and of compilation."""
 
     what: str
     seconds: list[float]
@@ -42,11 +42,11 @@ class StepTimes:
 
 
 def tracker(repeats: int, preset: str = "accurate") -> StepTimes:
-    """The object tracker's update: every frame is another, as in use."""
+    """The object tracker's update, on a new frame every time, as in use."""
     sequence = open_sequence(TABLE.format(repeats + 2)).select(cameras=(0, 1))
     frames = [sequence.frame(t) for t in range(sequence.num_frames)]
     config = PRESETS[preset]
-    # Fitting the first frame takes long and is not what is timed.
+    # Fitting the first frame takes long and is not timed.
     config = replace(config, start=replace(config.start, iterations=20))
     scene = start_scene(frames[0], sequence.mask(0, 0), 0, config)
     updates = list(islice(track(scene, frames[0], frames[1:], config), repeats + 1))
@@ -56,7 +56,7 @@ def tracker(repeats: int, preset: str = "accurate") -> StepTimes:
 
 
 def fit(repeats: int) -> StepTimes:
-    """One step of Adam on L1 and D-SSIM against one image; each call starts from what the last one gave."""
+    """One step of Adam on L1 and D-SSIM against one image; each call continues from the previous one."""
     width, height = FIT_SIZE
     seen, start = ball(FIT_GAUSSIANS, width, height), ball(FIT_GAUSSIANS, width, height, seed=1)
     camera = Camera(seen.viewmat[None], seen.K[None], width, height)
@@ -78,12 +78,12 @@ def fit(repeats: int) -> StepTimes:
 
     seconds = sample(call, repeats)
     if bool(call(0)[1]["skipped"]):
-        raise RuntimeError("the fitting step was skipped: its plan was too small or a number not finite")
+        raise RuntimeError("the fitting step was skipped: its plan was too small, or a number was not finite")
     return StepTimes(f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}", seconds, compiled.seconds)
 
 
 def field(repeats: int) -> StepTimes:
-    """One step of a feature field's distillation, as it comes: 256 channels, 16 levels, all losses on."""
+    """One step of distilling a feature field, with the defaults: 256 channels, 16 levels, all losses."""
     width, height = FIT_SIZE
     scene = ball(FIT_GAUSSIANS, width, height)
     camera = Camera(scene.viewmat, scene.K, width, height)
@@ -92,13 +92,13 @@ def field(repeats: int) -> StepTimes:
     config = DistillConfig(iterations=repeats + 1, contrast_after=0.0)
     updates = list(distill(*begin_distill(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
     if any(bool(update.info["skipped"]) for update in updates):
-        raise RuntimeError("a step of the distillation was skipped: a number is not finite")
+        raise RuntimeError("a step of the distillation was skipped: a number was not finite")
     what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {config.channels} channels"
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 
 def deform(repeats: int) -> StepTimes:
-    """One step of a scene that deforms, as it comes: deformation, colours, features, and the graph."""
+    """One step of a deforming scene, with the defaults: deformation, colours, features and graph."""
     seen = open_sequence(TISSUE).select(cameras=(0,))
     last = seen.num_frames - 1
     looks = [
@@ -117,7 +117,7 @@ def deform(repeats: int) -> StepTimes:
     problem, state = begin_deform(looks, config, np.eye(2, config.channels))
     updates = list(reconstruct(problem, state))
     if any(bool(update.info["skipped"]) for update in updates):
-        raise RuntimeError("a step of the deforming scene was skipped: a number is not finite")
+        raise RuntimeError("a step of the deforming scene was skipped: a number was not finite")
     what = f"{state.scene.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
@@ -145,7 +145,7 @@ class StepRow:
     updates: int
     median_ms: float
     p95_ms: float
-    steps_per_s: float  # of the median
+    steps_per_s: float  # from the median
     compile_s: float
     noisy: bool
 
@@ -160,7 +160,7 @@ class StepRow:
 
 
 def measure_step(name: str, repeats: int, before: Floors) -> tuple[StepRow, Floors]:
-    """Run one method's step; also returns the floors after it. `before` are those that were found last."""
+    """Time one method's step, between the floors `before` and those returned, which are measured after it."""
     jax.clear_caches()
     times = STEPS[name](repeats)
     median, p95 = median_and_p95(times.seconds)

@@ -1,4 +1,4 @@
-"""Runs the workloads, prints as it goes, and keeps the results on disk after each one."""
+"""Runs the workloads, prints progress, and saves the results after each one."""
 
 import json
 import sys
@@ -21,11 +21,11 @@ from gsjax.io.atomic import atomic_write, write_json
 RESULTS = Path(__file__).parent / "results"
 PART = Path("runs/bench")
 REPEATS, QUICK_REPEATS = 15, 5
-FLAT_FROM = 10**6  # pixel pairs; smaller calls cost what a call costs
+FLAT_FROM = 10**6  # pixel pairs; smaller calls are dominated by overhead
 
 
 class Run:
-    """What a run has found so far, and where it stands on disk."""
+    """Results of a run so far, and the folder in which they are saved."""
 
     def __init__(self, out: Path, complete: bool, repeats: int):
         self.out, self.complete, self.repeats = out, complete, repeats
@@ -37,10 +37,10 @@ class Run:
         self.sweeps: dict[str, tuple[str, ...]] = {}
 
     def record(self, finished: bool) -> dict[str, Any]:
-        """Everything, as bench.json has it."""
+        """All results, in the form of bench.json."""
         flat, complete = flatness(self.rows), self.complete and finished
         metrics = list(self.metrics)
-        if complete:  # of a part of the suite it would be another figure
+        if complete:  # for a part of the suite the figure would not be comparable
             noisy = any(row["noisy"] for row in self.rows)
             for program, found in flat.items():
                 metrics.append(Metric(f"flatness/{program}", found["ratio"], "x", "lower", 0.2, True, noisy))
@@ -56,7 +56,7 @@ class Run:
         )
 
     def write(self, finished: bool = False) -> dict[str, Any]:
-        """Write bench.json, results.md and growth.png, each whole or not at all."""
+        """Write bench.json, results.md and growth.png, each atomically."""
         record, drawing = self.record(finished), draw_growth(self.rows, self.sweeps)
         write_sorted(self.out / "bench.json", record)
         if drawing is not None:
@@ -68,7 +68,7 @@ class Run:
 
 
 def flatness(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The dearest rectangle pixel pair over the cheapest, of large calls with plain colours, by program."""
+    """Cost per rectangle pixel pair, largest over smallest, of large calls with colours only, by program."""
     found = {}
     for program in (FORWARD, BACKWARD, JVP):
         large = [
@@ -90,12 +90,12 @@ def flatness(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def write_sorted(path: Path, record: dict[str, Any]) -> None:
-    """As JSON with sorted keys, so that two records can be compared line by line."""
+    """Write JSON with sorted keys, so that two records can be compared line by line."""
     write_json(path, json.loads(json.dumps(record, sort_keys=True)))
 
 
 def baseline_path(device: str) -> Path:
-    """Each kind of device has its own: ratios do not travel from a CPU to a GPU."""
+    """The baseline of a kind of device; ratios are not comparable between CPU and GPU."""
     return RESULTS / ("baseline.json" if device == "cpu" else "baseline-gpu.json")
 
 
@@ -103,37 +103,40 @@ def read_baseline(path: Path) -> dict[str, Any] | None:
     """The committed baseline, or None.
 
     Raises:
-        ValueError: it is no JSON.
+        ValueError: it is not valid JSON.
     """
     if not path.is_file():
         return None
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        advice = "restore it from git"
-        raise ValueError(f"{path}: expected a baseline as JSON, found {error}; {advice}") from error
+        raise ValueError(
+            f"{path}: expected a baseline as JSON, found {error}; restore it from git"
+        ) from error
 
 
 def run(options: Any, suite: list[Workload] | None = None) -> int:
-    """The command: see `gsjax.cli.bench.Options`. Returns the exit code.
+    """Run the command with the options of `gsjax.cli.bench.Options`, and return the exit code.
 
     Raises:
-        ValueError: what was asked cannot be done.
+        ValueError: an option is invalid, or the baseline does not fit.
     """
     suite = (QUICK if options.quick else SUITE) if suite is None else suite
     known = {workload.name: workload for workload in suite}
     chosen = choose([*known, *STEPS], options.only)
-    usual = QUICK_REPEATS if options.quick else REPEATS
-    repeats = usual if options.repeats is None else options.repeats
+    default = QUICK_REPEATS if options.quick else REPEATS
+    repeats = default if options.repeats is None else options.repeats
     if repeats < 1:
         raise ValueError(f"--repeats: expected 1 or more, found {repeats}")
     complete = not options.quick and not options.only
     path = baseline_path(machine.describe()["device"])
     baseline = read_baseline(path)
     if options.check and baseline is None:
-        raise ValueError(f"--check: there is no baseline at {path}; --update-baseline makes one")
+        raise ValueError(
+            f"--check: expected a baseline at {path}, found none; make one with --update-baseline"
+        )
     out = options.out or (RESULTS if complete else PART)
-    # Not a terminal: lines stay whole, so that other programs can read them.
+    # Outside a terminal lines are not wrapped, so that other programs can parse them.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
     console.print(f"{machine.in_words(machine.describe())}; up to {repeats} calls each")
     console.print(LEGEND, soft_wrap=not console.is_terminal)
@@ -142,21 +145,21 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
         _run_all(chosen, known, repeats, found, console)
         finished = True
     except KeyboardInterrupt:
-        console.print("[bold red]stopped:[/] by Ctrl-C; what was measured until then is kept")
+        console.print("[bold red]stopped[/] by Ctrl-C; the results so far are saved")
     record = found.write(finished)
     console.print("")
     for line in bottom_line(record):
         console.print(line.replace("**", ""), markup=False)
     code = 0 if finished else 130
     if not record["metrics"] and (options.check or options.update_baseline):
-        raise ValueError("--check and --update-baseline: expected figures, found none that was measured")
+        raise ValueError("--check and --update-baseline: expected measured figures, found none")
     if baseline is not None and record["metrics"]:
         rows = compare(record, baseline)
         print_comparison(console, rows, baseline)
         if options.check and finished:
             if all(row.verdict == "new" for row in rows):
                 raise ValueError(
-                    f"--check: {path} has none of what was measured; leave --quick or --only out"
+                    f"--check: expected the measured figures in {path}, found none; omit --quick or --only"
                 )
             code = int(any(row.verdict in FAILING for row in rows))
     if options.update_baseline and finished:
@@ -169,7 +172,7 @@ def run(options: Any, suite: list[Workload] | None = None) -> int:
 def _run_all(
     chosen: list[str], known: dict[str, Workload], repeats: int, found: Run, console: Console
 ) -> None:
-    """Measure what is chosen, in order; disk and screen follow."""
+    """Measure the chosen workloads in order, and print and save the results after each."""
     floors = None
     with console.status("") as status:
         for name in chosen:

@@ -1,4 +1,4 @@
-"""How a call is timed: compiled apart, on inputs that change, waited for, many times."""
+"""Timing of calls: compiled separately, on changing inputs, waiting for the results, repeatedly."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-MAX_SECONDS = 20.0  # of one program's timed calls
+MAX_SECONDS = 20.0  # for all timed calls of one program
 MIN_CALLS = 3
 
 
 class Compiled(NamedTuple):
-    """A compiled program and what compiling it told."""
+    """A compiled program, with the statistics of its compilation."""
 
     run: Callable
     seconds: float  # of tracing and compiling
@@ -21,8 +21,8 @@ class Compiled(NamedTuple):
 
 
 def compile_program(function: Callable, *args: Any, options: dict[str, Any] | None = None) -> Compiled:
-    """Compile `function` for these arguments, with compiler options or as a user's plain `jax.jit` does."""
-    jax.clear_caches()  # traces that an earlier program shares would make this one look cheap
+    """Compile `function` for these arguments, with compiler options, or by default like a plain `jax.jit`."""
+    jax.clear_caches()  # traces shared with an earlier program would make this one look cheap
     began = time.perf_counter()
     run = jax.jit(function).lower(*args).compile(options)
     seconds = time.perf_counter() - began
@@ -32,9 +32,9 @@ def compile_program(function: Callable, *args: Any, options: dict[str, Any] | No
 
 
 def sample(call: Callable[[int], Any], repeats: int, max_seconds: float = MAX_SECONDS) -> list[float]:
-    """Seconds of `call(0)`, `call(1)`, ..., after two that warm up; results are waited for.
+    """Seconds of `call(0)`, `call(1)`, ..., including the wait for their results, after two warm-up calls.
 
-    It stops early, but not before three calls, once `max_seconds` have passed.
+    It stops early once `max_seconds` have passed, but not before three calls.
     """
     for i in (-2, -1):
         jax.block_until_ready(call(i))
@@ -55,12 +55,13 @@ def median_and_p95(seconds: Sequence[float]) -> tuple[float, float]:
 
 
 def perturbed_means(means: np.ndarray, rng: np.random.Generator, relative: float) -> np.ndarray:
-    """Means moved by `relative` of their coordinates, so that no two timed calls have the same inputs."""
+    """Means perturbed by `relative` of their coordinates, so that no two timed calls have the same inputs."""
     return (means * (1 + relative * rng.normal(size=means.shape))).astype(means.dtype)
 
 
 def perturbed_viewmat(viewmat: np.ndarray, rng: np.random.Generator, relative: float) -> np.ndarray:
-    """A rigid view turned by about `relative` radians about each axis and moved by as much, relative."""
+    """A rigid view rotated by about `relative` radians about each axis and shifted, relatively, by as
+    much."""
     rotation = viewmat[:3, :3] + relative * hat(rng.normal(size=3)) @ viewmat[:3, :3]
     u, _, vt = np.linalg.svd(rotation.astype(np.float64))
     moved = viewmat.copy()

@@ -1,4 +1,4 @@
-"""What is drawn: gsplat's garden, a trained guitar, and simulated balls that grow."""
+"""The workloads: gsplat's garden, a trained guitar, and synthetic balls of growing size."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.geometry.spherical_harmonics import evaluate_sh
 from gsjax.io.ply import read_ply
 
-HEAVY_CHANNELS = 64  # from here on three calls must do
+HEAVY_CHANNELS = 64  # with this many channels or more, three calls have to do
 
 
 class Scene(NamedTuple):
@@ -37,13 +37,13 @@ class Workload:
     """One scene and image size.
 
     Attributes:
-        name: how `--only` calls it.
-        make: makes the scene; raises FileNotFoundError where its data are absent.
-        width, height: of the image.
-        channels: composited: 3 for colours alone, more for that many features beside the colours.
-        repeats: the most timed calls of each program; None leaves it to the run.
-        sweeps: growth plots that it is a point of.
-        variants: also measured under plain `jax.jit`, and without `reads`.
+        name: name for `--only`.
+        make: makes the scene; raises FileNotFoundError if its data are absent.
+        width, height: size of the image, pixels.
+        channels: composited channels: 3 for colours only, else the number of features next to colours.
+        repeats: largest number of timed calls of each program; None leaves it to the run.
+        sweeps: growth plots to which it belongs.
+        variants: whether to measure it also under plain `jax.jit`, and without `reads`.
     """
 
     name: str
@@ -57,8 +57,8 @@ class Workload:
 
 
 def data_folder() -> Path:
-    """Where recordings are that are not part of the repository: `$GSJAX_DATA`, or `../shared/data` beside the
-    checkout."""
+    """Folder of the recordings that are not part of the repository: `$GSJAX_DATA`, or `../shared/data` next
+    to the checkout."""
     named = os.environ.get("GSJAX_DATA")
     return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -67,7 +67,7 @@ def _data_file(name: str) -> Path:
     path = data_folder() / name
     if not path.is_file():
         raise FileNotFoundError(
-            f"no file {path}: point GSJAX_DATA at the folder that holds {Path(name).parent}"
+            f"{path}: expected a file, found none; point GSJAX_DATA to the folder of {Path(name).parent}"
         )
     return path
 
@@ -77,7 +77,7 @@ def _floats(*arrays) -> list:
 
 
 def garden(camera: int) -> Scene:
-    """gsplat's test scene: points of the Mip-NeRF 360 garden, all but places and colours drawn at random."""
+    """gsplat's test scene: points of the Mip-NeRF 360 garden, with random shapes and opacities."""
     stored = np.load(_data_file("garden_points/test_garden.npz"))
     points = stored["means3d"]
     inside = (np.abs(points) <= 2).all(axis=1)
@@ -92,7 +92,7 @@ def garden(camera: int) -> Scene:
 
 
 def guitar() -> Scene:
-    """Trained Gaussians (PlayCanvas), seen from 1.5 times their extent; their y points down."""
+    """Trained Gaussians (PlayCanvas), seen from a distance of 1.5 times their extent; y points down."""
     gaussians, _ = read_ply(_data_file("guitar/guitar.compressed.ply"))
     low, high = np.min(gaussians.means, axis=0), np.max(gaussians.means, axis=0)
     center, extent = (low + high) / 2, float(np.max(high - low))
@@ -104,7 +104,7 @@ def guitar() -> Scene:
 
 
 def ball(num: int, width: int, height: int, channels: int = 3, seed: int = 0) -> Scene:
-    """A ball of small Gaussians that covers much of the image, whatever their number."""
+    """A ball of small Gaussians that covers much of the image, independently of their number."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(num, 3))
     radii = rng.uniform(size=(num, 1)) ** (1 / 3)
@@ -131,7 +131,7 @@ def ball_workload(
 
 
 def _sweep(counts, sizes, channels, num: int, size: tuple[int, int], variants: bool) -> list[Workload]:
-    """Counts at one size, sizes at one count, channels at both; the point where they meet comes once."""
+    """Sweeps over counts, sizes and channels through one common point, which is included once."""
     meeting = ball_workload(num, size, 3, ("gaussians", "pixels", "channels"), variants)
     return [
         meeting,
@@ -166,14 +166,18 @@ QUICK = _sweep(
 
 
 def choose(names: Sequence[str], patterns: Sequence[str]) -> list[str]:
-    """Those of `names` that `patterns` ask for: a name, its part before the first hyphen, or a glob.
+    """The `names` selected by `patterns`: names, parts of names before the first hyphen, or globs.
+
+    No patterns select all.
 
     Raises:
-        ValueError: a pattern fits none.
+        ValueError: a pattern matches no name.
     """
     for pattern in patterns:
         if not any(_fits(name, pattern) for name in names):
-            raise ValueError(f"--only: no workload is called {pattern!r}; there are {', '.join(names)}")
+            raise ValueError(
+                f"--only: expected a workload, found {pattern!r}; choose from {', '.join(names)}"
+            )
     return [n for n in names if not patterns or any(_fits(n, p) for p in patterns)]
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
@@ -122,7 +121,33 @@ SECTIONS = {
     "Grasping and policies": (None, ("grasping", "policies")),
     "Rasterizer": (None, ("rasterizer_trade/simulated", "rasterizer_trade/real")),
 }
-"""Of the page: the picture of a run, and the experiments whose figures are shown."""
+"""The page's sections: the picture of a run, and the experiments whose figures are shown."""
+
+CAPTIONS = {
+    "tracker_trade": "Errors, IoU and PSNR over update rate; a line for each knob.",
+    "tracker_ablation": "Each variant on both recordings; the line is the full tracker.",
+    "optimizers": "Point error over time; the dotted line is standing still.",
+    "basin": "From how far a displaced carton finds home: gradient cosines (left), success (right).",
+    "parts_ablation": "Each variant; the line is the full discovery.",
+    "parts_trade": "The line joins settings that no faster one beats.",
+    "parts_failures": "Overlap with the hard part, from easy to hopeless.",
+    "parts_tracked": "IoU with the true masks over frames.",
+    "bar_blends": "A bending, twisting bar, moved by handles.",
+    "parts_edits": "Edits of discovered parts.",
+    "field_ablation": "Each variant, three seeds.",
+    "field_trade": "One setting changed at a time.",
+    "deform_trade": "One setting changed at a time.",
+    "deform_pulling": "Held-out frames (real): deforming, static, and copies of other frames.",
+    "deform_flow": "Share of pixels below each flow error (real).",
+    "static_fit": "Held-out PSNR over minutes (real).",
+    "fit_trade": "Held-out PSNR over minutes, and over Gaussians (real).",
+    "known_scene": "PSNR of unseen views of known Gaussians.",
+    "grasping": "Success with 95 % intervals, and tracking error as the fingers close.",
+    "policies": "Success with 95 % intervals; dots are training seeds.",
+    "rasterizer_trade/simulated": "Each knob's PSNR and gradient cosine over time.",
+    "rasterizer_trade/real": "The same for garden and guitar.",
+}
+"""What the figure of each experiment shows."""
 
 SAYS = {
     "tracker": ("demo", "Camera 1 at three moments: input and render above, error and labels below."),
@@ -139,9 +164,9 @@ def page(shown: dict[str, str]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Made by `make gallery`: small runs on built-in scenes (simulated; some 20 minutes on two busy cores "
-        "the first time, then seconds), and the figures of [experiments](experiments.md) as they are "
-        "committed. Small runs look worse than long ones, and are no results.",
+        "Small runs on built-in scenes (simulated, and no results), with their commands, and figures "
+        "of [experiments](experiments.md): `gsjax experiment run NAME` makes each, and "
+        "`experiments/NAME/results.md` has its full caption. `make gallery` takes 20 minutes the first time.",
         "",
         "## Speed against accuracy",
         "",
@@ -155,16 +180,10 @@ def page(shown: dict[str, str]) -> str:
         if picture is not None:
             folder, says = SAYS[picture]
             command = shlex.join(COMMANDS[folder].replace(f"{RUNS}/", "runs/gallery/").split())
-            lines += [f"![{says}]({shown[picture]})", "", f"*{says}* `gsjax {command}`", ""]
+            lines += [f"![{title}]({shown[picture]})", "", f"*{says}* `gsjax {command}`", ""]
         for name in experiments:
-            lines += [f"![{name}](../experiments/{name}/figure.png)", "", _caption(name), ""]
+            lines += [f"![{name}](../experiments/{name}/figure.png)", "", f"*{CAPTIONS[name]}* `{name}`", ""]
     return "\n".join(lines)
-
-
-def _caption(name: str) -> str:
-    config = yaml.safe_load((ROOT / f"experiments/{name}/config.yaml").read_text(encoding="utf-8"))
-    says = (config.get("figure") or {}).get("caption") or config["claim"]
-    return f"*{' '.join(says.split())}* `gsjax experiment run {name}`"
 
 
 # -- speed against accuracy ----------------------------------------------------------------------------------

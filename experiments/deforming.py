@@ -15,7 +15,7 @@ from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.engine.deform.data import unit_times
 from gsjax.engine.deform.scores import draw
-from gsjax.geometry.cameras import PixelsOf, pixels_of
+from gsjax.geometry.cameras import PointPixels, pixels_of
 from gsjax.methods.deform import (
     DeformConfig,
     DeformProblem,
@@ -197,7 +197,7 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     }
 
 
-def _pixels(points: Float[np.ndarray, "n 3"], look: Look) -> PixelsOf:
+def _pixels(points: Float[np.ndarray, "n 3"], look: Look) -> PointPixels:
     """Where points fall in a look."""
     height, width = look.image.shape[:2]
     return pixels_of(points, look.viewmat, look.K, width, height)

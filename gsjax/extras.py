@@ -1,4 +1,4 @@
-"""Packages of an extra, imported where they are needed; who lacks one is told how to install it."""
+"""Imports of packages from optional extras, with installation instructions if one is missing."""
 
 import shlex
 import sys
@@ -7,19 +7,19 @@ from types import ModuleType
 
 
 class MissingExtra(ImportError):
-    """A package of an extra is not installed. The message says who needs it and what to do."""
+    """A package of an extra is not installed. The message says what needs it and how to install it."""
 
 
 def load(module: str, extra: str, needed_by: str) -> ModuleType:
-    """A module of a package that one extra of gsjax brings, imported now.
+    """Import a module from a package that belongs to an extra of gsjax.
 
     Args:
-        module: its dotted name.
-        extra: the extra's name in pyproject.toml.
-        needed_by: what needs it, as the user knows it: a command, an option, a model.
+        module: dotted name of the module.
+        extra: name of the extra in pyproject.toml.
+        needed_by: what needs the module, in the user's terms: a command, an option, a model.
 
     Raises:
-        MissingExtra: it is not installed, or something that it needs itself is not.
+        MissingExtra: the package or one of its own dependencies is not installed.
     """
     try:
         return import_module(module)

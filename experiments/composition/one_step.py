@@ -1,6 +1,6 @@
-"""Three methods as one jitted step: the object tracker, a teacher's features distilled into what is tracked,
-and the graph of SurstSplat or GaussianClin over them.
-docs/composition.md has `composed` as it stands here."""
+"""Three methods as one jitted step: the tracker of Object-Aware Gaussian Splatting for Robotic Manipulation,
+a teacher's features distilled into what is tracked (FD-3DGS, SurstSplat, GaussianClin), and the graph of
+SurstSplat or GaussianClin over them. docs/composition.md has `composed` as it stands here."""
 
 from typing import NamedTuple
 

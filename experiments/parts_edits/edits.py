@@ -23,9 +23,9 @@ from gsjax.methods.parts.limits import beyond_captured
 from gsjax.methods.parts.timeline import Script, apply, parse_op
 from gsjax.metrics.edit_judge import (
     Finding,
-    asked_displacement,
-    asked_motion_is_seen,
     place_is_clean,
+    requested_displacement,
+    requested_motion_is_seen,
     rest_stays,
 )
 from gsjax.optim.compiler import host_options
@@ -163,9 +163,9 @@ def _as_asked(
             motion = second @ np.linalg.inv(first)
             if np.abs(motion - np.eye(4)).max() > 1e-6:
                 mine = shown[..., part] > 0.9
-                told = asked_displacement(before.depths[t], after.depths[t], mine, motion, viewmat, K)
+                told = requested_displacement(before.depths[t], after.depths[t], mine, motion, viewmat, K)
                 asked[t] = np.where(np.isfinite(told), told, asked[t])
-    return asked_motion_is_seen(before.colors, after.colors, asked)
+    return requested_motion_is_seen(before.colors, after.colors, asked)
 
 
 def _rigid(center: Any, at: Moment, part: int) -> np.ndarray:

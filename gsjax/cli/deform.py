@@ -12,8 +12,8 @@ from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.data import Photographs
-from gsjax.data.open import is_of_photographs, is_recording, open_photographs
-from gsjax.data.ordered import open_in_time
+from gsjax.data.open import is_photographs, is_recording, open_photographs
+from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.data import DeformData, Tools, deform_data
 from gsjax.engine.deform.depth import Deep, Depth, with_depth
 from gsjax.engine.deform.file import NAME, StoredDeformation, write_deformation
@@ -26,7 +26,7 @@ from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, stage
-from gsjax.engine.options import OF_NO_BEARING, OfDataset, checked, preset_options
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, preset_options
 from gsjax.engine.recording import located, open_recording
 from gsjax.io.ply import write_ply
 from gsjax.methods.deform import (
@@ -87,7 +87,7 @@ def run(options: Options) -> int:
         elsewhere = {} if asked is None else asked.located()
         settings = replace(options, dataset=located(options.dataset), **elsewhere)
         if options.resume:
-            folder.check_config(settings, but=OF_NO_BEARING)
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
         deep = _recording(options, notes)
         told = (options.test_every, options.tools, asked, options.deform.channels)
         data = deform_data(deep.sequence, *told, options.tool_values, notes, console)
@@ -149,8 +149,8 @@ def run(options: Options) -> int:
 def _recording(options: Options, notes: Notes) -> Deep:
     """The recording, the camera that is learned from first, with its depth."""
     told = (options.frames, options.read, options.scale)
-    whole = open_recording(options.dataset, (), (), *told, opened=open_in_time).judged
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    whole = open_recording(options.dataset, (), (), *told, opened=open_as_sequence).judged
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         photographs = open_photographs(options.dataset, options.read)
         notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
     for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):

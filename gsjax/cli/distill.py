@@ -21,7 +21,7 @@ from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.learning import Course, Learning, learn, load, say_if_cut_short
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, stage
-from gsjax.engine.options import OF_NO_BEARING, Common, Resuming, Seeded, Timed, checked
+from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
 from gsjax.engine.recording import located
 from gsjax.engine.records import digest
 from gsjax.methods.distill import DistillConfig, begin_distill, distill
@@ -74,7 +74,7 @@ def run(options: Options) -> int:
         folder = RunFolder(_out(options, scene.file), overwrite=options.overwrite, resume=options.resume)
         settings = _settings(options, asked)
         if options.resume:
-            folder.check_config(settings, but=OF_NO_BEARING)
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
         cache, photographs = FeatureCache(), scene.photographs
         teaching = Teaching(photographs, scene.taught, asked, cache, console)
         if asked.features == "auto":

@@ -15,22 +15,23 @@ from rich.text import Text
 
 from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
-from gsjax.engine.fit.results import Seen, look, write_panel
+from gsjax.engine.fit.results import Compared, Judge, write_panel
 from gsjax.engine.folder import replaced_folder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import in_words
 from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common
-from gsjax.engine.photographs import photographs_of_run, read_views, split
+from gsjax.engine.photographs import photographs_of_run, read_frames, split
 from gsjax.engine.records import EVALUATION, Record, digest, read_record
 from gsjax.engine.report import Media, Table, format_number, write_report
 from gsjax.engine.scores import mean_scores
 from gsjax.engine.tables import Column
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
-from gsjax.methods.fit import View
+from gsjax.methods.fit import FitConfig
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim
 from gsjax.metrics.perceptual import LpipsWeights, fingerprint, load_lpips, lpips
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 NO_LPIPS = (
@@ -92,17 +93,17 @@ def run(options: Options) -> int:
         weights = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
         gaussians, _ = read_ply(record.path / "scene.ply")
         photographs, indices, held_out = _choose(options, record)
-        views = read_views(photographs.select(indices.tolist()), console)
+        frames = read_frames(photographs.select(indices.tolist()), console)
         folder, rows = record.path / EVALUATION.parent, []
         with replaced_folder(folder, _WRITTEN) as new:
             exposed = bool(record.config["fit"].get("exposure"))
-            looks = _looks(record, gaussians, views, photographs.background)
-            for seen in track(looks, "scoring", len(views), console=console, transient=True):
+            compared = _compared(record, gaussians, frames, photographs.background)
+            for seen in track(compared, "scoring", len(frames), console=console, transient=True):
                 picture, i = Path("renders", f"{len(rows):06d}.png"), len(rows)
                 write_panel(new / picture, seen)
                 row = {"view": photographs.names[indices[i]], "split": _HELD_OUT if held_out[i] else _TRAIN}
                 rows.append(row | scores(seen, weights, exposed) | {"picture": picture.as_posix()})
-            _say_what_is_missing(notes, record, rows, views, weights)
+            _say_what_is_missing(notes, record, rows, frames, weights)
             known = None if weights is None else {"network": weights.network, "weights": fingerprint(weights)}
             found = {
                 "kind": "eval",
@@ -125,7 +126,7 @@ def run(options: Options) -> int:
     return 0
 
 
-def scores(seen: Seen, weights: LpipsWeights | None, exposed: bool = False) -> dict[str, float | None]:
+def scores(seen: Compared, weights: LpipsWeights | None, exposed: bool = False) -> dict[str, float | None]:
     """How a view is seen, by the keys of `COLUMNS`; None where the picture is too small for a score, or the
     photographs or the user lack what it takes.
 
@@ -134,7 +135,7 @@ def scores(seen: Seen, weights: LpipsWeights | None, exposed: bool = False) -> d
         weights: of LPIPS.
         exposed: the fit learned an exposure for each photograph, so PSNR is taken with colours matched too.
     """
-    pair, side = (seen.image, seen.truth, seen.view.mask), min(seen.covered.shape)
+    pair, side = (seen.image, seen.truth, seen.mask), min(seen.covered.shape)
     perceived = weights is not None and side >= weights.least_side
     return {
         "psnr": seen.psnr(),
@@ -193,20 +194,23 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
 
 
-def _looks(record: Record, gaussians: Gaussians, views: list[View], behind: Color | None) -> Iterator[Seen]:
+def _compared(
+    record: Record, gaussians: Gaussians, frames: list[Frame], behind: Color | None
+) -> Iterator[Compared]:
     """Each view as it is drawn; those of one size share a plan."""
-    fit, plans = record.config["fit"], {}
+    fit = record.config["fit"]
     background = {"data": behind, "white": (1.0, 1.0, 1.0)}.get(fit.get("background", "data"))
-    for view in views:
-        size = view.image.shape
-        seen, plans[size] = look(
-            gaussians, view, background, bool(fit.get("antialiased", False)), plans.get(size)
-        )
-        yield seen
+    judge = Judge(FitConfig(antialiased=bool(fit.get("antialiased", False))), background)
+    for frame in frames:
+        yield judge.compare(gaussians, frame)
 
 
 def _say_what_is_missing(
-    notes: Notes, record: Record, rows: list[dict[str, Any]], views: list[View], weights: LpipsWeights | None
+    notes: Notes,
+    record: Record,
+    rows: list[dict[str, Any]],
+    frames: list[Frame],
+    weights: LpipsWeights | None,
 ) -> None:
     """Notes why scores are absent, and what training views are scored without."""
 
@@ -223,7 +227,7 @@ def _say_what_is_missing(
     else:
         small("lpips", weights.least_side, "LPIPS")
         notes.add(f"LPIPS 0.1 with {weights.network} (weights {fingerprint(weights)}).")
-    if all(view.depth is None for view in views):
+    if all(frame.depths is None for frame in frames):
         notes.add("Depth: not scored, for the photographs have none.")
     learned = [words for name, words in _PER_PHOTOGRAPH.items() if record.config["fit"].get(name)]
     if learned and any(row["split"] == _TRAIN for row in rows):

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
 from gsjax.data.errors import MissingFile
-from gsjax.data.open import is_of_photographs, is_recording
+from gsjax.data.open import is_photographs, is_recording
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.info_picture import by_camera, by_split, write_picture
 from gsjax.engine.messages import Notes
@@ -41,7 +41,7 @@ def run(options: Options) -> int:
             f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
         )
     expect_dataset(options.dataset)
-    if is_of_photographs(options.dataset) and not is_recording(options.dataset):
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
         return _print_photographs(options)
     with Notes(Console(stderr=True, highlight=False)):
         sequence = open_sequence(options.dataset, options.read)

@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from gsjax.data.opencv_cameras import open_camera, snapshots
-from gsjax.data.stream import Arrival, Newest, Snapshot, replay
+from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
 from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
 from gsjax.engine.folder import RunFolder
@@ -274,7 +274,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         console: shows how far it is.
     """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
-    newest = Newest(source.snapshots, patience=options.patience)
+    newest = NewestSnapshots(source.snapshots, patience=options.patience)
     arrived: list[Arrival] = []
 
     def frames() -> Iterator[Frame]:

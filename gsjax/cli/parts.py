@@ -16,7 +16,7 @@ from gsjax.data import Sequence
 from gsjax.engine.ending import exit_code, finish
 from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.engine.messages import Notes, stage
-from gsjax.engine.options import OF_NO_BEARING, OfRecording, SamWeights, Seeded, checked
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
 from gsjax.engine.parts.loop import Following, follow_parts, refine_parts
 from gsjax.engine.parts.results import finished, print_results, write_results
 from gsjax.engine.parts.resume import Saver, load
@@ -78,7 +78,7 @@ def run(options: Options) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
-            folder.check_config(settings, but=OF_NO_BEARING)
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
         given = None if options.scene is None else _read_scene(options.scene)
         seconds: dict[str, float] = {}
         tracked = recording.tracked

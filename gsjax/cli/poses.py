@@ -20,10 +20,10 @@ from gsjax.data.alignment import align_cameras
 from gsjax.data.stills import write_stills
 from gsjax.data.structure_from_motion import (
     MotionConfig,
-    Placed,
-    few_of,
+    SfmResult,
     list_photographs,
-    place_photographs,
+    reconstruct_cameras,
+    shortened,
 )
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common, Overwriting
@@ -75,7 +75,7 @@ def run(options: Options) -> int:
                 folder = work / "images"
                 with stage(console, f"choosing frames of {options.images}"):
                     names = write_stills(options.images, folder, options.stills)
-            placed = place_photographs(
+            placed = reconstruct_cameras(
                 folder,
                 names,
                 work,
@@ -124,7 +124,7 @@ def _in_both(names: Sequence[str], reference: Photographs) -> list[tuple[int, in
     if len(both) < 3:
         raise ValueError(
             f"--compare: expected poses of three of these photographs or more in {reference.name}, found "
-            f"{len(both)} of the same name; it has {few_of(reference.names)}"
+            f"{len(both)} of the same name; it has {shortened(reference.names)}"
         )
     return both
 
@@ -161,7 +161,7 @@ def _workshop(out: Path) -> Iterator[Path]:
 
 
 def _write(
-    options: Options, placed: Placed, names: list[str], work: Path, folder: Path, in_place: bool
+    options: Options, placed: SfmResult, names: list[str], work: Path, folder: Path, in_place: bool
 ) -> None:
     """Move what was made to its place; nothing is replaced before all of it is there."""
     sparse = work / "new" / "sparse"
@@ -180,7 +180,7 @@ def _write(
             os.replace(new, old)
 
 
-def _found(options: Options, placed: Placed, count: int, seconds: float) -> dict[str, Any]:
+def _found(options: Options, placed: SfmResult, count: int, seconds: float) -> dict[str, Any]:
     camera = placed.model.cameras[min(placed.model.cameras)]
     return {
         "photographs": count,
@@ -211,7 +211,7 @@ def _print(options: Options, found: dict[str, Any]) -> None:
     seconds = found["seconds"]
     rows = {
         "registered": f"{found['registered']} of {found['photographs']} photographs",
-        "left out": f"{len(left_out)}: {few_of(left_out)}" if left_out else "none",
+        "left out": f"{len(left_out)}: {shortened(left_out)}" if left_out else "none",
         "points": f"{found['points']:,}, each in {found['track_length']:.1f} photographs in the mean",
         "error": f"{found['error_px']:.2f} px in the mean, where photographs show them",
         "cameras": f"{cameras['number']} {cameras['model']}, {cameras['size'][0]} x {cameras['size'][1]}, "

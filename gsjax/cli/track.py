@@ -14,7 +14,7 @@ from gsjax.engine.folder import RunFolder, expect_dataset
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import FITTING, Notes, reason, say_error, stage
 from gsjax.engine.options import (
-    OF_NO_BEARING,
+    RESUME_MAY_CHANGE,
     FirstMasks,
     OfRecording,
     checked,
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
             options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids
         )
         if options.resume:
-            folder.check_config(settings, but=OF_NO_BEARING)
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
         mask = first_mask(recording.tracked, options.mask_camera, options.masks)
         folder.write_config(settings)  # from here on an earlier run is gone
         draw_ahead(recording, console)

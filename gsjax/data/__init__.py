@@ -1,4 +1,4 @@
-"""Recordings, real and simulated: every reader gives the same sequence type."""
+"""Recordings, real and simulated: every reader returns the same sequence type."""
 
 from gsjax.data.clip import read_clip
 from gsjax.data.colmap import read_colmap

@@ -1,7 +1,7 @@
-"""A video, or its frames in a folder, by one camera that stands still: no poses and no depth.
+"""A video, or a folder of its frames, from one static camera: no poses and no depth.
 
 CLIP.mp4          or images/NAME.png in a folder, or pictures in the folder itself, in order of their names
-masks/NAME.png    the tool in white, or in black, one a frame, optional; or gt_masks/
+masks/NAME.png    the tool in white, or in black, one per frame, optional; or gt_masks/
 """
 
 import warnings
@@ -16,23 +16,23 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import read_image, read_mask
 from gsjax.data.frame_folders import (
     DEFAULT_RATE_HZ,
-    expect_one_size,
+    check_one_size,
     frame_numbers,
     pictures,
     pictures_beside,
-    warn_of_single_frame,
+    warn_about_single_frame,
 )
-from gsjax.data.lens import matrix_of
+from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, Tool, check_tool, find_masks, tool_labels
 from gsjax.data.video import Video, describe_video
 from gsjax.geometry.cameras import intrinsics
 
 FIELD_OF_VIEW_DEGREES = 60.0
-"""From left to right, of a camera of which nothing is known: about that of a da Vinci robot's endoscope."""
+"""Horizontal field of view assumed for an uncalibrated camera: about that of a da Vinci robot's endoscope."""
 
 SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
-"""Of videos."""
+"""File extensions of videos."""
 
 
 def read_clip(
@@ -43,27 +43,27 @@ def read_clip(
     masks: str | None = None,
     tool: Tool = "white",
 ) -> Sequence:
-    """Frames of one camera, 0, that stands still in the origin. Times are a video's own; 30 Hz of a folder.
+    """The frames of one static camera, 0, at the origin. Times are those of the video, or 30 Hz for a folder.
 
-    Without `K` the camera is taken to see 60 degrees from left to right, its axis in the picture's middle.
+    Without `K`, a horizontal field of view of 60 degrees and a centred principal point are assumed.
 
     Args:
         path: the video, or the folder of the frames.
         K: intrinsics, or (fx, fy, cx, cy), in pixels, pixel centres at +0.5.
-        images: the folder of the frames in it; where there is none, they lie in the folder itself.
-        masks: the folder of masks, in the folder or beside the video; None: masks/ or gt_masks/ of a folder,
-            and none of a video.
-        tool: what the tool is in masks: "white" or "black".
+        images: name of the frames' folder in it; if there is none, the frames lie in the folder itself.
+        masks: name of the mask folder, in the folder or beside the video; None: masks/ or gt_masks/ of a
+            folder, and no masks for a video.
+        tool: colour of the tool in masks: "white" or "black".
 
     Raises:
-        DataError: there are no frames, or they differ in size; the video is none; there are not as many masks
-            as frames; the tool covers everything in all of them; there is depth, which needs poses.
-        ValueError: an option is none.
+        DataError: there are no frames, or they differ in size; the file is not a video; the numbers of masks
+            and frames differ; the tool covers everything in all of them; there is depth, which needs poses.
+        ValueError: an option is invalid.
 
-    Warns with DataWarning where `K` is not given, masks look inverted, or there is only one frame.
+    Warns with DataWarning if `K` is not given, masks look inverted, or there is only one frame.
     """
     source = Path(path)
-    frames = _of_folder(source, images) if source.is_dir() else _of_video(source)
+    frames = _folder_frames(source, images) if source.is_dir() else _video_frames(source)
     width, height, count = frames.width, frames.height, len(frames.times)
     home = source if source.is_dir() else source.parent
     folder = home / masks if masks else find_masks(source)
@@ -75,7 +75,7 @@ def read_clip(
     if files:
         check_tool(load_mask, count, tool, files[0].parent)
     if K is None:
-        assumed = f"{FIELD_OF_VIEW_DEGREES:g} degrees from left to right are assumed"
+        assumed = f"assuming a horizontal field of view of {FIELD_OF_VIEW_DEGREES:g} degrees"
         message = f"{source}: no intrinsics: {assumed}; give K (--read.K), fx fy cx cy in pixels"
         warnings.warn(message, DataWarning, stacklevel=2)
         K = intrinsics(0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW_DEGREES)), width, height)
@@ -86,7 +86,7 @@ def read_clip(
         height=height,
         times=frames.times,
         frame_ids=frames.numbers,
-        Ks=np.broadcast_to(matrix_of(K), (count, 1, 3, 3)),
+        Ks=np.broadcast_to(intrinsics_matrix(K), (count, 1, 3, 3)),
         viewmats=np.broadcast_to(np.eye(4), (count, 1, 4, 4)),
         load_image=lambda t, c: frames.load(t),
         load_mask=(lambda t, c: load_mask(t)) if files else None,
@@ -96,12 +96,12 @@ def read_clip(
 
 
 def is_clip(root: Path, images: str = "images", masks: str | None = None) -> bool:
-    """Whether it is a video, or a folder of frames with masks.
+    """Whether a path is a video, or a folder of frames with masks.
 
     Args:
         root: the file or folder.
-        images: the folder of frames in it.
-        masks: the folder of masks, where the user names one.
+        images: name of the frames' folder in it.
+        masks: name of the mask folder, if the user gave one.
     """
     if root.suffix.lower() in SUFFIXES and root.is_file():
         return True
@@ -117,7 +117,7 @@ class _Frames(NamedTuple):
     where: Callable[[int], str]
 
 
-def _of_video(path: Path) -> _Frames:
+def _video_frames(path: Path) -> _Frames:
     described = describe_video(path)
     width, height, count, rate_hz = described
     video = Video(path, width, height, count)
@@ -125,15 +125,15 @@ def _of_video(path: Path) -> _Frames:
     return _Frames(width, height, times, numbers, video.frame, lambda t: f"{path}, frame {t}")
 
 
-def _of_folder(root: Path, images: str) -> _Frames:
+def _folder_frames(root: Path, images: str) -> _Frames:
     frames = _frames_in(root, images)
     if not frames:
-        raise DataError(root, f"frames, in {images}/ or right here", "none", "Name their folder.")
+        raise DataError(root, f"frames, in {images}/ or directly in it", "none", "Give their folder.")
     if (root / "depth").is_dir():
-        advice = "Add it (rows of one pose do for a camera that stands still), or take depth/ out."
-        raise DataError(root, "poses_bounds.npy, where there is depth/", "no such file", advice)
-    width, height = expect_one_size(frames)
-    warn_of_single_frame(frames)
+        advice = "Add it (with equal rows for a static camera), or remove depth/."
+        raise DataError(root, "poses_bounds.npy beside depth/", "no such file", advice)
+    width, height = check_one_size(frames)
+    warn_about_single_frame(frames)
     times = np.arange(len(frames)) / DEFAULT_RATE_HZ
     return _Frames(
         width,

@@ -1,11 +1,11 @@
-"""COLMAP's reconstructions (Schönberger, Frahm 2016), text and binary: world to camera, OpenCV axes.
+"""COLMAP reconstructions (Schönberger, Frahm 2016), text and binary: world to camera, OpenCV axes.
 
 cameras    CAMERA_ID MODEL WIDTH HEIGHT PARAMS...          pixels, centres at +0.5
 images     IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME    and a line of (X Y POINT3D_ID)
 points3D   POINT3D_ID X Y Z R G B ERROR TRACK...
 
-each .txt or .bin (little endian; lengths as uint64), in sparse/0, sparse, or the folder itself; the
-photographs in images. The layouts are those that colmap.github.io/format.html describes.
+Each is a .txt or .bin file (little endian; lengths as uint64) in sparse/0, sparse or the folder itself; the
+photographs are in images. The layouts are described at colmap.github.io/format.html.
 """
 
 import os
@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image, read_mask
-from gsjax.data.lens import Lens, shrunk, straighten
+from gsjax.data.lens import Lens, scaled_intrinsics, undistort
 from gsjax.data.photographs import Cloud, Photographs
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-"""Where the three files may lie in a folder, those looked for first in front."""
+"""Subfolders in which the three files may lie, in the order in which they are searched."""
 
-# Model number -> (name, how many parameters); the order of a binary file's model ids.
+# Model id of a binary file -> (name, number of parameters).
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -43,7 +43,7 @@ _MODELS = {
     14: ("SIMPLE_FISHEYE", 3),
     15: ("FISHEYE", 4),
 }
-_UNIT_TOLERANCE = 0.01  # of a quaternion's length: text is often written with few digits
+_UNIT_TOLERANCE = 0.01  # on a quaternion's length: text files often have few digits
 _COUNTS = dict(_MODELS.values())
 _UNDISTORT = "Run COLMAP's image_undistorter, and give its folder."
 _AGAIN = "It may be cut off: fetch or export it again."
@@ -62,18 +62,18 @@ class _Image(NamedTuple):
 
 
 def read_colmap(path: str | Path, images: str = "images") -> Photographs:
-    """The registered photographs of a reconstruction, in order of name, and its points.
+    """The registered photographs of a reconstruction, sorted by name, and its points.
 
-    Photographs that are not there, and those whose pose is not finite, are left out with a DataWarning that
-    counts them. Distorted ones are straightened (see `gsjax.data.lens`).
+    Photographs whose file is missing or whose pose is not finite are left out, with a DataWarning that counts
+    them. Distorted photographs are undistorted (see `gsjax.data.lens`).
 
     Args:
         path: the folder that holds the photographs' folder and sparse/0, sparse or the files themselves.
-        images: the photographs' folder in it; masks/NAME.png beside it say which pixels count.
+        images: name of the photographs' folder in it; masks/NAME.png beside it mark the pixels that count.
 
     Raises:
-        DataError: a file is missing, cut off or of another form, no photograph is left, or a camera is of a
-            model that OpenCV does not have.
+        DataError: a file is missing, truncated or malformed, no photograph is left, or a camera has a model
+            that OpenCV does not support.
     """
     root = Path(path)
     model = next((root / place for place in PLACES if find(root / place)), None)
@@ -84,11 +84,11 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     suffix = find(model)
     cameras = _READERS[suffix]["cameras"](model / f"cameras{suffix}")
     registered = sorted(_READERS[suffix]["images"](model / f"images{suffix}"), key=lambda image: image.name)
-    for what, read in (("cameras", cameras), ("images", registered)):
-        if not read:
+    for what, entries in (("cameras", cameras), ("images", registered)):
+        if not entries:
             expected, advice = (
-                f"at least one of its {what}",
-                "Did it fail? Give another model, or reconstruct again.",
+                "at least one entry",
+                "Did the reconstruction fail? Give another model, or reconstruct again.",
             )
             raise DataError(model / f"{what}{suffix}", expected, "none", advice)
     cloud = (
@@ -98,17 +98,18 @@ def read_colmap(path: str | Path, images: str = "images") -> Photographs:
     )
     usable = [image for image in registered if np.isfinite(image.viewmat).all()]
     kept = [image for image in usable if os.path.isfile(root / images / image.name)]
-    said = []
+    left_out = []
     if missing := [image.name for image in usable if not os.path.isfile(root / images / image.name)]:
-        said.append(f"{len(missing)} that are not in {root / images} ({_first(missing)})")
+        left_out.append(f"{len(missing)} not in {root / images} ({_first(missing)})")
     if lost := [image.name for image in registered if not np.isfinite(image.viewmat).all()]:
-        said.append(f"{len(lost)} without a finite pose in images{suffix} ({_first(lost)})")
+        left_out.append(f"{len(lost)} without a finite pose in images{suffix} ({_first(lost)})")
     if not kept:
-        found = f"{len(registered)} registered, {' and '.join(said)}"
-        raise DataError(model, "registered photographs", found, f"Name their folder, if it is not {images}.")
-    if said:
-        message = f"{root}: of {len(registered)} registered photographs {' and '.join(said)} are left out"
-        warnings.warn(message, DataWarning, stacklevel=2)
+        found = f"{len(registered)} registered, {' and '.join(left_out)}"
+        advice = f"If their folder is not {images}, give its name."
+        raise DataError(model, "registered photographs that can be used", found, advice)
+    if left_out:
+        message = f"{root}: of {len(registered)} registered photographs, {' and '.join(left_out)}"
+        warnings.warn(f"{message} are left out", DataWarning, stacklevel=2)
     for image in kept:
         if image.camera not in cameras:
             known = sorted(cameras)[:8]
@@ -126,23 +127,23 @@ def _first(names: list[str]) -> str:
 
 
 def find(folder: Path) -> str | None:
-    """ ".bin" or ".txt" where a folder holds a reconstruction in that form, the newer form first; or None."""
-    there = (
+    """The suffix of the reconstruction files in a folder, ".bin" or, if there are none, ".txt"; or None."""
+    present = (
         suffix
         for suffix in (".bin", ".txt")
         if all((folder / f"{n}{suffix}").is_file() for n in ("cameras", "images"))
     )
-    return next(there, None)
+    return next(present, None)
 
 
-def find_lacking(root: Path) -> Path | None:
-    """The file that half of a reconstruction lacks, where there is such a half; or None."""
+def find_missing_file(root: Path) -> Path | None:
+    """The missing file of an incomplete reconstruction; None if there is no incomplete reconstruction."""
     for place in PLACES:
         for suffix in (".bin", ".txt"):
             files = [root / place / f"{name}{suffix}" for name in ("cameras", "images")]
-            there = [file.is_file() for file in files]
-            if any(there) and not all(there):
-                return files[there.index(False)]
+            present = [file.is_file() for file in files]
+            if any(present) and not all(present):
+                return files[present.index(False)]
     return None
 
 
@@ -151,10 +152,10 @@ def _photographs(root, folder, images, cameras, cloud) -> Photographs:
     sizes = [picture_size(path) for path in paths]
     taken_by = [cameras[image.camera] for image in images]
     lenses = [
-        camera.lens._replace(K=shrunk(camera.lens.K, (camera.width, camera.height), size, path))
+        camera.lens._replace(K=scaled_intrinsics(camera.lens.K, (camera.width, camera.height), size, path))
         for camera, size, path in zip(taken_by, sizes, paths, strict=True)
     ]
-    ideal = [straighten(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
+    ideal = [undistort(lens, *size) for lens, size in zip(lenses, sizes, strict=True)]
     masks = [
         next((m for m in _mask_names(root / "masks", image.name) if m.is_file()), None) for image in images
     ]
@@ -162,8 +163,8 @@ def _photographs(root, folder, images, cameras, cloud) -> Photographs:
     def load_mask(i: int) -> np.ndarray | None:
         if masks[i] is None:
             return None
-        counts = (read_mask(masks[i], *sizes[i]) != 0).astype(np.uint8)
-        return ideal[i][1](counts, cv2.INTER_NEAREST) > 0
+        mask = (read_mask(masks[i], *sizes[i]) != 0).astype(np.uint8)
+        return ideal[i][1](mask, cv2.INTER_NEAREST) > 0
 
     return Photographs(
         name=root.resolve().name,
@@ -179,18 +180,18 @@ def _photographs(root, folder, images, cameras, cloud) -> Photographs:
 
 
 def _mask_names(folder: Path, name: str) -> tuple[Path, Path]:
-    """COLMAP calls the mask of a.jpg a.jpg.png; others call it a.png."""
+    """COLMAP names the mask of a.jpg a.jpg.png; other tools name it a.png."""
     return folder / f"{name}.png", (folder / name).with_suffix(".png")
 
 
 def _lens(path: Path, name: str, p: tuple[float, ...]) -> Lens:
-    """Parameters of a COLMAP model as OpenCV has them."""
+    """The parameters of a COLMAP model in OpenCV's form."""
     if name not in _COUNTS or name in ("FOV", "THIN_PRISM_FISHEYE"):
         known = ", ".join(n for n in _COUNTS if n not in ("FOV", "THIN_PRISM_FISHEYE"))
-        raise DataError(path, f"a camera of a model that OpenCV has: {known}", name, _UNDISTORT)
-    one = name.startswith(("SIMPLE", "RADIAL"))  # focal length
-    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if one else p[:4]
-    rest = p[3:] if one else p[4:]
+        raise DataError(path, f"a camera model that OpenCV supports: {known}", name, _UNDISTORT)
+    single_focal = name.startswith(("SIMPLE", "RADIAL"))
+    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if single_focal else p[:4]
+    rest = p[3:] if single_focal else p[4:]
     fisheye = name.endswith("FISHEYE")
     wanted = 4 if fisheye else max(4, len(rest))
     coeffs = (*rest, *[0.0] * (wanted - len(rest)))
@@ -205,10 +206,10 @@ def _lens(path: Path, name: str, p: tuple[float, ...]) -> Lens:
 def _viewmat(
     where: object, name: str, quat: tuple[float, ...], translation: tuple[float, ...]
 ) -> Float[np.ndarray, "4 4"]:
-    """From w x y z; NaN throughout where the numbers name no pose.
+    """The view matrix of a quaternion w x y z and a translation; all NaN if they do not define a pose.
 
     Raises:
-        DataError: the quaternion's length is neither about 1 nor 0.
+        DataError: the quaternion's length is neither 0 nor close to 1.
     """
     if not np.isfinite([*quat, *translation]).all() or (length := np.hypot.reduce(quat)) < 1e-9:
         return np.full((4, 4), np.nan)
@@ -223,7 +224,7 @@ def _viewmat(
 
 
 class _Bytes:
-    """A binary file, read from front to back."""
+    """A binary file, read sequentially."""
 
     def __init__(self, path: Path):
         self.path, self.at = path, 0
@@ -231,7 +232,7 @@ class _Bytes:
             self.content = path.read_bytes()
         except FileNotFoundError:
             raise DataError(
-                path, "a part of the reconstruction", "no such file", "Was it copied whole?"
+                path, "a file of the reconstruction", "no such file", "Was the folder copied completely?"
             ) from None
 
     def take(self, layout: str) -> tuple:
@@ -257,16 +258,16 @@ class _Bytes:
         return name
 
     def count(self, least: int) -> int:
-        """How many items follow, of at least so many bytes each."""
+        """The number of items that follow, each of at least `least` bytes."""
         (count,) = self.take("Q")
         if count * least > len(self.content) - self.at:
             found = f"{count} items announced in {len(self.content)} bytes"
-            raise DataError(self.path, "a file of COLMAP", found, _AGAIN)
+            raise DataError(self.path, "a COLMAP file", found, _AGAIN)
         return count
 
     def cut_off(self) -> DataError:
         return DataError(
-            self.path, "a whole file of COLMAP", f"its end after {len(self.content)} bytes", _AGAIN
+            self.path, "a complete COLMAP file", f"its end after {len(self.content)} bytes", _AGAIN
         )
 
 
@@ -275,8 +276,8 @@ def _cameras_bin(path: Path) -> dict[int, _Camera]:
     for _ in range(file.count(24)):
         number, model, width, height = file.take("iiQQ")
         if model not in _MODELS:
-            known = f"one of the camera models {sorted(_MODELS)}"
-            raise DataError(path, known, f"number {model}", f"{_AGAIN} Or: {_UNDISTORT}")
+            known = f"one of the camera model ids {sorted(_MODELS)}"
+            raise DataError(path, known, f"id {model}", f"{_AGAIN} Otherwise: {_UNDISTORT}")
         name, count = _MODELS[model]
         cameras[number] = _Camera(_lens(path, name, file.take(f"{count}d")), width, height)
     return cameras
@@ -303,12 +304,12 @@ def _points_bin(path: Path) -> Cloud:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """The lines with their numbers, comments left out."""
+    """The lines with their numbers, without comments."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
         raise DataError(
-            path, "a part of the reconstruction", "no such file", "Was it copied whole?"
+            path, "a file of the reconstruction", "no such file", "Was the folder copied completely?"
         ) from None
     return [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
 
@@ -341,7 +342,7 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
 
 
 def _images_txt(path: Path) -> list[_Image]:
-    """Two lines an image, of which the second, its points, may be empty."""
+    """Two lines per image, of which the second, its points, may be empty."""
     lines = _lines(path)
     while lines and not lines[0][1].strip():
         lines.pop(0)

@@ -1,4 +1,4 @@
-"""How data that cannot be used, or only partly, is reported."""
+"""The errors and warnings for data that is unusable or only partly usable."""
 
 
 class DataError(ValueError):
@@ -10,7 +10,7 @@ class DataError(ValueError):
 
 
 class MissingFile(DataError):
-    """A picture or array of a frame that is not where it should be."""
+    """An image or array of a frame is not where it should be."""
 
 
 class DataWarning(UserWarning):

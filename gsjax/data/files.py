@@ -1,4 +1,4 @@
-"""Single files: JSON, images, depth and masks, each checked as it is read."""
+"""Reading single files with checks: JSON, arrays, images, depth and masks."""
 
 import json
 import zipfile
@@ -13,9 +13,9 @@ from jaxtyping import Float, Int, UInt8
 from gsjax.data.errors import DataError, MissingFile
 
 SATURATED_DEPTH = 65535
-"""The largest 16-bit value: what converters clip to and what Kinect writes where it measured nothing."""
+"""The largest 16-bit value: converters clip to it, and the Kinect writes it where it measured nothing."""
 
-# OpenCV decodes the rest of a file that was cut off as grey, so the end marks are looked for here.
+# OpenCV decodes the missing rest of a truncated file as grey, so end markers are checked here.
 _END_MARKS = {b"\x89PNG": b"IEND", b"\xff\xd8": b"\xff\xd9"}
 _TAIL = 64
 
@@ -30,17 +30,17 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text())
     except FileNotFoundError:
         raise DataError(
-            path, "a JSON file", "no such file", "Check the folder; was it copied whole?"
+            path, "a JSON file", "no such file", "Check the folder; was it copied completely?"
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(path, "a JSON file", f"bad JSON ({error})", "Fetch the file again.") from None
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file by name; that of an .npy file stands under "". Nothing is unpickled.
+    """The arrays of an .npz file by name; the array of an .npy file has the name "". Nothing is unpickled.
 
     Raises:
-        DataError: the file is missing, cut off, or holds no plain arrays.
+        DataError: the file is missing, truncated, or does not hold plain arrays.
     """
     try:
         loaded = np.load(path, allow_pickle=False)
@@ -49,7 +49,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with loaded:
             return dict(loaded)
     except FileNotFoundError:
-        raise DataError(path, "arrays", "no such file", "Check the folder; was it copied whole?") from None
+        advice = "Check the folder; was it copied completely?"
+        raise DataError(path, "arrays", "no such file", advice) from None
     except (ValueError, EOFError, MemoryError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(path, "plain arrays", f"bad data ({error})", "Fetch the file again.") from None
 
@@ -58,14 +59,14 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image in pixels.
 
     Raises:
-        DataError: the file is missing, cut off, or not an image.
+        DataError: the file is missing, truncated, or not an image.
     """
     height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
     return width, height
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photograph in pixels, as it is stored, from the head of its file.
+    """Width and height of a photograph in pixels, as stored, read from the file header only.
 
     Raises:
         DataError: the file is missing or not an image.
@@ -83,15 +84,15 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
-    """An 8-bit colour image, RGB, as its pixels are stored: that is how cameras are calibrated, whatever its
-    EXIF data says of its orientation.
+    """An 8-bit colour image, RGB, in its stored orientation: cameras are calibrated for the stored pixels,
+    so the EXIF orientation is ignored.
 
     Args:
         path: the file.
-        width, height: that it has to have, pixels.
+        width, height: expected size, pixels.
 
     Raises:
-        DataError: the file is missing, cut off, not an image, or not of this size.
+        DataError: the file is missing, truncated, not an image, or of another size.
     """
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     _check_size(path, image, width, height)
@@ -99,14 +100,14 @@ def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height
 
 
 def read_rgba(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width channels"]:
-    """An image with 3 channels, RGB, or 4 where it is transparent somewhere; 16 bits become 8.
+    """An image with 3 channels, RGB, or 4 if it has transparency; 16 bits are converted to 8.
 
     Args:
         path: the file.
-        width, height: that it has to have, pixels.
+        width, height: expected size, pixels.
 
     Raises:
-        DataError: the file is missing, cut off, not an image, or not of this size.
+        DataError: the file is missing, truncated, not an image, or of another size.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     _check_size(path, image, width, height)
@@ -128,11 +129,11 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
 
     Args:
         path: the file.
-        unit_m: metres of one step.
-        width, height: that it has to have, pixels.
+        unit_m: metres per step.
+        width, height: expected size, pixels.
 
     Raises:
-        DataError: the file is missing, cut off, not a 16-bit single-channel image, or not of this size.
+        DataError: the file is missing, truncated, not a 16-bit single-channel image, or of another size.
     """
     raw = _decode(path, cv2.IMREAD_UNCHANGED, "a depth image")
     _check_size(path, raw, width, height)
@@ -144,22 +145,22 @@ def read_depth(path: Path, unit_m: float, width: int, height: int) -> Float[np.n
 
 
 def read_mask(path: Path, width: int, height: int) -> Int[np.ndarray, "height width"]:
-    """Integer labels, int32. A mask saved as a grey image of three equal channels is read as one.
+    """Integer labels, int32. A mask saved with three equal channels is accepted.
 
     Args:
         path: the file.
-        width, height: that it has to have, pixels.
+        width, height: expected size, pixels.
 
     Raises:
-        DataError: the file is missing, cut off, of several differing channels, or not of this size.
+        DataError: the file is missing, truncated, has channels that differ, or is of another size.
     """
     raw = _decode(path, cv2.IMREAD_UNCHANGED, "a mask")
     _check_size(path, raw, width, height)
     if raw.ndim == 3:
         colors = raw[..., :3]
         if (colors != colors[..., :1]).any():
-            advice = "Save one label a pixel, as a single-channel PNG."
-            raise DataError(path, "one label a pixel", f"{raw.shape[2]} channels that differ", advice)
+            advice = "Save one label per pixel, as a single-channel PNG."
+            raise DataError(path, "one label per pixel", f"{raw.shape[2]} channels that differ", advice)
         raw = colors[..., 0]
     return raw.astype(np.int32)
 
@@ -180,7 +181,7 @@ def _decode(path: Path, flags: int, kind: str = "an image") -> np.ndarray:
 
 
 def _no_such_file(path: Path, kind: str) -> MissingFile:
-    advice = "Restore it, or leave out that frame (of all cameras, in the meta too)."
+    advice = "Restore it, or remove that frame (of all cameras, and from any metadata)."
     return MissingFile(path, kind, "no such file", advice)
 
 
@@ -188,5 +189,5 @@ def _check_size(path: Path, image: np.ndarray, width: int, height: int) -> None:
     if image.shape[:2] != (height, width):
         found = f"{image.shape[1]}x{image.shape[0]}"
         raise DataError(
-            path, f"{width}x{height} pixels", found, "All images, depths and masks share one size."
+            path, f"{width}x{height} pixels", found, "All images, depths and masks must have one size."
         )

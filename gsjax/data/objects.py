@@ -1,4 +1,4 @@
-"""What is known of the objects of a sequence: how they truly moved, for scoring, and what shape they have."""
+"""Known properties of the objects of a sequence: their true motion, for scoring, and their shapes."""
 
 from collections.abc import Sequence as Indices
 from dataclasses import dataclass, replace
@@ -9,21 +9,21 @@ from jaxtyping import Float, Int
 from gsjax.data.validation import check_poses, check_shape
 from gsjax.geometry.joints import Joint
 
-# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+# Field shapes are in the docstrings: constructors check them, with better messages than an annotation's.
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is known of the objects of a sequence, for scoring only.
+    """Ground truth of the objects of a sequence, for scoring only.
 
     Attributes:
-        names: one name an object.
+        names: name of each object, K of them.
         label_ids: the mask value of each object, [K].
         poses: object-to-world transforms, [T,K,4,4] float64.
-        robot: the mask value of the robot, or None where there is none.
-        joints: one for each object, None for one that moves freely; empty where that is not known.
-        tracks: material points on the surface of what deforms, followed over time, [T,V,3] float64, metres,
-            world; None where that is not known. What deforms has no pose, and is not among the objects.
+        robot: the mask value of the robot; None without a robot.
+        joints: the joint of each object, None for one that moves freely; empty if joints are unknown.
+        tracks: trajectories of material points on deformable surfaces, [T,V,3] float64, metres, world; None
+            if unknown. Deformable things have no pose and are not among the objects.
 
     Raises:
         ValueError: shapes disagree, or a pose is not a rigid motion.
@@ -50,7 +50,7 @@ class Truth:
         check_poses("pose", self.poses, lambda t, k: f"object {self.names[k]} in frame {t}", advice)
 
     def select(self, frames: Indices[int]) -> "Truth":
-        """That of some frames."""
+        """The truth of these frames."""
         chosen = list(frames)
         joints = tuple(j and replace(j, values=j.values[chosen]) for j in self.joints)
         tracks = None if self.tracks is None else self.tracks[chosen]
@@ -59,18 +59,19 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class PointModel:
-    """An object or a background whose shape is known beforehand, as Gaussians in its own frame.
+    """An object or background of known shape, as Gaussians in its own frame.
 
     Attributes:
-        name: what it is.
+        name: name of the object.
         means: centres in the model's frame, metres, [N,3].
-        quats: [w,x,y,z] of any length, [N,4].
+        quats: [w,x,y,z], not necessarily normalised, [N,4].
         scales: standard deviations, metres, [N,3].
         opacities: 0 to 1, [N].
         colors: RGB, 0 to 1, [N,3].
         label: mask value of the object; 0 is the static background.
-        pose: model-to-world transform [4,4] in the first frame; None: it must be fitted to the first frames.
-        plane: (n, d) with n.x + d = 0 of the plane in the world that it rests on, or None.
+        pose: model-to-world transform [4,4] in the first frame; None if it has to be fitted to the first
+            frames.
+        plane: (n, d), the plane n.x + d = 0 in the world that it rests on, [4], or None.
 
     Raises:
         ValueError: shapes disagree.

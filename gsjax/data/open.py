@@ -1,4 +1,4 @@
-"""Opens any recording, and any set of photographs, that some reader here knows."""
+"""Opens recordings and sets of photographs in any layout that has a reader."""
 
 import inspect
 from contextlib import suppress
@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 
 from gsjax.data import clip, colmap, poses_bounds, transforms
-from gsjax.data.endonerf import is_endonerf, read_endonerf, surely_endonerf
+from gsjax.data.endonerf import is_endonerf, is_unambiguous_endonerf, read_endonerf
 from gsjax.data.endovis import LEFT, is_endovis, read_endovis
 from gsjax.data.errors import DataError
 from gsjax.data.open3d_rgbd import is_open3d, read_open3d
@@ -33,7 +33,7 @@ SIMULATED_SCENES = {
     "tissue": tissue,
 }
 
-# What only a folder of that layout has (* stands for anything), and its reader.
+# Glob pattern that only a folder of that layout matches -> the layout and its reader.
 _LAYOUTS = {
     "train_meta.json": ("Panoptic", read_panoptic),
     "sample_demos": ("push-T", read_push_t),
@@ -48,31 +48,32 @@ _RECORDINGS |= {"poses_bounds.npy and depth or masks": "EndoNeRF", "poses_bounds
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What some layouts leave open."""
+    """Options for what some layouts leave open."""
 
     K: tuple[float, float, float, float] | None = None
-    """fx fy cx cy of what comes without intrinsics (Open3D, videos), in pixels, centres at +0.5."""
+    """fx fy cx cy for data without intrinsics (Open3D, videos), in pixels, centres at +0.5."""
     axes: poses_bounds.Axes | None = None
-    """What the columns of poses_bounds.npy are: llff (down, right, back; DyNeRF too) or endonerf (right, up,
-    back). A folder with masks and depth beside its images is EndoNeRF's unless this says otherwise."""
+    """Meaning of the rotation columns in poses_bounds.npy: llff (down, right, back; DyNeRF too) or endonerf
+    (right, up, back). Default: endonerf if masks and depth lie beside the images; otherwise required."""
     images: str = "images"
-    """Folder of the photographs or frames, in COLMAP's, LLFF's and EndoNeRF's layouts."""
+    """Folder of the photographs or frames, in the COLMAP, LLFF and EndoNeRF layouts."""
     masks: str | None = None
-    """Folder of the masks of tools, beside a video or in a folder of frames without poses."""
+    """Folder of the tool masks, beside a video or in a folder of frames without poses."""
     tool: Tool = "white"
-    """What the tool is in black and white masks (EndoNeRF, videos): white or black."""
+    """Colour of the tool in black-and-white masks (EndoNeRF, videos): white or black."""
     depth_unit_m: float | None = None
-    """Lengths of one step of a depth image (Open3D, nerfstudio, EndoNeRF); 0.001 unless the data say it."""
+    """Length of one step of a depth image (Open3D, nerfstudio, EndoNeRF); default: as the data state, else
+    0.001."""
     depth_percentiles: tuple[float, float] | None = None
-    """Lowest and highest percentile of each frame's depth that is kept (EndoNeRF), as in 3 99.8 for depth by
-    stereo matching; all is kept unless given."""
+    """Lowest and highest percentile of each frame's depth to keep (EndoNeRF), for example 3 99.8 for depth
+    from stereo matching; default: keep all."""
     pose_unit_m: float = 1.0
-    """Metres of one unit of the poses (EndoNeRF), where the camera moves."""
+    """Metres per unit of the poses (EndoNeRF), for a camera that moves."""
     baseline_m: float | None = None
     """Metres from the left eye to the right one (EndoNeRF, EndoVis without a calibration)."""
     near: float = NEAR
-    """What is nearer to a camera than this is not drawn: the rig, where cameras see each other. In the unit
-    of the poses."""
+    """Near clipping distance, in the unit of the poses: nothing nearer to a camera is drawn, for example the
+    rig where cameras see each other."""
 
     def __post_init__(self):
         if not 0 <= self.near < np.inf:
@@ -80,15 +81,15 @@ class ReadOptions:
 
 
 def open_sequence(path: str | Path, options: ReadOptions | None = None) -> Sequence:
-    """The sequence in a folder, whose layout is recognised, of a video, or of a built-in scene.
+    """Open the sequence in a folder, whose layout is recognised, a video, or a built-in scene.
 
-    A video, and frames with masks but without poses, are of one camera that stands still. A built-in scene is
-    "simulated:NAME" with the arguments of its function behind it, as in
+    A video, or frames with masks but without poses, are read as one camera that stands still. A built-in
+    scene is "simulated:NAME", optionally followed by arguments of its function, as in
     "simulated:tabletop?seed=3&frames=20&hide=true".
 
     Raises:
-        DataError: there is no such folder, its layout is not known, or it is one of photographs.
-        ValueError: there is no built-in scene of that name, or it has no such argument; an option is missing.
+        DataError: there is no such folder, its layout is unknown, or it holds photographs without a time.
+        ValueError: there is no built-in scene of that name, it has no such argument, or an option is missing.
     """
     options = options or ReadOptions()
     return replace(_sequence(path, options), near=options.near)
@@ -114,19 +115,19 @@ def _sequence(path: str | Path, options: ReadOptions) -> Sequence:
         return read_endovis(root, K=options.K, baseline_m=options.baseline_m)
     photographs = _photograph_layout(root)
     if photographs:
-        found = f"photographs ({photographs} layout), which have no order in time"
-        raise DataError(root, "a recording over time", found, "gsjax fit takes them.")
+        found = f"photographs ({photographs} layout), which are not ordered in time"
+        raise DataError(root, "a recording over time", found, "Use gsjax fit for photographs.")
     if clip.is_clip(root, options.images, options.masks):
         return _clip(root, options)
     raise _unknown(root, _RECORDINGS, options)
 
 
 def open_photographs(path: str | Path, options: ReadOptions | None = None) -> Photographs:
-    """The photographs in a folder, whose layout is recognised, or all frames of a recording.
+    """Open the photographs in a folder, whose layout is recognised, or all frames of a recording.
 
     Raises:
-        DataError: there is no such folder, or its layout is not known.
-        ValueError: as `open_sequence`, or `axes` is needed and missing.
+        DataError: there is no such folder, or its layout is unknown.
+        ValueError: as `open_sequence`, or `axes` is required and missing.
     """
     options = options or ReadOptions()
     return replace(_photographs(path, options), near=options.near)
@@ -152,16 +153,16 @@ def _photographs(path: str | Path, options: ReadOptions) -> Photographs:
 
 
 def is_recording(path: str | Path) -> bool:
-    """Whether there is a recording over time, by what lies there."""
+    """Whether a path holds a recording over time, judged by its files."""
     root = Path(path)
     known = any(next(root.glob(mark), None) for mark in _LAYOUTS)
     known = known or any(layout(root) for layout in (is_open3d, is_endonerf, is_endovis))
     return str(path).startswith(SIMULATED_PREFIX) or known or next(root.glob("cam*.mp4"), None) is not None
 
 
-def is_of_photographs(path: str | Path) -> bool:
-    """Whether there are photographs of what stands still, rather than a recording over time. EndoNeRF's
-    folders are both: `open_photographs` takes the left eye's frames, `open_sequence` all there is."""
+def is_photographs(path: str | Path) -> bool:
+    """Whether a path holds photographs of a static scene rather than a recording over time. EndoNeRF folders
+    are both: `open_photographs` reads the left eye's frames, `open_sequence` everything."""
     if str(path).startswith(SIMULATED_PREFIX):
         return False
     root = Path(path)
@@ -174,7 +175,7 @@ _PHOTOGRAPHS = {"transforms.json": "nerfstudio", "sparse/0/cameras.bin": "COLMAP
 
 
 def _photograph_layout(root: Path) -> str | None:
-    """What a folder of photographs is called, by what lies there."""
+    """Name of the layout of a folder of photographs, judged by its files; None if it has none."""
     if next(root.glob("transforms*.json"), None):
         return "nerfstudio"
     if any(colmap.find(root / place) for place in colmap.PLACES):
@@ -188,7 +189,7 @@ def _open3d(root: Path, options: ReadOptions) -> Sequence:
     if options.K is None:
         raise ValueError(
             f"{root}: an Open3D folder has no intrinsics; give K (--read.K), fx fy cx cy in pixels, centres "
-            "at +0.5 (where its papers count them at integers, add 0.5 to cx and cy)"
+            "at +0.5 (if your calibration counts pixel centres at integers, add 0.5 to cx and cy)"
         )
     return read_open3d(root, options.K, **_unit(options))
 
@@ -211,11 +212,11 @@ def _clip(path: Path, options: ReadOptions) -> Sequence:
 
 
 def _axes(root: Path, options: ReadOptions) -> poses_bounds.Axes:
-    if options.axes is None and surely_endonerf(root, options.images):
+    if options.axes is None and is_unambiguous_endonerf(root, options.images):
         return "endonerf"
     if options.axes is None:
         raise ValueError(
-            f"{root}: poses_bounds.npy does not say how its columns are meant; give axes (--read.axes), "
+            f"{root}: poses_bounds.npy does not state the meaning of its columns; give axes (--read.axes), "
             "llff (down, right, back) or endonerf (right, up, back)"
         )
     return options.axes
@@ -242,8 +243,9 @@ def _find_poses(images: Path) -> str:
 
 
 def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataError:
-    if (lacking := colmap.find_lacking(root)) is not None:
-        return DataError(lacking, "a part of the reconstruction", "no such file", "Was it copied whole?")
+    if (missing := colmap.find_missing_file(root)) is not None:
+        advice = "Was the folder copied completely?"
+        return DataError(missing, "a file of the reconstruction", "no such file", advice)
     for folder in (root, root / options.images):
         count = sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
         if count:
@@ -258,7 +260,7 @@ def _unknown(root: Path, marks: dict[str, str], options: ReadOptions) -> DataErr
 def _simulate(text: str) -> Sequence:
     name, _, query = text.removeprefix(SIMULATED_PREFIX).partition("?")
     if name not in SIMULATED_SCENES:
-        raise ValueError(f"no built-in scene {name!r}; there are: {', '.join(SIMULATED_SCENES)}")
+        raise ValueError(f"no built-in scene {name!r}; available: {', '.join(SIMULATED_SCENES)}")
     scene = SIMULATED_SCENES[name]
     parameters = inspect.signature(scene).parameters
     arguments = {}
@@ -270,7 +272,7 @@ def _simulate(text: str) -> Sequence:
 
 
 def _parse(text: str, key: str, value: str, kind: type) -> int | float | bool | str:
-    """As the argument's default is: a word, a number, or a truth value written true, false, 1, or 0."""
+    """A value of the type of the argument's default; booleans are written true, false, 1 or 0."""
     if kind is bool and value.lower() in ("true", "false", "1", "0"):
         return value.lower() in ("true", "1")
     if kind is str:

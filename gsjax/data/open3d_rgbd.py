@@ -1,12 +1,12 @@
-"""RGB-D folders as Open3D's reconstruction system has them (Choi et al. 2015): one moving camera.
+"""RGB-D folders of Open3D's reconstruction system (Choi et al. 2015): one moving camera.
 
 image/NUMBER.jpg          or color/, rgb/; .png
 depth/NUMBER.png          uint16 millimetres, registered to colour
 trajectory.log            (test_)scene/trajectory.log or beside the images: for each frame three integers, the
-                          first its number, and 4 lines of a matrix, camera to world, OpenCV axes
+                          first its number, and a 4x4 matrix in 4 lines, camera to world, OpenCV axes
 
-The folder has no intrinsics (Open3D takes them from a file of the user's), so the caller gives them. A pose
-is of the frame whose file name has its number: folders often hold every third frame only.
+The folder has no intrinsics (Open3D reads them from a file that the user supplies), so the caller provides
+them. A pose belongs to the frame whose file name has its number: folders often hold only every third frame.
 """
 
 import re
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import image_size, read_depth, read_image
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
-from gsjax.data.lens import matrix_of
+from gsjax.data.lens import intrinsics_matrix
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
 
@@ -50,21 +50,21 @@ def read_open3d(
     depth_unit_m: float = DEPTH_UNIT_M,
     trajectory: str | None = None,
 ) -> Sequence:
-    """The frames that have colour, depth and a pose, at 30 Hz by their numbers.
+    """The frames that have colour, depth and a pose; their times are their numbers at 30 Hz.
 
     Args:
         path: the folder.
-        K: of the colour camera, or (fx, fy, cx, cy); pixel centres at +0.5 (Open3D and most sensors count
-            them at integers: add 0.5 to cx and cy).
-        depth_unit_m: metres of one step of depth.
-        trajectory: the file of poses, relative to the folder; the first of those above that is there.
+        K: intrinsics of the colour camera, or (fx, fy, cx, cy); pixel centres at +0.5 (Open3D and most
+            sensors count them at integers: add 0.5 to cx and cy).
+        depth_unit_m: metres per depth step.
+        trajectory: the pose file, relative to the folder; default: the first of those above that exists.
 
     Raises:
-        DataError: the folder has no images or poses, a file is of another form, or no frame has all three.
-        ValueError: `K` is none, or a pose no rigid motion.
+        DataError: the folder has no images or poses, a file is malformed, or no frame has all three.
+        ValueError: `K` is invalid, or a pose is not a rigid motion.
     """
     root = Path(path)
-    matrix = matrix_of(K)
+    matrix = intrinsics_matrix(K)
     folder, log = _first(root, _IMAGES), root / trajectory if trajectory else _first(root, _TRAJECTORIES)
     if folder is None or log is None:
         missing = (
@@ -76,14 +76,12 @@ def read_open3d(
     poses, images, depths = _read_log(log), _numbered(folder), _numbered(root / "depth")
     numbers = sorted(images.keys() & depths.keys() & poses.keys())
     if not numbers:
-        found = (
-            f"{len(images)} images, {len(depths)} depths and {len(poses)} poses without one number in common"
-        )
-        raise DataError(root, "frames with image, depth and pose", found, "Name files by the frame's number.")
+        found = f"{len(images)} images, {len(depths)} depths and {len(poses)} poses with no number in common"
+        raise DataError(root, "frames with image, depth and pose", found, "Name files by frame number.")
     if left_out := sorted(images.keys() - set(numbers)):
         some = ", ".join(images[n].name for n in left_out[:3]) + (", ..." if len(left_out) > 3 else "")
-        said = f"{len(left_out)} of {len(images)} frames are left out, without depth or a pose"
-        message = f"{root}: {said} ({some})"
+        reason = f"{len(left_out)} of {len(images)} frames without depth or a pose are left out"
+        message = f"{root}: {reason} ({some})"
         warnings.warn(message, DataWarning, stacklevel=2)
     to_world = np.stack([poses[n] for n in numbers])[:, None]
     advice = "Poses are camera to world in OpenCV axes."
@@ -110,7 +108,7 @@ def _first(root: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The pictures of a folder by the number in their name."""
+    """The pictures of a folder, by the number in their name."""
     if not folder.is_dir():
         return {}
     return {int(match[1]): file for file in folder.iterdir() if (match := _NUMBER.fullmatch(file.name))}
@@ -118,16 +116,16 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 def _read_log(path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:
     """Poses by frame number; those that are not finite are left out."""
-    expected = "blocks of a line of three integers and four of four numbers"
+    expected = "blocks of one line of three integers and four lines of four numbers"
     try:
         values = np.array(path.read_text().split(), np.float64)
     except (FileNotFoundError, IsADirectoryError):
-        raise DataError(path, "a trajectory", "no such file", "Name another.") from None
+        raise DataError(path, "a trajectory", "no such file", "Give another file.") from None
     except (ValueError, UnicodeDecodeError) as error:
         raise DataError(path, expected, f"something else ({error})", "Fetch the file again.") from None
     if values.size % 19 or not values.size:
         raise DataError(
-            path, expected, f"{values.size} numbers, which are not so many blocks of 19", "Is it cut off?"
+            path, expected, f"{values.size} numbers, not one or more blocks of 19", "Is it cut off?"
         )
     blocks = values.reshape(-1, 19)
     return {int(block[0]): block[3:].reshape(4, 4) for block in blocks if np.isfinite(block).all()}

@@ -1,4 +1,4 @@
-"""RGB-D cameras that OpenCV reads (its OpenNI 2 backend: Kinect, Xtion, Astra), as a stream of snapshots."""
+"""RGB-D cameras read through OpenCV's OpenNI 2 backend (Kinect, Xtion, Astra), as a stream of snapshots."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -19,31 +19,31 @@ _MILLIMETRE = 1e-3
 
 @runtime_checkable
 class Capture(Protocol):
-    """What is used of `cv2.VideoCapture`."""
+    """The part of `cv2.VideoCapture` that is used here."""
 
     def isOpened(self) -> bool:
-        """Whether there is such a camera."""
+        """Whether the camera is open."""
         ...
 
     def get(self, propId: int) -> float:
-        """A property by OpenCV's number; 0 where it has none."""
+        """The value of an OpenCV property; 0 if the camera does not have it."""
         ...
 
     def grab(self) -> bool:
-        """Take the next frame; False where none comes."""
+        """Grab the next frame; False if there is none."""
         ...
 
     def retrieve(self, *, flag: int = 0) -> tuple[bool, np.ndarray]:
-        """One picture of the frame taken, [H,W] or [H,W,3], and whether there is one."""
+        """Whether the grabbed frame has a picture of this kind, and the picture, [H,W] or [H,W,3]."""
         ...
 
 
 class RgbdCamera(NamedTuple):
-    """An open camera and where it stands.
+    """An open camera with its calibration.
 
     Attributes:
-        capture: of OpenCV.
-        K: pixels; pixel centres at +0.5.
+        capture: the OpenCV capture.
+        K: intrinsics in pixels, pixel centres at +0.5.
         viewmat: world to camera, OpenCV axes.
     """
 
@@ -53,24 +53,24 @@ class RgbdCamera(NamedTuple):
 
 
 def open_camera(index: int, viewmat: Float[np.ndarray, "4 4"] | None = None) -> RgbdCamera:
-    """The RGB-D camera that OpenCV counts as `index`, with depth registered to colour, as its driver has it.
+    """Open the RGB-D camera with OpenCV's number `index`, with depth registered to colour by its driver.
 
     Args:
-        viewmat: world to camera; the world is the camera's own unless given.
+        viewmat: world to camera, [4,4]; default: the world frame is the camera's own.
 
     Raises:
-        DataError: there is no such camera, or it measures no depth.
+        DataError: there is no such camera, or it has no depth.
     """
     capture = cv2.VideoCapture(index, cv2.CAP_OPENNI2)
     capture.set(cv2.CAP_PROP_OPENNI_REGISTRATION, 1)
-    return described(index, capture, np.eye(4) if viewmat is None else viewmat)
+    return calibrated_camera(index, capture, np.eye(4) if viewmat is None else viewmat)
 
 
-def described(index: int, capture: Capture, viewmat: Float[np.ndarray, "4 4"]) -> RgbdCamera:
-    """An RGB-D camera that is open, with its intrinsics.
+def calibrated_camera(index: int, capture: Capture, viewmat: Float[np.ndarray, "4 4"]) -> RgbdCamera:
+    """An open RGB-D camera with the intrinsics that its driver reports.
 
     Args:
-        index: as OpenCV counts it, for messages.
+        index: OpenCV's number of the camera, for messages.
         capture: the open camera.
         viewmat: world to camera, OpenCV axes.
 
@@ -79,20 +79,21 @@ def described(index: int, capture: Capture, viewmat: Float[np.ndarray, "4 4"]) -
     """
     what, expected = f"camera {index}", "an RGB-D camera of OpenCV's OpenNI 2 backend"
     if not capture.isOpened():
-        found = "none that opens"
+        found = "none that can be opened"
         raise DataError(what, expected, found, "Connect it, install its OpenNI 2 driver, or replay a folder.")
     focal = capture.get(cv2.CAP_OPENNI_DEPTH_GENERATOR + cv2.CAP_PROP_OPENNI_FOCAL_LENGTH)
     if not focal > 0:
-        raise DataError(what, expected, "a camera without depth", "Tracking starts from depth: take another.")
+        raise DataError(what, expected, "a camera without depth", "Tracking needs depth: use another.")
     width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     return RgbdCamera(capture, intrinsics(focal, width, height), viewmat)
 
 
 def snapshots(cameras: Sequence[RgbdCamera]) -> Iterator[Snapshot]:
-    """What all cameras see, as long as they give pictures. All are grabbed first, then read out.
+    """Snapshots from all cameras until one of them ends. All are grabbed first, then decoded, to keep them
+    close in time.
 
     Raises:
-        DataError: a camera gives a picture without depth, or of another size than the first one.
+        DataError: a camera returns a frame without depth, or of another size than the first one.
     """
     viewmats = jnp.asarray(np.stack([camera.viewmat for camera in cameras]), jnp.float32)
     Ks = jnp.asarray(np.stack([camera.K for camera in cameras]), jnp.float32)
@@ -118,9 +119,9 @@ def snapshots(cameras: Sequence[RgbdCamera]) -> Iterator[Snapshot]:
 
 def _retrieved(c: int, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
     """BGR bytes and depth in metres."""
-    there, image = capture.retrieve(flag=cv2.CAP_OPENNI_BGR_IMAGE)
-    with_depth, depth = capture.retrieve(flag=cv2.CAP_OPENNI_DEPTH_MAP)
-    if not (there and with_depth):
-        what = "colour" if not there else "depth"
+    has_color, image = capture.retrieve(flag=cv2.CAP_OPENNI_BGR_IMAGE)
+    has_depth, depth = capture.retrieve(flag=cv2.CAP_OPENNI_DEPTH_MAP)
+    if not (has_color and has_depth):
+        what = "colour" if not has_color else "depth"
         raise DataError(f"camera {c}", "colour and depth", f"a frame without {what}", "Check its connection.")
     return image, (_MILLIMETRE * depth).astype(np.float32)

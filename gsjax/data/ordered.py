@@ -1,5 +1,5 @@
-"""Photographs that one camera took one after the other, as a recording: those of a video that structure from
-motion placed, say."""
+"""Photographs that one camera took in succession, as a recording: for example the frames of a video whose
+poses were estimated by structure from motion."""
 
 import re
 
@@ -7,34 +7,34 @@ import numpy as np
 
 from gsjax.data.errors import DataError
 from gsjax.data.frame_folders import DEFAULT_RATE_HZ
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs, open_sequence
+from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs, open_sequence
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.tool_masks import LABEL_NAMES, TISSUE, TOOL
 
 
-def open_in_time(dataset: str, read: ReadOptions | None = None) -> Sequence:
-    """A recording; of placed photographs that are none, as `gsjax poses` makes of a video, those in order.
+def open_as_sequence(dataset: str, read: ReadOptions | None = None) -> Sequence:
+    """Open a recording, or a set of photographs as one, as `gsjax poses` writes it for a video.
 
     Raises:
-        DataError: it cannot be read, or photographs differ in size.
+        DataError: the data cannot be read, or photographs differ in size.
     """
-    if is_of_photographs(dataset) and not is_recording(dataset):
-        return in_order(open_photographs(dataset, read))
+    if is_photographs(dataset) and not is_recording(dataset):
+        return sequence_of(open_photographs(dataset, read))
     return open_sequence(dataset, read)
 
 
 def _by_numbers(name: str) -> list[tuple[int, str]]:
-    """Such that frame_2 comes before frame_10."""
+    """Sort key by which frame_2 comes before frame_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def in_order(photographs: Photographs) -> Sequence:
-    """The photographs in order of their times, or else of their names, as frames of camera 0. What masks
-    leave out counts as tool. Lengths stay in the photographs' unit.
+def sequence_of(photographs: Photographs) -> Sequence:
+    """The photographs as frames of camera 0, in order of their times or, without times, of their names.
+    Pixels that masks exclude are labelled as tool. Lengths stay in the photographs' unit.
 
     Raises:
-        DataError: they differ in size.
+        DataError: the photographs differ in size.
     """
     times, names = photographs.times, photographs.names
     if times is None:
@@ -45,15 +45,16 @@ def in_order(photographs: Photographs) -> Sequence:
     other = next((i for i in order if tuple(photographs.sizes[i]) != (width, height)), None)
     if other is not None:
         found = "{}x{} in {}".format(*photographs.sizes[other], names[other])
-        advice = "A recording is by one camera; leave out the others."
-        raise DataError(photographs.name, f"frames of {width}x{height} as the first", found, advice)
+        advice = "A recording comes from one camera; remove the photographs of other sizes."
+        raise DataError(photographs.name, f"frames of {width}x{height} like the first", found, advice)
 
     def mask(t: int, c: int) -> np.ndarray:
-        counts = photographs.mask(order[t])
-        return np.full((height, width), TISSUE) if counts is None else np.where(counts, TISSUE, TOOL)
+        valid = photographs.mask(order[t])
+        return np.full((height, width), TISSUE) if valid is None else np.where(valid, TISSUE, TOOL)
 
     seconds = np.arange(len(order)) / DEFAULT_RATE_HZ if times is None else np.asarray(times)[order]
-    masked, deep, locate = photographs.load_mask, photographs.load_depth, photographs.locate
+    has_masks, has_depth = photographs.load_mask is not None, photographs.load_depth is not None
+    locate = photographs.locate
     return Sequence(
         name=photographs.name,
         camera_ids=(0,),
@@ -64,9 +65,9 @@ def in_order(photographs: Photographs) -> Sequence:
         Ks=photographs.Ks[order][:, None],
         viewmats=photographs.viewmats[order][:, None],
         load_image=lambda t, c: photographs.image(order[t]),
-        load_mask=mask if masked else None,
-        load_depth=(lambda t, c: photographs.depth(order[t])) if deep else None,
-        label_names=LABEL_NAMES if masked else {},
+        load_mask=mask if has_masks else None,
+        load_depth=(lambda t, c: photographs.depth(order[t])) if has_depth else None,
+        label_names=LABEL_NAMES if has_masks else {},
         near=photographs.near,
         locate=locate and (lambda kind, t, c: locate(kind, order[t])),
     )

@@ -1,13 +1,13 @@
 """The Panoptic layout of Dynamic 3D Gaussians (Luiten et al. 2024), with depth, times and truth added.
 
 train_meta.json        w, h, k[t][c] 3x3, w2c[t][c] 4x4 (OpenCV axes), fn[t][c], cam_id[t][c];
-                       ours adds time[t] in seconds and depth_unit_m
+                       gsjax adds time[t] in seconds and depth_unit_m
 test_meta.json         the same for held-out cameras, optional; both are merged
-ims/CAM/FRAME.jpg      named by fn
-seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or of the first frame alone
+ims/CAM/FRAME.jpg      named in fn
+seg/CAM/FRAME.png      labels, optional, possibly for some cameras only, or only for the first frame
 depth/CAM/FRAME.png    uint16 in steps of depth_unit_m, 0 and 65535 = invalid, optional
-truth.npz, meta.json   simulated scenes: T_wo [T,K,4,4] with meta's objects (labels 2.., robot 1), or
-                       T_wp [T,K,4,4] with meta's parts (labels 1..) and joints, whose values are q [T,joints]
+truth.npz, meta.json   of simulated scenes: T_wo [T,K,4,4] of meta's objects (labels 2.., robot 1), or
+                       T_wp [T,K,4,4] of meta's parts (labels 1..) and joints, with joint values q [T,joints]
 """
 
 import re
@@ -31,19 +31,20 @@ DEFAULT_DEPTH_UNIT_M = 0.001
 _JOINTS = {"slide": "prismatic", "hinge": "revolute"}
 _JOINT_KEYS = ("axis_world", "point_world")
 META_NAMES = ("train_meta.json", "test_meta.json")
-_ADVICE_META = "Correct the file, or leave that frame or camera out of it."
+_ADVICE_META = "Correct the file, or remove that frame or camera from it."
 
 
 def read_panoptic(path: str | Path) -> Sequence:
-    """The sequence in a folder of this layout; cameras of both metas, in the order in which they stand.
+    """The sequence in a folder of this layout, with the cameras of both metas in the order in which they are
+    listed.
 
-    Without `time` the frames are 1/30 s apart; without `depth_unit_m` depth is in millimetres. Frames of
-    which no image exists are left out, with a DataWarning that counts them.
+    Without `time`, frames are 1/30 s apart; without `depth_unit_m`, depth is in millimetres. Frames without
+    any image are left out, with a DataWarning that counts them.
 
     Raises:
-        DataError: a meta is missing or disagrees with itself or with the other, an image of a frame is
-            missing while others exist, or the truth does not fit.
-        ValueError: a pose is no rigid motion, or times do not increase.
+        DataError: a meta is missing, inconsistent or in conflict with the other, only some images of a frame
+            are missing, or the truth does not match.
+        ValueError: a pose is not a rigid motion, or times do not increase.
     """
     root = Path(path)
     meta = _read_metas(root)
@@ -54,11 +55,11 @@ def read_panoptic(path: str | Path) -> Sequence:
     times = np.asarray(meta.get("time", np.arange(frames) / DEFAULT_RATE_HZ), np.float64)
     if times.shape != (frames,):
         raise DataError(
-            root / META_NAMES[0], f"{frames} numbers as time", f"shape {times.shape}", _ADVICE_META
+            root / META_NAMES[0], f"time to be {frames} numbers", f"shape {times.shape}", _ADVICE_META
         )
     unit = float(meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M))
 
-    first_alone = [_has_first_alone(root, name) for name in names[0]]
+    first_mask_only = [_has_first_mask_only(root, name) for name in names[0]]
 
     def locate(kind: str, t: int, c: int) -> str:
         return str(_FINDERS.get(kind, _image_path)(root, names[t][c]))
@@ -69,7 +70,7 @@ def read_panoptic(path: str | Path) -> Sequence:
 
     def load_mask(t: int, c: int) -> np.ndarray | None:
         name = names[t][c]
-        absent = not _has(root, "seg", name) or (first_alone[c] and name != names[0][c])
+        absent = not _has(root, "seg", name) or (first_mask_only[c] and name != names[0][c])
         return None if absent else read_mask(_mask_path(root, name), width, height)
 
     return Sequence(
@@ -90,23 +91,24 @@ def read_panoptic(path: str | Path) -> Sequence:
 
 
 def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0.0001) -> None:
-    """Saves a sequence in this layout, as one train_meta.json; images as PNG, so nothing is lost.
+    """Save a sequence in this layout, with a single train_meta.json and lossless PNG images.
 
-    Truth is saved too; its labels must be those of a tabletop: the objects 2, 3, ..., a robot 1.
+    Truth is saved too; its labels must be those of a tabletop: 2, 3, ... for objects, 1 for a robot.
 
     Args:
-        sequence: what to save; every frame of it is loaded.
-        path: a folder; it is made, and files of the same names in it are replaced.
-        depth_unit_m: metres of one step of depth; 65534 steps are the farthest that can be saved. What is
-            farther becomes invalid, with a DataWarning that counts it.
+        sequence: the sequence; all its frames are loaded.
+        path: the folder; created if missing. Existing files of the same names are overwritten.
+        depth_unit_m: metres per depth step; depth beyond 65534 steps becomes invalid, with a DataWarning that
+            counts the pixels.
 
     Raises:
-        ValueError: the truth has other labels, or a mask has labels beyond 0 to 65535.
+        ValueError: the truth has other labels, or a mask has labels outside 0 to 65535.
     """
     root = Path(path)
     truth = sequence.truth
     if truth is not None and truth.label_ids.tolist() != list(range(2, 2 + len(truth.names))):
-        raise ValueError(f"write_panoptic needs objects labelled 2, 3, ..., got {truth.label_ids.tolist()}")
+        found = truth.label_ids.tolist()
+        raise ValueError(f"write_panoptic requires objects labelled 2, 3, ..., got {found}")
     names = [[f"{cam}/{frame:06d}.png" for cam in sequence.camera_ids] for frame in sequence.frame_ids]
     too_far = 0
     for t, frame in enumerate(names):
@@ -121,12 +123,12 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
             if mask is not None:
                 if mask.min() < 0 or mask.max() > 65535:
                     found = f"{mask.min()} to {mask.max()} in frame {t}"
-                    raise ValueError(f"write_panoptic saves labels from 0 to 65535, got {found}")
+                    raise ValueError(f"write_panoptic requires labels from 0 to 65535, got {found}")
                 _write_image(root / "seg" / name, mask.astype(np.uint8 if mask.max() < 256 else np.uint16))
     if too_far:
         farthest = (SATURATED_DEPTH - 1) * depth_unit_m
-        message = f"{root}: {too_far} pixels farther than {farthest:.4g} m have lost their depth"
-        warnings.warn(f"{message}; a larger depth_unit_m keeps them", DataWarning, stacklevel=2)
+        message = f"{root}: the depth of {too_far} pixels farther than {farthest:.4g} m is lost"
+        warnings.warn(f"{message}; set a larger depth_unit_m to keep it", DataWarning, stacklevel=2)
     meta = {
         "w": sequence.width,
         "h": sequence.height,
@@ -140,11 +142,11 @@ def write_panoptic(sequence: Sequence, path: str | Path, depth_unit_m: float = 0
     if truth is not None:
         write_npz(root / "truth.npz", {"T_wo": truth.poses})
         write_json(root / "meta.json", {"objects": truth.names, "seg": "0 scene, 1 robot, 2+i objects[i]"})
-    write_json(root / META_NAMES[0], meta)  # last: a folder that has it is whole
+    write_json(root / META_NAMES[0], meta)  # last, so that a folder that has it is complete
 
 
 def _read_metas(root: Path) -> dict[str, Any]:
-    """Both metas as one: k and w2c as arrays [T,C,...], fn [T][C], cam_id [C], and each camera's file."""
+    """Both metas merged: k and w2c as arrays [T,C,...], fn [T][C], cam_id [C], and each camera's file."""
     merged = _read_meta(root / META_NAMES[0])
     extra_path = root / META_NAMES[1]
     if not extra_path.exists():
@@ -157,7 +159,8 @@ def _read_metas(root: Path) -> dict[str, Any]:
     shared = set(merged["cam_id"]) & set(extra["cam_id"])
     if shared:
         found = f"cameras {sorted(shared)} in both"
-        raise DataError(extra_path, f"other cameras than in {META_NAMES[0]}", found, "Take them out of one.")
+        expected = f"cameras other than those in {META_NAMES[0]}"
+        raise DataError(extra_path, expected, found, "Remove them from one of the two.")
     merged["fn"] = [a + b for a, b in zip(merged["fn"], extra["fn"], strict=True)]
     for key in ("cam_id", "file"):
         merged[key] = merged[key] + extra[key]
@@ -171,7 +174,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
         return _checked(path, read_json(path))
     except (TypeError, KeyError, OverflowError) as error:  # a number where a list belongs, and the like
         found = f"something else ({error})"
-        raise DataError(path, "lists and numbers as this layout has them", found, _ADVICE_META) from None
+        raise DataError(path, "the lists and numbers of this layout", found, _ADVICE_META) from None
 
 
 def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
@@ -180,10 +183,10 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
         raise DataError(path, "the keys w, h, k, w2c, fn, cam_id", f"no {', '.join(missing)}", _ADVICE_META)
     for key in ("w", "h"):
         if not isinstance(meta[key], int) or meta[key] < 1:
-            raise DataError(path, f"a whole number of pixels as {key}", repr(meta[key]), _ADVICE_META)
+            raise DataError(path, f"{key} to be a whole number of pixels", repr(meta[key]), _ADVICE_META)
     unit = meta.get("depth_unit_m", DEFAULT_DEPTH_UNIT_M)
     if not isinstance(unit, (int, float)) or not 0 < unit < np.inf:
-        raise DataError(path, "metres, more than 0, as depth_unit_m", repr(unit), _ADVICE_META)
+        raise DataError(path, "depth_unit_m to be metres above 0", repr(unit), _ADVICE_META)
     frames, cameras = len(meta["fn"]), len(meta["cam_id"][0]) if meta["cam_id"] else 0
     if frames == 0 or cameras == 0:
         raise DataError(path, "at least one frame and one camera", f"{frames} and {cameras}", _ADVICE_META)
@@ -203,7 +206,7 @@ def _checked(path: Path, meta: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_cameras(meta: dict[str, Any], present: list[int]) -> None:
-    """Raises ValueError where a camera is none, in frames that have images; the message names its file."""
+    """Raises ValueError if a camera is invalid in a frame that has images; the message names its file."""
     for c, (path, camera) in enumerate(zip(meta["file"], meta["cam_id"], strict=True)):
 
         def where(t: int, _: int, camera: int = camera) -> str:
@@ -221,23 +224,24 @@ def _stack(path: Path, key: str, values: list, side: int) -> np.ndarray:
     for t, frame in enumerate(values):
         for c, matrix in enumerate(frame):
             if np.shape(matrix) != (side, side):
-                found = f"shape {np.shape(matrix)} in frame {t}, camera number {c}"
+                found = f"shape {np.shape(matrix)} in frame {t}, camera position {c}"
                 raise DataError(path, f"{key} of shape ({side}, {side})", found, _ADVICE_META)
     return np.asarray(values, np.float64)
 
 
 def _present_frames(root: Path, names: list[list[str]]) -> list[int]:
-    """Frames whose images exist."""
+    """Indices of the frames whose images exist."""
     exists = np.array([[_image_path(root, name).exists() for name in frame] for frame in names])
     some, every = exists.any(1), exists.all(1)
     if not some.any():
         found = f"none of {exists.size}, for example no {names[0][0]}"
-        raise DataError(root / "ims", "the images that the meta names", found, "Was the folder copied whole?")
+        advice = "Was the folder copied completely?"
+        raise DataError(root / "ims", "the images listed in the meta", found, advice)
     if (some & ~every).any():
         t = int(np.argmax(some & ~every))
-        missing = [name for name, there in zip(names[t], exists[t], strict=True) if not there]
-        expected = f"an image of all {exists.shape[1]} cameras in frame {t}"
-        found = f"none of {len(missing)} of them"
+        missing = [name for name, present in zip(names[t], exists[t], strict=True) if not present]
+        expected = f"images of all {exists.shape[1]} cameras in frame {t}"
+        found = f"{len(missing)} of them missing"
         raise DataError(_image_path(root, missing[0]), expected, found, "Restore it.")
     if not every.all():
         message = f"{root}: {np.sum(~every)} of {len(every)} frames have no image and are left out"
@@ -256,7 +260,7 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
             names, poses = tuple(described[names_key]), np.asarray(arrays[key], np.float64)
             if poses.shape != (frames, len(names), 4, 4):
                 expected = f"{key} of shape {(frames, len(names), 4, 4)}: frames, {names_key} of meta.json"
-                raise DataError(path, expected, f"{poses.shape}", "Make the truth again.")
+                raise DataError(path, expected, f"{poses.shape}", "Regenerate the truth.")
             labels = np.arange(first_label, first_label + len(names))
             joints = _read_joints(path, described.get("joints", {}), arrays.get("q"), names, frames)
             truth = Truth(names=names, label_ids=labels, poses=poses, robot=robot, joints=joints)
@@ -267,12 +271,13 @@ def _read_truth(root: Path, frames: int, present: list[int]) -> Truth | None:
 def _read_joints(
     path: Path, described: Any, values: np.ndarray | None, names: tuple[str, ...], frames: int
 ) -> tuple[Joint | None, ...]:
-    """Of each part: meta.json names those that there are, and q has a column for each."""
+    """The joint of each part, None for parts without one: meta.json describes the joints, and q has a column
+    for each."""
     if not described or values is None:
         return ()
     if values.shape != (frames, len(described)):
         expected = f"q of shape {(frames, len(described))}: frames, joints of meta.json"
-        raise DataError(path, expected, f"{values.shape}", "Make the truth again.")
+        raise DataError(path, expected, f"{values.shape}", "Regenerate the truth.")
     columns = dict(zip(described, np.asarray(values, np.float64).T, strict=True))
     try:
         joints = {
@@ -281,7 +286,7 @@ def _read_joints(
         }
     except (KeyError, TypeError, ValueError) as error:
         expected = "joints with type (slide or hinge), axis_world and point_world"
-        raise DataError(path.parent / "meta.json", expected, f"{error}", "Make the truth again.") from None
+        raise DataError(path.parent / "meta.json", expected, f"{error}", "Regenerate the truth.") from None
     return tuple(joints.get(name) for name in names)
 
 
@@ -301,12 +306,12 @@ _FINDERS = {"image": _image_path, "mask": _mask_path, "depth": _depth_path}
 
 
 def _has(root: Path, kind: str, name: str) -> bool:
-    """Whether the camera of image `name` has a folder of that kind."""
+    """Whether the camera of image `name` has a folder of this kind."""
     return (root / kind / name).parent.is_dir()
 
 
-def _has_first_alone(root: Path, first: str) -> bool:
-    """Whether the camera of image `first` has its mask and no other, which is all that the tracker needs."""
+def _has_first_mask_only(root: Path, first: str) -> bool:
+    """Whether the camera of image `first` has only the mask of that image, all that the tracker needs."""
     mask = _mask_path(root, first)
     return _has(root, "seg", first) and [*mask.parent.iterdir()] == [mask]
 
@@ -320,5 +325,5 @@ def _write_image(path: Path, image: np.ndarray) -> None:
     with atomic_write(path) as temporary:
         if not cv2.imwrite(str(temporary), image):
             raise DataError(
-                path, "a place to write an image", "no way to write there", "Choose another folder."
+                path, "a writable path for an image", "one that cannot be written", "Choose another folder."
             )

@@ -1,4 +1,4 @@
-"""Posed photographs of one scene: what static readers give, and what a reconstruction is fitted to."""
+"""Posed photographs of one scene: the result of static readers and the input of a reconstruction."""
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Indices
@@ -9,23 +9,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 
 from gsjax.data.errors import DataError
-from gsjax.data.resizing import blended, expect_scale, picked
+from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_intrinsics, check_poses, check_shape
 from gsjax.geometry.cameras import NEAR, Camera
 from gsjax.scene.frame import Frame
 
-# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+# Field shapes are in the docstrings: constructors check them, with better messages than an annotation's.
 
 _POSE_ADVICE = "viewmats are world-to-camera in OpenCV axes; correct or leave out that photograph."
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Coloured points of a scene, as structure from motion leaves them.
+    """Coloured points of a scene, for example from structure from motion.
 
     Attributes:
-        points: [M,3], in the photographs' world.
+        points: [M,3], in the photographs' world frame.
         colors: RGB, 0 to 1, [M,3].
 
     Raises:
@@ -42,29 +42,29 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """N photographs by calibrated pinhole cameras, each of its own size. They are loaded when asked for and
-    never kept. Lengths are in the data's own unit, which only a sensor of depth makes metres.
+    """N photographs by calibrated pinhole cameras, each of its own size. They are loaded on demand and not
+    cached. Lengths are in the data's own unit, which is metres only if a depth sensor fixes the scale.
 
     Attributes:
-        name: what to call them.
-        names: of each photograph, as in the data.
+        name: name of the set.
+        names: name of each photograph, as in the data.
         sizes: width and height in pixels, [N,2].
         Ks: intrinsics in pixels, pixel centres at +0.5, [N,3,3] float64.
         viewmats: world to camera, OpenCV axes, [N,4,4] float64.
-        load_image: i -> RGB, [H,W,3] uint8, as a pinhole camera sees it.
-        load_mask: i -> which pixels count, [H,W] bool; or None where all do.
-        load_depth: i -> depth along the optical axis, [H,W], 0 = invalid; or None where it has none.
-        load_labels: i -> what each pixel shows, [H,W] integers; or None where nobody said.
-        label_names: of labels, where they have one.
-        times: seconds, [N], where the data has them, or None.
-        splits: "train", "val" or "test" for each, as the data has it; None where it does not say.
+        load_image: i -> RGB, [H,W,3] uint8, undistorted.
+        load_mask: i -> which pixels count, [H,W] bool; or None if all do.
+        load_depth: i -> depth along the optical axis, [H,W], 0 = invalid; or None without depth.
+        load_labels: i -> label of each pixel, [H,W] integers; or None without labels.
+        label_names: names of labels, for those that have one.
+        times: seconds, [N]; None if the data has none.
+        splits: "train", "val" or "test" for each; None if the data has no splits.
         cloud: points of the scene.
-        background: RGB, 0 to 1, of what was behind transparent photographs; None where none was transparent.
-        near: what is nearer to a camera is not to be drawn, metres.
+        background: RGB, 0 to 1, composited behind transparent photographs; None if none is transparent.
+        near: near clipping distance, in the data's unit.
         locate: (kind, i) -> path of a file, for messages; kind is "image", "mask", "labels" or "depth".
 
     Raises:
-        ValueError: shapes disagree, a pose is no rigid motion, or there is no photograph.
+        ValueError: shapes disagree, a pose is not a rigid motion, or there is no photograph.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Photographs:
 
     @property
     def num(self) -> int:
-        """N."""
+        """Number of photographs, N."""
         return len(self.names)
 
     def camera(self, i: int) -> Camera:
@@ -129,14 +129,14 @@ class Photographs:
         """RGB.
 
         Raises:
-            DataError: the file is bad, or the loader gave another shape or type.
+            DataError: the file is unreadable, or the loader returned another shape or type.
         """
         image = np.asarray(self.load_image(i))
         self._check("image", i, image, (3,), np.uint8)
         return image
 
     def mask(self, i: int) -> Bool[np.ndarray, "height width"] | None:
-        """Which pixels count; None where all do.
+        """Which pixels count; None if all do.
 
         Raises:
             DataError: as `image`.
@@ -144,7 +144,7 @@ class Photographs:
         return self._optional(self.load_mask, "mask", i, np.bool_)
 
     def depth(self, i: int) -> Float[np.ndarray, "height width"] | None:
-        """Depth along the optical axis, float32, 0 = invalid; None where it has none.
+        """Depth along the optical axis, float32, 0 = invalid; None without depth.
 
         Raises:
             DataError: as `image`.
@@ -155,7 +155,7 @@ class Photographs:
         return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
     def labels(self, i: int) -> Integer[np.ndarray, "height width"] | None:
-        """What each pixel shows, 0 the background; None where nobody said.
+        """Label of each pixel, 0 for the background; None without labels.
 
         Raises:
             DataError: as `image`.
@@ -163,7 +163,7 @@ class Photographs:
         return self._optional(self.load_labels, "labels", i, np.integer)
 
     def select(self, indices: Indices[int]) -> "Photographs":
-        """Some of them, in this order."""
+        """The photographs at these indices, in this order."""
         chosen = [int(i) for i in indices]
         locate = self.locate
         return replace(
@@ -182,13 +182,13 @@ class Photographs:
         )
 
     def scaled(self, scale: float) -> "Photographs":
-        """The same views in smaller photographs: colours are means over what a pixel covers, depths and masks
-        those in its middle.
+        """The same views downscaled: colours are averaged over the area of each new pixel; masks, depths and
+        labels are sampled at its centre.
 
         Raises:
             ValueError: `scale` is not above 0 and at most 1.
         """
-        expect_scale(scale)
+        check_scale(scale)
         if scale == 1:
             return self
         sizes = np.maximum(1, np.round(self.sizes * scale).astype(int))
@@ -201,14 +201,14 @@ class Photographs:
             self,
             sizes=sizes,
             Ks=self.Ks * factors[:, :, None],
-            load_image=blended(self.image, size),
-            load_mask=picked(self.load_mask and self.mask, size),
-            load_depth=picked(self.load_depth and self.depth, size),
-            load_labels=picked(self.load_labels and self.labels, size),
+            load_image=area_resized(self.image, size),
+            load_mask=nearest_resized(self.load_mask and self.mask, size),
+            load_depth=nearest_resized(self.load_depth and self.depth, size),
+            load_labels=nearest_resized(self.load_labels and self.labels, size),
         )
 
     def where(self, kind: str, i: int) -> str:
-        """What errors call the image, mask or depth of a photograph: its path, if it has one."""
+        """Name of a photograph's image, mask, labels or depth in messages: its path, if it has one."""
         return f"{self.name}, {kind} {self.names[i]}" if self.locate is None else self.locate(kind, i)
 
     def _optional(self, loader: Callable | None, kind: str, i: int, dtype: type) -> np.ndarray | None:
@@ -220,8 +220,8 @@ class Photographs:
     def _check(self, kind: str, i: int, array: np.ndarray, channels: tuple[int, ...], dtype: type) -> None:
         width, height = (int(size) for size in self.sizes[i])
         if array.shape != (height, width, *channels) or not np.issubdtype(array.dtype, dtype):
-            words = {np.floating: "floats", np.integer: "integers"}.get(dtype) or np.dtype(dtype).name
-            expected = f"shape {(height, width, *channels)} of {words}"
+            type_name = {np.floating: "floats", np.integer: "integers"}.get(dtype) or np.dtype(dtype).name
+            expected = f"shape {(height, width, *channels)} of {type_name}"
             found = f"shape {array.shape} of {array.dtype}"
             raise DataError(self.where(kind, i), expected, found, "Correct the file or its loader.")
 
@@ -229,19 +229,19 @@ class Photographs:
 def photographs_of(sequence: Sequence) -> Photographs:
     """All frames of all cameras of a recording as photographs, frame by frame."""
     frames, cameras = sequence.num_frames, sequence.num_cameras
-    places = [(t, c) for t in range(frames) for c in range(cameras)]
-    names = (f"{sequence.camera_ids[c]}/{sequence.frame_ids[t]}" for t, c in places)
+    views = [(t, c) for t in range(frames) for c in range(cameras)]
+    names = (f"{sequence.camera_ids[c]}/{sequence.frame_ids[t]}" for t, c in views)
     return Photographs(
         name=sequence.name,
         names=tuple(names),
-        sizes=np.tile([sequence.width, sequence.height], (len(places), 1)),
+        sizes=np.tile([sequence.width, sequence.height], (len(views), 1)),
         Ks=sequence.Ks.reshape(-1, 3, 3),
         viewmats=sequence.viewmats.reshape(-1, 4, 4),
-        load_image=lambda i: sequence.image(*places[i]),
-        load_depth=(lambda i: sequence.depth(*places[i])) if sequence.has_depth else None,
-        load_labels=(lambda i: sequence.mask(*places[i])) if sequence.has_masks else None,
+        load_image=lambda i: sequence.image(*views[i]),
+        load_depth=(lambda i: sequence.depth(*views[i])) if sequence.has_depth else None,
+        load_labels=(lambda i: sequence.mask(*views[i])) if sequence.has_masks else None,
         label_names=sequence.names_of_labels,
         times=np.repeat(sequence.times, cameras) if frames > 1 else None,
         near=sequence.near,
-        locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *places[i]),
+        locate=lambda kind, i: sequence.where("mask" if kind == "labels" else kind, *views[i]),
     )

@@ -1,8 +1,8 @@
-"""poses_bounds.npy (LLFF, Mildenhall et al. 2019), as DyNeRF's and EndoNeRF's recordings have it too.
+"""poses_bounds.npy (LLFF, Mildenhall et al. 2019), also used by DyNeRF and EndoNeRF.
 
-[N,17], a row a camera: 3x5 [R | t | (height, width, focal length)] by rows, and the nearest and farthest
-depth. R and t are camera to world. The name does not tell how R's columns are meant: LLFF and DyNeRF write
-[down, right, back], EndoNeRF [right, up, back]. So the caller says which.
+[N,17], one row per camera: 3x5 [R | t | (height, width, focal length)] in row-major order, and the nearest
+and farthest depth. R and t are camera to world. The file does not state the meaning of R's columns: LLFF and
+DyNeRF write [down, right, back], EndoNeRF [right, up, back]. So the caller has to choose.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from gsjax.data.errors import DataError
 from gsjax.data.files import picture_size, read_arrays, read_image
 from gsjax.data.frame_folders import pictures
-from gsjax.data.lens import shrunk
+from gsjax.data.lens import scaled_intrinsics
 from gsjax.data.photographs import Photographs
 from gsjax.data.sequence import Sequence
 from gsjax.data.validation import check_poses
@@ -23,7 +23,7 @@ from gsjax.geometry.cameras import intrinsics
 
 Axes = Literal["llff", "endonerf"]
 NAMES = ("poses_bounds.npy", "pose_bounds.npy")
-"""What the file is called; some releases leave out an s."""
+"""Names of the file; some releases leave out an s."""
 
 # Columns of R that are right, down and forward, up to sign.
 _TO_OPENCV = {
@@ -33,24 +33,24 @@ _TO_OPENCV = {
 
 
 def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photographs:
-    """Photographs, a row of poses_bounds.npy each, in order of their names.
+    """Photographs sorted by name, one per row of poses_bounds.npy.
 
     Args:
         path: the folder.
-        axes: what the columns of R are: "llff" down, right, back; "endonerf" right, up, back.
-        images: the photographs' folder in it; smaller ones than the file says are taken as they are.
+        axes: meaning of the columns of R: "llff" down, right, back; "endonerf" right, up, back.
+        images: name of the photographs' folder in it; the photographs may be downscaled copies.
 
     Raises:
-        DataError: a file is missing or has another form, or there are more or fewer photographs than rows.
-        ValueError: `axes` is neither, or a pose is no rigid motion.
+        DataError: a file is missing or malformed, or the number of photographs and rows differ.
+        ValueError: `axes` is invalid, or a pose is not a rigid motion.
     """
     root = Path(path)
     file, viewmats, sizes, focals = _read_rows(root, axes)
     folder = root / images
     paths = pictures(folder)
     if len(paths) != len(viewmats):
-        expected, found = f"{len(viewmats)} photographs in {folder}, one a row", f"{len(paths)}"
-        raise DataError(file, expected, found, "Name their folder, or fetch them again.")
+        expected, found = f"{len(viewmats)} photographs in {folder}, one per row", f"{len(paths)}"
+        raise DataError(file, expected, found, "Give the name of their folder, or fetch them again.")
     actual = np.array([picture_size(photograph) for photograph in paths])
     return Photographs(
         name=root.resolve().name,
@@ -64,20 +64,20 @@ def read_llff(path: str | Path, axes: Axes, images: str = "images") -> Photograp
 
 
 def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
-    """The cameras of a DyNeRF scene (Li et al. 2022): cam00.mp4, cam01.mp4, ..., each a row of poses.
+    """A DyNeRF scene (Li et al. 2022): cam00.mp4, cam01.mp4, ..., one per row of poses.
 
-    The shortest video says how many frames there are.
+    The sequence is as long as the shortest video.
 
     Raises:
-        DataError: as `read_llff`, or videos differ in size.
+        DataError: as `read_llff`, or the videos differ in size.
     """
     root = Path(path)
     file, viewmats, sizes, focals = _read_rows(root, axes)
     paths = sorted(root.glob("cam*.mp4"))
     if len(paths) != len(viewmats):
-        expected, found = f"{len(viewmats)} videos cam*.mp4, one a row", f"{len(paths)}"
+        expected, found = f"{len(viewmats)} videos cam*.mp4, one per row", f"{len(paths)}"
         raise DataError(
-            file, expected, found, "Was the folder copied whole? Remove the rows of what is not there."
+            file, expected, found, "Was the folder copied completely? Remove the rows of missing videos."
         )
     described = [describe_video(video) for video in paths]
     shapes = [(video.width, video.height) for video in described]
@@ -87,7 +87,7 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
             f"{shapes[0][0]}x{shapes[0][1]} as in {paths[0].name}",
             f"{shapes[odd][0]}x{shapes[odd][1]}",
         )
-        raise DataError(paths[odd], expected, found, "Bring all videos to one size.")
+        raise DataError(paths[odd], expected, found, "Resize all videos to one size.")
     frames = min(video.frames for video in described)
     videos = [Video(p, *shapes[0], video.frames) for p, video in zip(paths, described, strict=True)]
     Ks = _intrinsics(paths, focals, sizes, np.array(shapes))
@@ -108,15 +108,15 @@ def read_dynerf(path: str | Path, axes: Axes = "llff") -> Sequence:
 
 
 def find(root: Path) -> Path | None:
-    """The file of poses in a folder, or None."""
+    """The pose file in a folder, or None."""
     return next((root / name for name in NAMES if (root / name).is_file()), None)
 
 
 def _read_rows(root: Path, axes: str) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray]:
-    """The file, and of each row the view matrix, (width, height) and the focal length."""
+    """The file, and the view matrix, (width, height) and focal length of each row."""
     if axes not in _TO_OPENCV:
         raise ValueError(
-            "axes must say how the columns of poses_bounds.npy are meant: 'llff' (down, right, back; "
+            "axes must be the meaning of the columns of poses_bounds.npy: 'llff' (down, right, back; "
             f"DyNeRF too) or 'endonerf' (right, up, back); got {axes!r}"
         )
     file = find(root)
@@ -125,7 +125,7 @@ def _read_rows(root: Path, axes: str) -> tuple[Path, np.ndarray, np.ndarray, np.
     rows = read_arrays(file).get("")
     if rows is None or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "fiu":
         found = "several arrays" if rows is None else f"shape {rows.shape} of {rows.dtype}"
-        raise DataError(file, "one array [N,17] of numbers", found, "Is it of LLFF's form?")
+        raise DataError(file, "one array [N,17] of numbers", found, "Is it an LLFF file?")
     if not np.isfinite(rows).all():
         row = int(np.argmax(~np.isfinite(rows).all(-1)))
         raise DataError(
@@ -139,22 +139,22 @@ def _read_rows(root: Path, axes: str) -> tuple[Path, np.ndarray, np.ndarray, np.
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = matrices[:, :, :3] @ _TO_OPENCV[axes]
     poses[:, :3, 3] = matrices[:, :, 3]
-    check_poses("pose", poses[:, None], lambda row, _: f"row {row} of {file}", "Is axes the right one?")
+    check_poses("pose", poses[:, None], lambda row, _: f"row {row} of {file}", "Is axes set correctly?")
     return file, np.linalg.inv(poses), matrices[:, 1::-1, 4], matrices[:, 2, 4]
 
 
 def _intrinsics(
     paths: list[Path],
     focals: Float[np.ndarray, "n"],
-    said: Float[np.ndarray, "n 2"],
+    stated: Float[np.ndarray, "n 2"],
     actual: Int[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n 3 3"]:
-    """K of pictures that may be smaller than the file says, the principal point in the middle."""
-    centers = (said / 2).tolist()
-    columns = (focals.tolist(), centers, said.tolist(), actual.tolist())
+    """K of pictures that may be smaller than the file states, with the principal point at the centre."""
+    centers = (stated / 2).tolist()
+    columns = (focals.tolist(), centers, stated.tolist(), actual.tolist())
     return np.stack(
         [
-            shrunk(intrinsics(focal, 0, 0, tuple(center)), tuple(size), tuple(now), path)
+            scaled_intrinsics(intrinsics(focal, 0, 0, tuple(center)), tuple(size), tuple(now), path)
             for path, focal, center, size, now in zip(paths, *columns, strict=True)
         ]
     )

@@ -1,8 +1,8 @@
 """The push-T recordings of Embodied Gaussians (Abou-Chakra et al. 2025): three videos, calibrated, no depth.
 
-sample_demos/DEMO/cameras.json          a serial number each: X_WC, camera to world in OpenGL axes
+sample_demos/DEMO/cameras.json          by serial number: X_WC, camera to world in OpenGL axes
 sample_demos/DEMO/videos/SERIAL.json    K (pixel centres at integers), resolution, timestamps in seconds
-sample_demos/DEMO/videos/SERIAL.mp4     its frame rate is wrong; the timestamps count
+sample_demos/DEMO/videos/SERIAL.mp4     its frame rate is wrong; only the timestamps are used
 environment/ground.npy                  points of the ground [N,3], world
 environment/ground_plane.json           its plane (n, d), n.x + d = 0
 objects/tblock.json                     the T-block as Gaussians in its own frame
@@ -24,7 +24,7 @@ from gsjax.geometry.cameras import viewmat_from_opengl
 from gsjax.geometry.neighbors import neighbor_spacing
 
 MAX_SKEW_S = 0.03
-"""How far apart in time the images of one frame may be: an object at 1 m/s would move by 3 cm."""
+"""Largest time between the images of a frame: an object at 1 m/s moves by 3 cm."""
 
 GROUND_COLOR = 0.5
 GROUND_THICKNESS_M = 0.001
@@ -35,17 +35,17 @@ _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S) -> Sequence:
-    """Demonstration `demo` of a push-T folder. Cameras count from 0 in the order of cameras.json.
+    """Demonstration `demo` of a push-T folder. Cameras are numbered from 0 in the order of cameras.json.
 
-    The frames are those of the first camera; each other camera gives its image nearest in time. A frame of
-    which a camera has no image within `max_skew` seconds is left out, with a DataWarning that counts them.
-    Times are the recording's own, in seconds. `models` holds the ground (static) and the T-block (whose pose
-    is unknown).
+    The frames are those of the first camera, paired with the image of every other camera nearest in time.
+    Frames for which a camera has no image within `max_skew` seconds are left out, with a DataWarning that
+    counts them. Times are the recording's own, in seconds. `models` holds the ground (static) and the T-block
+    (of unknown pose).
 
     Raises:
-        DataError: a file is missing or bad, a video has another number of frames than timestamps, timestamps
-            do not increase, or no frame has an image of every camera within `max_skew`.
-        ValueError: a pose is no rigid motion.
+        DataError: a file is missing or unreadable, the numbers of frames and timestamps of a video differ,
+            timestamps do not increase, or no frame has an image of every camera within `max_skew`.
+        ValueError: a pose is not a rigid motion.
     """
     root = Path(path)
     folder = root / "sample_demos" / str(demo)
@@ -62,8 +62,8 @@ def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S
         videos.append(Video(record.with_suffix(".mp4"), *_get(record, meta, "resolution"), len(stamps[-1])))
         if (videos[-1].width, videos[-1].height) != (videos[0].width, videos[0].height):
             found = f"{videos[-1].width}x{videos[-1].height}"
-            expected = f"{videos[0].width}x{videos[0].height} as in the first camera"
-            raise DataError(record, expected, found, "Bring all videos to one size, and K with them.")
+            expected = f"{videos[0].width}x{videos[0].height} as for the first camera"
+            raise DataError(record, expected, found, "Resize all videos to one size, and scale K with them.")
     clocks = {video.path.name: own for video, own in zip(videos, stamps, strict=True)}
     pairs = associate(folder / "videos", clocks, max_skew)
     frames = len(pairs)
@@ -83,7 +83,7 @@ def read_push_t(path: str | Path, demo: int = 0, *, max_skew: float = MAX_SKEW_S
 
 
 def _read_models(root: Path) -> tuple[PointModel, ...]:
-    """Ground and block, as far as their files are there."""
+    """The ground and the block, if their files exist."""
     ground, plane_path = root / "environment" / "ground.npy", root / "environment" / "ground_plane.json"
     block = root / "objects" / "tblock.json"
     plane = (
@@ -98,15 +98,15 @@ def _read_models(root: Path) -> tuple[PointModel, ...]:
 
 
 def _ground_model(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> PointModel:
-    """Grey discs in the plane, as wide as the points are apart."""
+    """Grey discs in the plane, as wide as the spacing of the points."""
     spacing = neighbor_spacing(points)
     scales = np.stack([spacing, spacing, np.full_like(spacing, GROUND_THICKNESS_M)], axis=1)
     count = len(points)
-    turn, _ = Rotation.align_vectors(plane[None, :3], [[0.0, 0.0, 1.0]])
+    to_plane, _ = Rotation.align_vectors(plane[None, :3], [[0.0, 0.0, 1.0]])
     return PointModel(
         name="ground",
         means=points,
-        quats=np.tile(turn.as_quat(scalar_first=True), (count, 1)),
+        quats=np.tile(to_plane.as_quat(scalar_first=True), (count, 1)),
         scales=scales,
         opacities=np.full(count, 0.9),
         colors=np.full((count, 3), GROUND_COLOR),
@@ -116,10 +116,10 @@ def _ground_model(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"
 
 
 def _block_model(path: Path, plane: Float[np.ndarray, "4"] | None) -> PointModel:
-    """The T-block. The file's X_WB is not its pose in the recordings, so it has none.
+    """The T-block, without a pose: the file's X_WB is not its pose in the recordings.
 
-    The file's colours are in the order blue, green, red: their mean (0.29, 0.49, 0.87) is a sky blue, while
-    the block in the videos is orange.
+    The file's colours are in the order blue, green, red: read as RGB, their mean (0.29, 0.49, 0.87) would be
+    sky blue, while the block in the videos is orange.
     """
     gaussians = _get(path, read_json(path), "gaussians")
     fields = {

@@ -1,4 +1,4 @@
-"""The one sequence type that every reader gives and every method takes."""
+"""The one sequence type that every reader returns and every method takes."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -11,25 +11,25 @@ from jaxtyping import Float, Int, UInt8
 
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.objects import PointModel, Truth
-from gsjax.data.resizing import blended, expect_scale, picked
+from gsjax.data.resizing import area_resized, check_scale, nearest_resized
 from gsjax.data.validation import check_depth, check_intrinsics, check_poses, check_shape, check_times
 from gsjax.geometry.cameras import NEAR, Camera
 from gsjax.scene.frame import Frame
 
-# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+# Field shapes are in the docstrings: constructors check them, with better messages than an annotation's.
 
 _POSE_ADVICE = "viewmats are world-to-camera in OpenCV axes; correct or leave out that pose."
 
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """Calibrated cameras that saw a scene over time. Frames are loaded when asked for and never kept.
+    """A scene recorded by calibrated cameras over time. Frames are loaded on demand and not cached.
 
     `t` and `c` count frames and cameras of this sequence from 0; `frame_ids` and `camera_ids` are the data's
-    own numbers for them. Several cameras of one frame are taken as simultaneous.
+    own numbers for them. The cameras of one frame are treated as simultaneous.
 
     Attributes:
-        name: what to call it.
+        name: name of the sequence.
         camera_ids: the data's own camera numbers, C of them.
         width: pixels, of every camera.
         height: pixels.
@@ -40,17 +40,18 @@ class Sequence:
         load_image: (t, c) -> RGB, [H,W,3] uint8; or floats in 0..1 if `float_images`.
         load_depth: (t, c) -> metres, [H,W], 0 = invalid; or None for a camera without depth.
         load_mask: (t, c) -> labels, [H,W] integers; or None for a camera without masks.
-        load_flow: (t, u, c) -> pixels [H,W,2] that each pixel of frame t moves until frame u; NaN = unknown.
-        truth: what is known of the objects, for scoring.
-        models: shapes known beforehand.
-        label_names: of mask values whose names are known; `truth` and `models` name theirs.
-        float_images: `load_image` gives floats. Its pixels that are not finite are reported, turn black, and
-            count as invalid in `depth`.
-        near: what is nearer to a camera is not to be drawn, metres.
+        load_flow: (t, u, c) -> displacement in pixels [H,W,2] of each pixel of frame t until frame u; NaN =
+            unknown.
+        truth: ground truth of the objects, for scoring.
+        models: objects of known shape.
+        label_names: names of mask values, besides those that `truth` and `models` name.
+        float_images: `load_image` returns floats. Pixels that are not finite are reported, become black, and
+            are invalid in `depth`.
+        near: near clipping distance, metres.
         locate: (kind, t, c) -> path of a file, for messages; kind is "image", "depth", "mask" or "flow".
 
     Raises:
-        ValueError: shapes disagree, a pose is no rigid motion, or times do not increase.
+        ValueError: shapes disagree, a pose is not a rigid motion, or times do not increase.
     """
 
     name: str
@@ -92,12 +93,12 @@ class Sequence:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(self.times)
 
     @property
     def num_cameras(self) -> int:
-        """C."""
+        """Number of cameras, C."""
         return len(self.camera_ids)
 
     @property
@@ -117,7 +118,7 @@ class Sequence:
 
     @property
     def names_of_labels(self) -> dict[int, str]:
-        """The name of each mask value that has one: the data's own, a model's, the truth's."""
+        """Names of mask values: from the data, the models and the truth."""
         names = dict(self.label_names) | {m.label: m.name for m in self.models if m.label}
         if self.truth is not None:
             labels = (int(label) for label in self.truth.label_ids)
@@ -126,22 +127,22 @@ class Sequence:
         return names
 
     def camera(self, t: int, c: int) -> Camera:
-        """Camera `c` as it stood in frame `t`, in JAX's default float type."""
+        """Camera `c` in frame `t`, in JAX's default float type."""
         dtype = jnp.result_type(float)
         viewmat, K = jnp.asarray(self.viewmats[t, c], dtype), jnp.asarray(self.Ks[t, c], dtype)
         return Camera(viewmat, K, self.width, self.height, self.near)
 
     def image(self, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
-        """RGB. Warns with DataWarning where float pixels are not finite or the whole image is one colour.
+        """RGB. Warns with DataWarning if float pixels are not finite or the whole image is one colour.
 
         Raises:
-            DataError: the file is bad, or the loader gave another shape or type.
+            DataError: the file is unreadable, or the loader returned another shape or type.
         """
         image, what = self._raw_image(t, c), self.where("image", t, c)
         if self.float_images:
             finite = np.isfinite(image).all(-1)
             if not finite.all():
-                message = f"{what}: {np.sum(~finite)} pixels are not finite; they are black and have no depth"
+                message = f"{what}: {np.sum(~finite)} pixels are not finite; they become black without depth"
                 warnings.warn(message, DataWarning, stacklevel=2)
             clean = np.where(finite[..., None], image, 0)
             image = np.round(np.clip(clean, 0, 1) * 255).astype(np.uint8)
@@ -150,12 +151,13 @@ class Sequence:
         return image
 
     def depth(self, t: int, c: int) -> Float[np.ndarray, "height width"] | None:
-        """Depth along the optical axis, metres, float32, 0 = invalid; None where this camera has none.
+        """Depth along the optical axis, metres, float32, 0 = invalid; None if this camera has none.
 
-        Warns with DataWarning where no pixel is valid.
+        Warns with DataWarning if no pixel is valid.
 
         Raises:
-            DataError: the file is bad, the loader gave another shape or type, or the unit is wrong.
+            DataError: the file is unreadable, the loader returned another shape or type, or the unit is
+                wrong.
         """
         depth, what = self._load(self.load_depth, "depth", t, c), self.where("depth", t, c)
         if depth is None:
@@ -166,10 +168,10 @@ class Sequence:
         return check_depth(depth, what)
 
     def mask(self, t: int, c: int) -> Int[np.ndarray, "height width"] | None:
-        """Labels, int32; None where this camera has none.
+        """Labels, int32; None if this camera has none.
 
         Raises:
-            DataError: the file is bad, or the loader gave another shape or type.
+            DataError: the file is unreadable, or the loader returned another shape or type.
         """
         mask = self._load(self.load_mask, "mask", t, c)
         if mask is None:
@@ -178,7 +180,7 @@ class Sequence:
         return mask.astype(np.int32)
 
     def frame(self, t: int) -> Frame:
-        """All cameras of frame `t` as arrays on the device; cameras without depth have depth 0 everywhere.
+        """All cameras of frame `t` as device arrays; cameras without depth have depth 0 everywhere.
 
         Raises:
             DataError: as `image` and `depth`.
@@ -188,19 +190,19 @@ class Sequence:
         images = np.stack([self.image(t, c) for c in cameras])
         depths = None
         if self.has_depth:
-            nothing = np.zeros((self.height, self.width), np.float32)
+            invalid = np.zeros((self.height, self.width), np.float32)
             loaded = [self.depth(t, c) for c in cameras]
-            depths = jnp.asarray(np.stack([nothing if d is None else d for d in loaded]), dtype)
+            depths = jnp.asarray(np.stack([invalid if d is None else d for d in loaded]), dtype)
         viewmats, Ks = jnp.asarray(self.viewmats[t], dtype), jnp.asarray(self.Ks[t], dtype)
         camera = Camera(viewmats, Ks, self.width, self.height, self.near)
         return Frame(jnp.asarray(images, dtype) / 255, depths, camera)
 
     def flow(self, t: int, c: int) -> Float[np.ndarray, "height width 2"] | None:
-        """Pixels (x, y) that each pixel of frame `t` moves until t + 1; NaN = unknown; None without flow.
+        """Displacement (x, y) of each pixel from frame `t` to t + 1, pixels; NaN = unknown, None = no flow.
 
         Raises:
             IndexError: `t` is the last frame.
-            DataError: the loader gave another shape or type.
+            DataError: the loader returned another shape or type.
         """
         if self.load_flow is None:
             return None
@@ -213,10 +215,10 @@ class Sequence:
     def select(
         self, frames: slice | Indices[int] = slice(None), cameras: Indices[int] | None = None
     ) -> "Sequence":
-        """The sequence of some frames (positions from 0) and some cameras (their camera_ids; None = all).
+        """The sequence of some frames (positions from 0) and some cameras (by camera id; None = all).
 
         Raises:
-            ValueError: a camera or a frame is not there, none is left, or frames do not increase.
+            ValueError: a camera or frame does not exist, none is left, or frames do not increase.
         """
         chosen = np.arange(self.num_frames)[frames] if isinstance(frames, slice) else np.asarray(frames, int)
         outside = [int(t) for t in chosen if not 0 <= t < self.num_frames]
@@ -246,13 +248,13 @@ class Sequence:
         )
 
     def scaled(self, scale: float) -> "Sequence":
-        """The same views in smaller pictures: colours are means over what a pixel covers, depths, labels and
-        flow those in its middle.
+        """The same views downscaled: colours are averaged over the area of each new pixel; depths, labels and
+        flow are sampled at its centre.
 
         Raises:
             ValueError: `scale` is not above 0 and at most 1.
         """
-        expect_scale(scale)
+        check_scale(scale)
         if scale == 1:
             return self
         width, height = (max(1, round(side * scale)) for side in (self.width, self.height))
@@ -261,23 +263,23 @@ class Sequence:
         def size(*_: int) -> tuple[int, int]:
             return width, height
 
-        flow = picked(self.load_flow, size)
+        flow = nearest_resized(self.load_flow, size)
         return replace(
             self,
             width=width,
             height=height,
             Ks=self.Ks * factors[:, None],
-            load_image=blended(self.image, size),
-            load_depth=picked(self.load_depth and self.depth, size),
-            load_mask=picked(self.load_mask and self.mask, size),
-            load_flow=flow and (lambda *which: _times(flow(*which), factors[:2])),
-            float_images=False,  # `image` has made bytes of them, and `depth` knows which were not finite
+            load_image=area_resized(self.image, size),
+            load_depth=nearest_resized(self.load_depth and self.depth, size),
+            load_mask=nearest_resized(self.load_mask and self.mask, size),
+            load_flow=flow and (lambda *indices: _times(flow(*indices), factors[:2])),
+            float_images=False,  # `image` has converted them to bytes; `depth` has masked non-finite pixels
         )
 
     def _raw_image(self, t: int, c: int) -> np.ndarray:
         image = self._load(self.load_image, "image", t, c)
-        kind, words = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
-        _check_array(self.where("image", t, c), image, (self.height, self.width, 3), kind, words)
+        kind, type_name = (np.floating, "floats in 0..1") if self.float_images else (np.uint8, "uint8 RGB")
+        _check_array(self.where("image", t, c), image, (self.height, self.width, 3), kind, type_name)
         return image
 
     def _load(self, loader: Callable | None, kind: str, t: int, c: int) -> np.ndarray | None:
@@ -289,14 +291,14 @@ class Sequence:
         if not (0 <= t < self.num_frames and 0 <= c < self.num_cameras):
             raise IndexError(
                 f"{self.name} has {self.num_frames} frames and {self.num_cameras} cameras, counted from 0; "
-                f"asked for frame {t}, camera {c}"
+                f"got frame {t}, camera {c}"
             )
 
     def _camera_in_frame(self, t: int, c: int) -> str:
         return f"camera {self.camera_ids[c]} in frame {self.frame_ids[t]}"
 
     def where(self, kind: str, t: int, c: int) -> str:
-        """What errors call the image, depth or mask of camera `c` in frame `t`: its path, if it has one.
+        """Name of the image, depth or mask of camera `c` in frame `t` in messages: its path, if it has one.
 
         Args:
             kind: "image", "depth", "mask" or "flow".
@@ -308,11 +310,11 @@ class Sequence:
 
 
 def _check_array(
-    what: str, array: np.ndarray | None, shape: tuple[int, ...], dtype: type, words: str
+    what: str, array: np.ndarray | None, shape: tuple[int, ...], dtype: type, type_name: str
 ) -> None:
     if array is None or array.shape != shape or not np.issubdtype(array.dtype, dtype):
         found = "nothing" if array is None else f"shape {array.shape} of {array.dtype}"
-        raise DataError(what, f"shape {shape} of {words}", found, "Correct the file or its loader.")
+        raise DataError(what, f"shape {shape} of {type_name}", found, "Correct the file or its loader.")
 
 
 def _reindex(loader: Callable | None, frames: list[int], cameras: list[int]) -> Callable | None:

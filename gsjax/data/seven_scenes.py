@@ -1,14 +1,14 @@
-"""7-Scenes (Shotton et al. 2013): one moving Kinect with depth, poses by KinectFusion.
+"""7-Scenes (Shotton et al. 2013): one moving Kinect with depth and poses from KinectFusion.
 
 frame-NUMBER.color.png     640x480, or .jpg
 frame-NUMBER.depth.png     uint16 millimetres, 0 and 65535 = invalid
 frame-NUMBER.pose.txt      4x4, camera to world, OpenCV axes, of the depth camera
-camera-intrinsics.txt      3x3, in some copies: the depth camera's
+camera-intrinsics.txt      3x3, in some copies: intrinsics of the depth camera
 
-The two cameras are not registered: a pixel of colour and the same pixel of depth show different things, up
-to 40 pixels apart. The release gives intrinsics for the depth camera alone (585 pixels, in the middle of the
-image). The colour camera's here are what the Kinect's maker set: 525 pixels, in the middle, and 25 mm beside
-the depth camera. Depth edges of the kitchen then lie on edges of colour, to a pixel or two.
+The two cameras are not registered: the same point appears up to 40 pixels apart in colour and depth. The
+release has intrinsics for the depth camera only (focal length 585 pixels, centred principal point). For the
+colour camera the Kinect's factory values are used here: 525 pixels, centred, and 25 mm beside the depth
+camera. With them, depth edges of the kitchen coincide with colour edges to within a pixel or two.
 """
 
 import re
@@ -28,7 +28,7 @@ RATE_HZ = 30.0
 WIDTH, HEIGHT = 640, 480
 DEPTH_FOCAL, COLOR_FOCAL = 585.0, 525.0
 BASELINE_M = 0.025
-"""How far the colour camera stands to the right of the depth camera."""
+"""Distance of the colour camera to the right of the depth camera."""
 
 _DEPTH_UNIT_M = 0.001
 _MICROSOFT_NAN = re.compile(r"-?\d\.#(?:IND|QNAN|SNAN|INF)\w*(?:[+-]\d+)?")
@@ -36,21 +36,22 @@ _FRAME = re.compile(r"frame-(\d+)\.pose\.txt")
 
 
 def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
-    """The sequence in a folder of this layout (a seq-01 of a scene): one camera, 0, at 30 Hz by frame number.
+    """The sequence in a folder of this layout (such as seq-01 of a scene): one camera, 0; times are frame
+    numbers at 30 Hz.
 
     Frames whose pose is not finite (tracking was lost) or whose images are missing are left out, with a
     DataWarning that counts them.
 
     Args:
         path: the folder that holds frame-000000.pose.txt.
-        register: give the colour camera, with depth as it would see it: carried over point by point, nearer
-            before farther, and invalid where the depth camera saw nothing. False gives the depth camera with
-            the files as they are, for those who want depth alone or have registered colour themselves.
+        register: return the colour camera with depth warped into its view: reprojected point by point with a
+            z-buffer, and invalid where the depth camera has no data. False returns the depth camera with the
+            files unchanged, for use with depth alone or with colour that is already registered.
 
     Raises:
-        DataError: the folder has no frame or holds several sequences, a pose has another form, or the
-            intrinsics in it are of another camera.
-        ValueError: a pose is no rigid motion.
+        DataError: the folder has no frame or holds several sequences, a pose is malformed, or its intrinsics
+            belong to another camera.
+        ValueError: a pose is not a rigid motion.
     """
     root = Path(path)
     _check_intrinsics(root / "camera-intrinsics.txt")
@@ -61,7 +62,7 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
 
     def load_depth(t: int, c: int) -> Float[np.ndarray, "height width"]:
         depth = read_depth(depths[t], _DEPTH_UNIT_M, WIDTH, HEIGHT)
-        return _seen_by_color(depth) if register else depth
+        return _warped_to_color(depth) if register else depth
 
     files = {"image": images, "depth": depths}
     K = intrinsics(COLOR_FOCAL if register else DEPTH_FOCAL, WIDTH, HEIGHT)
@@ -81,14 +82,14 @@ def read_seven_scenes(path: str | Path, *, register: bool = True) -> Sequence:
 
 
 def _name(root: Path) -> str:
-    """The folder's, and that of the scene where the folder is one of its sequences."""
+    """The folder's name, preceded by that of the scene if the folder is one of its sequences."""
     return f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
 
 
-def _seen_by_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Depth of the depth camera as the colour camera sees it; 0 where no point falls.
+def _warped_to_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Depth of the depth camera warped into the colour camera's view; 0 where no point falls.
 
-    The colour camera's pixels are wider, so a surface that faces it has no holes.
+    The colour camera's pixels are wider, so surfaces that face it have no holes.
     """
     rows, columns = np.nonzero(depth)
     z = depth[rows, columns]
@@ -103,12 +104,12 @@ def _seen_by_color(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray
 
 
 def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], list[Path], list[Path]]:
-    """Numbers, camera-to-world poses, colour and depth files of the usable frames, in order of number."""
+    """Numbers, camera-to-world poses, colour and depth files of the usable frames, sorted by number."""
     names = [match for file in root.iterdir() if (match := _FRAME.fullmatch(file.name))]
     if not names:
         parts = sorted(part.name for part in root.glob("seq-*"))
         found = f"the sequences {', '.join(parts)}" if parts else "no frame-NUMBER.pose.txt"
-        advice = f"Give one of them, as in {root / parts[0]}, unpacked." if parts else "Give its folder."
+        advice = f"Give one of them, such as {root / parts[0]}, unpacked." if parts else "Give its folder."
         raise DataError(root, "the frames of one sequence", found, advice)
     numbers, poses, images, depths = [], [], [], []
     lost: list[str] = []
@@ -126,17 +127,18 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
             poses.append(pose)
             images.append(image)
             depths.append(depth)
-    said = [
+    left_out = [
         f"{len(stems)} {what} ({', '.join(stems[:3])}{', ...' if len(stems) > 3 else ''})"
         for stems, what in ((lost, "without a finite pose"), (missing, "without an image"))
         if stems
     ]
     if not numbers:
-        found = f"none of {len(names)}: {', '.join(said)}"
-        advice = "Check the folder; was it copied whole?"
+        found = f"none of {len(names)}: {', '.join(left_out)}"
+        advice = "Check the folder; was it copied completely?"
         raise DataError(root, "a frame with pose, colour and depth", found, advice)
-    if said:
-        message = f"{root}: {len(lost) + len(missing)} of {len(names)} frames are left out, {', '.join(said)}"
+    if left_out:
+        count = len(lost) + len(missing)
+        message = f"{root}: {count} of {len(names)} frames are left out: {', '.join(left_out)}"
         warnings.warn(message, DataWarning, stacklevel=3)
     to_world, advice = np.stack(poses), "Poses are camera to world; correct that frame, or remove it."
     files = [root / f"frame-{number:06d}.pose.txt" for number in numbers]
@@ -145,7 +147,7 @@ def _read_frames(root: Path) -> tuple[list[int], Float[np.ndarray, "t 4 4"], lis
 
 
 def _read_matrix(path: Path, side: int) -> Float[np.ndarray, "side side"]:
-    """A square matrix of numbers in a text file; what Microsoft's compiler wrote for NaN is NaN."""
+    """A square matrix of numbers in a text file; Microsoft's spellings of NaN and infinity become NaN."""
     expected, advice = f"{side} lines of {side} numbers", "Fetch the file again, or remove that frame."
     try:
         lines = _MICROSOFT_NAN.sub("nan", path.read_text()).splitlines()
@@ -158,12 +160,12 @@ def _read_matrix(path: Path, side: int) -> Float[np.ndarray, "side side"]:
 
 
 def _check_intrinsics(path: Path) -> None:
-    """Other recordings come in this layout too, with the intrinsics of their camera."""
+    """Reject recordings of other cameras in this layout, which come with their own intrinsics."""
     if not path.exists():
         return
     K = _read_matrix(path, 3)
     known = intrinsics(DEPTH_FOCAL, WIDTH, HEIGHT)
     if not np.allclose(K, known, atol=0.5):
         expected = f"the depth camera of 7-Scenes, {known.tolist()}"
-        advice = "Another camera's recording can be given as arrays or as a Panoptic folder (docs/data.md)."
+        advice = "Give a recording of another camera as arrays or as a Panoptic folder (docs/data.md)."
         raise DataError(path, expected, f"{K.tolist()}", advice)

@@ -1,4 +1,4 @@
-"""Still pictures of a video: of each stretch the sharpest."""
+"""Still pictures from a video: the sharpest frame of each segment."""
 
 from pathlib import Path
 
@@ -9,39 +9,37 @@ from jaxtyping import UInt8
 from gsjax.data.errors import DataError
 from gsjax.data.video import describe_video
 
-_JUDGED_WIDTH = 480  # pixels: enough to tell a shake from a steady hand
+_SHARPNESS_WIDTH = 480  # pixels: enough to detect motion blur
 _JPEG_QUALITY = 95
 
 
 def write_stills(video: Path, folder: Path, count: int) -> list[str]:
-    """Write the sharpest frame of each of `count` equal stretches of a video as frame_NUMBER.jpg, upright as
-    players show it; all frames where it has fewer.
+    """Write the sharpest frame of each of `count` equal segments of a video as frame_NUMBER.jpg, rotated
+    upright as players show it; or all frames if there are fewer than `count`.
 
     Args:
         video: the file.
-        folder: where pictures go; it is made.
-        count: how many, at most.
+        folder: output folder; created if missing.
+        count: largest number of pictures.
 
     Returns:
-        Their names, in order of time.
+        The names of the pictures, in order of time.
 
     Raises:
-        DataError: the file is missing, or no video.
+        DataError: the file is missing or not a video.
         ValueError: `count` is less than 1.
     """
     if count < 1:
         raise ValueError(f"frames: expected 1 or more, found {count}")
     total = describe_video(video).frames
-    stretches = (
-        np.minimum(np.arange(total) * count // total, count - 1) if total > count else np.arange(total)
-    )
+    segments = np.minimum(np.arange(total) * count // total, count - 1) if total > count else np.arange(total)
     folder.mkdir(parents=True, exist_ok=True)
     capture, names = cv2.VideoCapture(str(video)), []
     best: tuple[float, int, np.ndarray] | None = None
     number = 0
     while (grabbed := capture.read())[0]:
-        stretch = stretches[min(number, total - 1)]
-        if best is not None and stretches[min(best[1], total - 1)] != stretch:
+        segment = segments[min(number, total - 1)]
+        if best is not None and segments[min(best[1], total - 1)] != segment:
             names.append(_write(folder, *best[1:]))
             best = None
         sharp = sharpness(grabbed[1])
@@ -50,13 +48,13 @@ def write_stills(video: Path, folder: Path, count: int) -> list[str]:
         number += 1
     capture.release()
     if best is None:
-        raise DataError(video, "a video", "one of which no frame can be read", "Fetch the file again.")
+        raise DataError(video, "a video", "one without a readable frame", "Fetch the file again.")
     return [*names, _write(folder, *best[1:])]
 
 
 def sharpness(picture: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Variance of the Laplacian of a small grey copy: comparable among frames of one video."""
-    scale = min(1.0, _JUDGED_WIDTH / picture.shape[1])
+    """Variance of the Laplacian of a downscaled grey copy; comparable between frames of one video."""
+    scale = min(1.0, _SHARPNESS_WIDTH / picture.shape[1])
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())
 

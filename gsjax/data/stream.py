@@ -1,7 +1,7 @@
-"""Frames that come when they come: the newest is handed on, and what nobody took in time is dropped.
+"""Live streams of frames: the consumer always gets the newest; those it is too slow for are dropped.
 
-A source is any iterator of `Snapshot`s that waits until there is one: a recording replayed in real time,
-cameras that OpenCV reads, or what you write. `Newest` reads it in a thread of its own.
+A source is any iterator of `Snapshot`s that blocks until one is available: a recording replayed in real time,
+cameras read through OpenCV, or a user-defined iterator. `NewestSnapshots` reads it in a thread of its own.
 """
 
 import threading
@@ -14,12 +14,12 @@ from gsjax.scene.frame import Frame
 
 
 class Snapshot(NamedTuple):
-    """What all cameras saw at about one moment.
+    """The images of all cameras at approximately the same time.
 
     Attributes:
         frame: images, depths and cameras.
-        stamp: when, by the source's clock, seconds.
-        skew: time between the first and the last of its cameras, seconds.
+        stamp: time by the source's clock, seconds.
+        skew: time between its first and its last camera, seconds.
     """
 
     frame: Frame
@@ -28,27 +28,27 @@ class Snapshot(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A snapshot, and when it arrived by `time.perf_counter`."""
+    """A snapshot and its arrival time by `time.perf_counter`, seconds."""
 
     snapshot: Snapshot
     time: float
 
 
 class StreamStalled(OSError):
-    """Nothing came from a source for longer than was to be waited."""
+    """A source delivered nothing within the timeout."""
 
 
 @dataclass
 class Counts:
-    """What became of the snapshots that a source offered.
+    """Statistics of the snapshots that a source offered.
 
     Attributes:
-        offered: all of them.
-        used: handed on.
-        dropped: a newer one came before anybody took them.
-        out_of_order: not newer than the one before.
-        out_of_sync: their cameras were further apart than allowed.
-        longest_gap_s: the longest wait between two of them.
+        offered: all snapshots.
+        used: those passed to the consumer.
+        dropped: those replaced by a newer one before the consumer took them.
+        out_of_order: those not newer than the one before.
+        out_of_sync: those whose cameras were further apart in time than allowed.
+        longest_gap_s: longest time between two consecutive snapshots, seconds.
     """
 
     offered: int = 0
@@ -59,16 +59,16 @@ class Counts:
     longest_gap_s: float = 0.0
 
 
-class Newest:
-    """Iterates over a source's newest snapshots; each is read once, and the reading goes on meanwhile.
+class NewestSnapshots:
+    """Iterates over the newest snapshots of a source, each at most once, while a thread keeps reading.
 
     Args:
-        source: gives snapshots, and ends or raises as it likes; what it raises is raised here.
-        max_skew: cameras may be so far apart, seconds.
-        patience: how long to wait for a snapshot, seconds.
+        source: the snapshots; an exception that it raises is re-raised in the consumer.
+        max_skew: largest allowed time between the cameras of a snapshot, seconds.
+        patience: longest wait for a snapshot, seconds.
 
     Raises:
-        StreamStalled: while iterating, where nothing has come for so long.
+        StreamStalled: while iterating, if no snapshot arrives within `patience`.
     """
 
     def __init__(self, source: Iterable[Snapshot], *, max_skew: float = 0.02, patience: float = 10.0):
@@ -88,31 +88,31 @@ class Newest:
             self._closed = True
 
     def _take(self) -> Arrival | None:
-        """The newest, or None where the source has ended."""
+        """The newest arrival, or None if the source has ended."""
         with self._news:
-            there = self._news.wait_for(lambda: self._waiting or self._ended, self._patience)
+            ready = self._news.wait_for(lambda: self._waiting or self._ended, self._patience)
             arrival, self._waiting = self._waiting, None
         if arrival is not None:
             return arrival
         if self._error is not None:
             raise self._error
-        if not there:
+        if not ready:
             counts = self.counts
-            left_out = {"out of order": counts.out_of_order, "with cameras out of sync": counts.out_of_sync}
-            words = "".join(f", {count} of them {why}" for why, count in left_out.items() if count)
+            rejected = {"out of order": counts.out_of_order, "with cameras out of sync": counts.out_of_sync}
+            details = "".join(f", {count} of them {why}" for why, count in rejected.items() if count)
             raise StreamStalled(
-                f"the stream stalled: nothing for {self._patience:g} s after {counts.offered} frames{words}"
+                f"the stream stalled: nothing for {self._patience:g} s after {counts.offered} frames{details}"
             )
         return None
 
     def _read(self) -> None:
-        counts, newest, before = self.counts, float("-inf"), None
+        counts, newest, previous = self.counts, float("-inf"), None
         try:
             for snapshot in self._source:
                 now = time.perf_counter()
                 counts.offered += 1
-                counts.longest_gap_s = max(counts.longest_gap_s, now - (now if before is None else before))
-                before = now
+                gap = 0.0 if previous is None else now - previous
+                counts.longest_gap_s, previous = max(counts.longest_gap_s, gap), now
                 if snapshot.stamp <= newest:
                     counts.out_of_order += 1
                 elif snapshot.skew > self._max_skew:
@@ -134,7 +134,7 @@ class Newest:
 
 
 def back_and_forth(length: int) -> Iterator[int]:
-    """0, 1, ..., length-1, length-2, ..., 1, 0, 1, ...: a recording without end, in which nothing jumps."""
+    """0, 1, ..., length-1, length-2, ..., 1, 0, 1, ...: endless playback without jumps."""
     while True:
         yield from range(length)
         yield from range(length - 2, 0, -1)
@@ -148,16 +148,16 @@ def replay(
     now: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Snapshot]:
-    """Frames in memory, back and forth in real time; the first comes one period after the start.
+    """Play frames in memory back and forth in real time; the first comes one period after the start.
 
     Args:
-        frames: of a recording.
-        hz: how many come a second.
-        seconds: for how long.
+        frames: the frames of a recording.
+        hz: frames per second.
+        seconds: duration.
         now, sleep: the clock.
     """
-    begun = now()
+    start = now()
     for count, index in zip(range(1, round(hz * seconds) + 1), back_and_forth(len(frames)), strict=False):
         due = count / hz
-        sleep(max(0.0, begun + due - now()))
+        sleep(max(0.0, start + due - now()))
         yield Snapshot(frames[index], due)

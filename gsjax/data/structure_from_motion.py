@@ -1,7 +1,7 @@
-"""Where photographs were taken, from nothing but themselves: structure from motion by COLMAP's library.
+"""Camera poses from photographs alone: structure from motion with COLMAP's library.
 
-Features (SIFT, Lowe 2004), matches between pairs checked against two-view geometry, and incremental mapping
-(Schönberger, Frahm 2016), each by pycolmap on the CPU. What comes out is what `read_colmap` reads.
+Features (SIFT, Lowe 2004), pairwise matches verified against two-view geometry, and incremental mapping
+(Schönberger, Frahm 2016), each by pycolmap on the CPU. `read_colmap` reads the result.
 """
 
 import os
@@ -21,46 +21,48 @@ from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Endings of photographs, in lower case."""
+"""File extensions of photographs, in lower case."""
 
-_SMALLEST_MODEL = 3  # photographs: two see no scale, and any two share something
-_ENOUGH_FOR_CENTER = 20  # photographs by one camera
+_SMALLEST_MODEL = 3  # photographs: two fix no scale, and almost any two have some matches
+_ENOUGH_FOR_CENTER = 20  # photographs per camera
 _NAMED_AT_MOST = 5
 _ADVICE = (
-    "Take more of them with much overlap, of something with texture that stands still; or try --max-size, "
+    "Take more photographs with more overlap, of a textured scene in which nothing moves; or try --max-size, "
     "--max-features and --matching exhaustive."
 )
 
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """How photographs are placed."""
+    """Options of structure from motion."""
 
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
     ] = "OPENCV"
-    """COLMAP's model of the lens: OPENCV has four numbers of distortion, SIMPLE_RADIAL has one, for few
-    photographs."""
+    """COLMAP's lens model: OPENCV has four distortion coefficients; SIMPLE_RADIAL has one and suits small
+    sets of photographs."""
     share_camera: bool = True
-    """Photographs of one size were taken by one camera with one zoom; else each has its own."""
+    """Treat photographs of the same size as taken by one camera at one zoom; otherwise each has a camera of
+    its own."""
     max_size: int = 1000
-    """Features are sought in copies whose longer side has at most so many pixels."""
+    """Features are detected in copies downscaled so that the longer side has at most this many pixels."""
     max_features: int = 4096
-    """Features of a photograph, the strongest ones; matching takes time by their square."""
+    """Largest number of features per photograph, strongest first; matching time grows with its square."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are compared: all, or neighbours in order of name; auto takes neighbours for a video and
-    for more than --exhaustive-up-to photographs."""
+    """Which pairs are matched: all of them, or neighbours in order of name; auto matches neighbours for a
+    video and for more than --exhaustive-up-to photographs."""
     exhaustive_up_to: int = 200
-    """Photographs of which auto compares all pairs."""
+    """Largest number of photographs for which auto matches all pairs."""
     overlap: int = 10
-    """How many of the following photographs each is compared with, and those 1, 2, 4, ... places on."""
+    """In sequential matching, how many of the following photographs each one is matched with, besides those
+    1, 2, 4, ... places on."""
     refine_center: bool = True
-    """At the end the principal point is found too, where each camera took 20 photographs or more; else it is
-    the middle of the picture, which a turn of all cameras makes up for in part."""
+    """Finally refine the principal point too, if each camera took 20 photographs or more; otherwise it stays
+    at the image centre, for which a rotation of all cameras partly compensates."""
     mapping_threads: int = 1
-    """Threads of the last stage: with one, the same photographs give the same bits; -1 takes all cores."""
+    """Threads of the mapping stage: with 1, results are bitwise reproducible; -1 uses all cores."""
     seed: int = 0
-    """Of all that is drawn."""
+    """Random seed."""
 
     def __post_init__(self):
         for name, least in (("max_size", 64), ("max_features", 64), ("exhaustive_up_to", 2), ("overlap", 1)):
@@ -70,18 +72,18 @@ class MotionConfig:
             raise ValueError(f"mapping_threads: expected 1 or more, or -1, found {self.mapping_threads}")
 
 
-class Placed(NamedTuple):
-    """Photographs whose cameras were found.
+class SfmResult(NamedTuple):
+    """The result of structure from motion.
 
     Attributes:
-        model: pycolmap's Reconstruction, the one with the most photographs.
-        names: of the photographs in it, in order.
-        left_out: those that are not, in order.
-        others: how many photographs each further model has; such models share no scale with the first.
-        features: how many each photograph has, by name.
-        pairs: how many pairs of photographs show the same things.
-        error_px: mean distance of the points from where photographs show them, in their own pixels.
-        seconds: what each stage took, by name.
+        model: the pycolmap Reconstruction with the most registered photographs.
+        names: names of the photographs registered in it, sorted.
+        left_out: names of the photographs that are not, sorted.
+        others: number of photographs in each further model; these models share no scale with the first.
+        features: number of features of each photograph, by name.
+        pairs: number of photograph pairs with verified matches.
+        error_px: mean reprojection error of the points, pixels of the original photographs.
+        seconds: duration of each stage, by name.
     """
 
     model: Any
@@ -95,13 +97,13 @@ class Placed(NamedTuple):
 
     @property
     def points(self) -> int:
-        """How many points of the scene there are."""
+        """Number of 3D points in the model."""
         return self.model.num_points3D()
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and those within it, in order, relative to it. What cannot be read
-    is left out with a DataWarning that names it.
+    """Names of the photographs in a folder and its subfolders, sorted, relative to the folder. Files that
+    cannot be read are left out with a DataWarning.
 
     Raises:
         DataError: there is no such folder, or it has fewer than three photographs that can be read.
@@ -113,7 +115,7 @@ def list_photographs(folder: Path) -> list[str]:
         for path in folder.rglob("*")
         if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
     )
-    bad = {name: said for name in names if (said := _unreadable(folder / name)) is not None}
+    bad = {name: reason for name in names if (reason := _unreadable(folder / name)) is not None}
     good = [name for name in names if name not in bad]
     if len(good) < _SMALLEST_MODEL:
         found = f"{len(good) or 'none'}" + (f", and {len(bad)} that cannot be read" if bad else "")
@@ -126,31 +128,31 @@ def list_photographs(folder: Path) -> list[str]:
     return good
 
 
-def place_photographs(
+def reconstruct_cameras(
     folder: Path,
     names: Sequence[str],
     work: Path,
     config: MotionConfig,
     *,
     in_order: bool = False,
-    stage: Callable[[str], AbstractContextManager] = lambda words: nullcontext(),
-) -> Placed:
-    """The cameras of photographs and the points that they see.
+    stage: Callable[[str], AbstractContextManager] = lambda description: nullcontext(),
+) -> SfmResult:
+    """Estimate the cameras of photographs and the 3D points that they see.
 
-    The world's axes and unit are COLMAP's own choice: photographs alone show neither.
+    The world's axes and unit are arbitrary, as COLMAP chooses them: photographs alone determine neither.
 
     Args:
-        folder: where they lie.
-        names: of the photographs, relative to it.
+        folder: the folder of the photographs.
+        names: names of the photographs, relative to `folder`.
         work: an empty folder for the database, which may be removed afterwards.
-        config: how.
-        in_order: they are frames of a video.
-        stage: entered around each stage with what it does, in words.
+        config: the options.
+        in_order: the photographs are consecutive frames of a video.
+        stage: context manager entered around each stage, called with a description of it.
 
     Raises:
-        DataError: no photographs could be placed.
+        DataError: fewer than three photographs could be registered together.
         MissingExtra: pycolmap is not installed.
-        ValueError: it is too old.
+        ValueError: pycolmap is too old.
     """
     pycolmap = _pycolmap()
     database, seconds = work / "database.db", {}
@@ -158,11 +160,11 @@ def place_photographs(
         config.matching == "auto" and not in_order and len(names) <= config.exhaustive_up_to
     )
 
-    def timed(name: str, words: str, call: Callable[[], Any]) -> Any:
-        begun = perf_counter()
-        with stage(words):
+    def timed(name: str, description: str, call: Callable[[], Any]) -> Any:
+        start = perf_counter()
+        with stage(description):
             result = call()
-        seconds[name] = perf_counter() - begun
+        seconds[name] = perf_counter() - start
         return result
 
     timed(
@@ -172,25 +174,25 @@ def place_photographs(
     )
     timed(
         "matching",
-        f"comparing {'all pairs' if exhaustive else 'neighbours'}",
+        f"matching {'all pairs' if exhaustive else 'neighbours'}",
         lambda: _match(pycolmap, database, config, exhaustive),
     )
     features, pairs = _counts(pycolmap, database)
     models = timed(
         "mapping",
-        "placing photographs",
+        "registering photographs",
         lambda: _map(pycolmap, database, folder, work, config),
     )
     models = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not models or models[0].num_reg_images() < _SMALLEST_MODEL:
         median = int(np.median(list(features.values())))
-        found = f"{pairs} pairs that show the same things, and {median} features in the median photograph"
-        raise DataError(folder, "photographs that fit together", found, _ADVICE)
+        found = f"{pairs} pairs with verified matches, and {median} features in the median photograph"
+        raise DataError(folder, "photographs that can be registered together", found, _ADVICE)
     best = models[0]
-    if config.refine_center and _photographs_a_camera(best) >= _ENOUGH_FOR_CENTER:
+    if config.refine_center and _fewest_photographs_per_camera(best) >= _ENOUGH_FOR_CENTER:
         timed("refining", "refining cameras", lambda: _refine(pycolmap, best, config))
     registered = sorted(best.images[i].name for i in best.reg_image_ids())
-    return Placed(
+    return SfmResult(
         model=best,
         names=tuple(registered),
         left_out=tuple(sorted(set(names) - set(registered))),
@@ -202,8 +204,8 @@ def place_photographs(
     )
 
 
-def few_of(names: Sequence[str]) -> str:
-    """Names as messages have them: the first ones of many."""
+def shortened(names: Sequence[str]) -> str:
+    """Names joined for a message, shortened to the first few if there are many."""
     return ", ".join(names[:_NAMED_AT_MOST]) + (", ..." if len(names) > _NAMED_AT_MOST else "")
 
 
@@ -213,13 +215,13 @@ def _pycolmap() -> Any:
     pycolmap = extras.load("pycolmap", "poses", "gsjax poses")
     if not hasattr(pycolmap, "FeatureExtractionOptions"):
         raise ValueError("gsjax poses needs pycolmap 4: pip install --upgrade pycolmap")
-    # It logs every photograph. What goes wrong is said here.
+    # By default it logs every photograph. Failures are reported here instead.
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     return pycolmap
 
 
 def _unreadable(path: Path) -> str | None:
-    """What is wrong with a photograph, or None. COLMAP may stop at one, or pass over it."""
+    """Why a photograph cannot be read, or None. COLMAP would stop at such a file, or skip it silently."""
     try:
         read_image(path, *picture_size(path))
     except DataError as error:
@@ -228,16 +230,16 @@ def _unreadable(path: Path) -> str | None:
 
 
 def _extract(pycolmap, database: Path, folder: Path, names: Sequence[str], config: MotionConfig) -> None:
-    how, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
-    how.max_image_size, how.sift.max_num_features = config.max_size, config.max_features
+    extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
+    extraction.max_image_size, extraction.sift.max_num_features = config.max_size, config.max_features
     reader.camera_model = config.camera_model
     by_size: dict[Any, list[str]] = {}
     for name in names:
         by_size.setdefault(picture_size(folder / name), []).append(name)
     mode = pycolmap.CameraMode.SINGLE if config.share_camera else pycolmap.CameraMode.PER_IMAGE
-    pycolmap.Database.open(database).close()  # makes it
-    for group in by_size.values():  # one camera has one size
-        # Else the threads that find features number the photographs, in the order in which they are ready.
+    pycolmap.Database.open(database).close()  # creates it
+    for group in by_size.values():  # a camera has one image size
+        # Import first: otherwise image ids depend on the order in which the extraction threads finish.
         pycolmap.import_images(database, folder, camera_mode=mode, image_names=group, options=reader)
         pycolmap.extract_features(
             database,
@@ -245,15 +247,15 @@ def _extract(pycolmap, database: Path, folder: Path, names: Sequence[str], confi
             image_names=group,
             camera_mode=mode,
             reader_options=reader,
-            extraction_options=how,
+            extraction_options=extraction,
             device=pycolmap.Device.cpu,
         )
 
 
 def _match(pycolmap, database: Path, config: MotionConfig, exhaustive: bool) -> None:
-    verified = pycolmap.TwoViewGeometryOptions()
-    verified.ransac.random_seed = config.seed
-    shared = {"verification_options": verified, "device": pycolmap.Device.cpu}
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    shared = {"verification_options": verification, "device": pycolmap.Device.cpu}
     if exhaustive:
         pycolmap.match_exhaustive(database, **shared)
     else:
@@ -263,7 +265,7 @@ def _match(pycolmap, database: Path, config: MotionConfig, exhaustive: bool) -> 
 
 
 def _counts(pycolmap, database: Path) -> tuple[dict[str, int], int]:
-    """Features by name, and pairs that passed."""
+    """Number of features of each photograph, by name, and number of verified pairs."""
     with pycolmap.Database.open(database) as opened:
         features = {
             image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()
@@ -273,24 +275,24 @@ def _counts(pycolmap, database: Path) -> tuple[dict[str, int], int]:
 
 
 def _map(pycolmap, database: Path, folder: Path, work: Path, config: MotionConfig) -> list[Any]:
-    how = pycolmap.IncrementalPipelineOptions()
-    how.num_threads = how.mapper.num_threads = config.mapping_threads
-    how.random_seed = how.mapper.random_seed = how.triangulation.random_seed = config.seed
-    how.min_model_size = _SMALLEST_MODEL
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = config.mapping_threads
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = config.seed
+    options.min_model_size = _SMALLEST_MODEL
     target = work / "models"
     os.makedirs(target, exist_ok=True)
-    return list(pycolmap.incremental_mapping(database, folder, target, how).values())
+    return list(pycolmap.incremental_mapping(database, folder, target, options).values())
 
 
-def _photographs_a_camera(model: Any) -> int:
-    """Of the camera that took the fewest."""
+def _fewest_photographs_per_camera(model: Any) -> int:
+    """Number of photographs by the camera that took the fewest."""
     taken = Counter(model.images[i].camera_id for i in model.reg_image_ids())
     return min(taken.values())
 
 
 def _refine(pycolmap, model: Any, config: MotionConfig) -> None:
-    """All of it once more, with the principal points."""
-    how = pycolmap.BundleAdjustmentOptions()
-    how.refine_principal_point, how.print_summary = True, False
-    how.ceres.solver_options.num_threads = config.mapping_threads
-    pycolmap.bundle_adjustment(model, how)
+    """One more bundle adjustment of the whole model, principal points included."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point, options.print_summary = True, False
+    options.ceres.solver_options.num_threads = config.mapping_threads
+    pycolmap.bundle_adjustment(model, options)

@@ -1,5 +1,5 @@
-"""Masks of surgical tools: in black and white, where which of the two is the tool is for the user to say; and
-in label maps, by what classes are called."""
+"""Masks of surgical tools: black-and-white ones, whose polarity the user states, and label maps, in which
+tools are recognised by the names of their classes."""
 
 import re
 import warnings
@@ -13,13 +13,13 @@ from jaxtyping import Int
 from gsjax.data.errors import DataError, DataWarning
 
 Tool = Literal["white", "black"]
-"""What the tool is in a mask."""
+"""Colour of the tool in a mask."""
 
 TISSUE, TOOL = 0, 1
 LABEL_NAMES = {TOOL: "tool"}
 _FOLDERS = ("masks", "gt_masks")  # in EndoNeRF's releases
-_FRAMES_LOOKED_AT = 64
-_CALLED = re.compile(
+_CHECKED_FRAMES = 64
+_TOOL_NAMES = re.compile(
     r"\b(tool|instrument|shaft|wrist|clasper|probe|forceps|driver|sealer|retractor|scissors|grasper|stapler|"
     r"needle|thread|clamp|clip|suction|hook|trocar|other)s?\b",
     re.IGNORECASE,
@@ -27,29 +27,30 @@ _CALLED = re.compile(
 
 
 def find_masks(root: Path) -> Path | None:
-    """The folder of masks in a folder, or None."""
+    """The mask folder in a folder, or None."""
     return next((root / name for name in _FOLDERS if (root / name).is_dir()), None)
 
 
 def is_tool(value: int, names: Mapping[int, str]) -> bool:
-    """Whether a value of a label map is of a tool: all but 0, where it has no name; else by its name.
+    """Whether a value of a label map denotes a tool: decided by its name, or, without a name, any value
+    above 0 does.
 
     Args:
-        value: of a pixel.
-        names: of values, "suturing-needle" say, a tool, or "kidney-parenchyma", none.
+        value: the label of a pixel.
+        names: names of labels, for example "suturing-needle" (a tool) or "kidney-parenchyma" (not a tool).
     """
     if value <= TISSUE:
         return False
-    return value not in names or _CALLED.search(re.sub(r"[-_]", " ", names[value])) is not None
+    return value not in names or _TOOL_NAMES.search(re.sub(r"[-_]", " ", names[value])) is not None
 
 
 def tool_labels(mask: Int[np.ndarray, "height width"], tool: str) -> Int[np.ndarray, "height width"]:
-    """0 where there is tissue and 1 where there is a tool, int32.
+    """0 for tissue and 1 for a tool, int32.
 
-    White is more than 127, for what was saved as JPEG is not quite black; or 1 in a mask of zeros and ones.
+    White means above 127, since JPEG compression leaves black not quite 0; or 1 in a mask of zeros and ones.
 
     Raises:
-        ValueError: `tool` is neither.
+        ValueError: `tool` is neither "white" nor "black".
     """
     if tool not in ("white", "black"):
         raise ValueError(f"tool: expected 'white' or 'black', found {tool!r}")
@@ -58,25 +59,25 @@ def tool_labels(mask: Int[np.ndarray, "height width"], tool: str) -> Int[np.ndar
 
 
 def check_tool(load: Callable[[int], np.ndarray], frames: int, tool: Tool, where: object) -> None:
-    """A look at labels, of at most 64 frames that are spread evenly: an inverted mask hides the tissue.
+    """Check the labels of at most 64 evenly spaced frames for inverted masks, which would hide the tissue.
 
-    Warns with DataWarning where the tool covers more than half of the picture in more than half of them.
+    Warns with DataWarning if the tool covers more than half of the picture in more than half of the frames.
 
     Args:
-        load: frame to labels, as `tool_labels` gives them.
-        frames: how many there are.
-        tool: what it is in masks, "white" or "black".
-        where: what messages name.
+        load: frame -> labels, as `tool_labels` returns them.
+        frames: number of frames.
+        tool: colour of the tool in masks, "white" or "black".
+        where: name of the masks in messages.
 
     Raises:
-        DataError: it covers all of every picture.
+        DataError: the tool covers every checked picture completely.
     """
-    chosen = np.unique(np.linspace(0, frames - 1, min(frames, _FRAMES_LOOKED_AT)).astype(int))
+    chosen = np.unique(np.linspace(0, frames - 1, min(frames, _CHECKED_FRAMES)).astype(int))
     shares = np.array([np.mean(load(int(t)) == TOOL) for t in chosen])
     other = "black" if tool == "white" else "white"
     advice = f"Are they inverted? Then the tool is {other}: set tool (--read.tool {other})."
     if (shares == 1).all():
-        found = f"nothing but tool in all {len(shares)} frames looked at"
+        found = f"only tool in all {len(shares)} checked frames"
         raise DataError(where, f"masks with the tool {tool} and some tissue", found, advice)
     many = np.sum(shares > 0.5)
     if 2 * many > len(shares):

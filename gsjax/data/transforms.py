@@ -1,12 +1,12 @@
 """transforms.json of nerfstudio, instant-ngp and Blender (NeRF, D-NeRF): camera to world, OpenGL axes.
 
-fl_x, fl_y, cx, cy, w, h       pixels, centres at +0.5; of all frames, or in each frame
-camera_angle_x, camera_angle_y radians, where there are no focal lengths
-k1 .. k4, p1, p2               OpenCV's lens distortion; camera_model (or is_fisheye) says of which model
-frames[]                       file_path (Blender leaves out the extension), transform_matrix [4,4], perhaps
-                               mask_path (0 = does not count), depth_file_path (16 bit), time
-train_filenames, ...           nerfstudio's splits: what no list names is left out, as there; Blender has a
-                               file for each: transforms_train.json, ...
+fl_x, fl_y, cx, cy, w, h       pixels, centres at +0.5; for all frames, or per frame
+camera_angle_x, camera_angle_y radians, instead of focal lengths
+k1 .. k4, p1, p2               OpenCV's lens distortion; camera_model (or is_fisheye) selects the model
+frames[]                       file_path (Blender omits the extension), transform_matrix [4,4], optionally
+                               mask_path (0 = ignored), depth_file_path (16 bits), time
+train_filenames, ...           nerfstudio's splits: files in none of the lists are left out, as nerfstudio
+                               does; Blender has a file per split: transforms_train.json, ...
 ply_file_path                  nerfstudio's sparse points
 """
 
@@ -22,7 +22,7 @@ from jaxtyping import Float
 from gsjax.data.clouds import read_cloud
 from gsjax.data.errors import DataError, DataWarning
 from gsjax.data.files import picture_size, read_depth, read_json, read_mask, read_rgba
-from gsjax.data.lens import Lens, shrunk, straighten
+from gsjax.data.lens import Lens, scaled_intrinsics, undistort
 from gsjax.data.photographs import Photographs
 from gsjax.data.validation import check_poses
 from gsjax.geometry.cameras import intrinsics, viewmat_from_opengl
@@ -53,21 +53,22 @@ def read_transforms(
     background: tuple[float, float, float] = WHITE,
     depth_unit_m: float = _DEPTH_UNIT_M,
 ) -> Photographs:
-    """The photographs that a transforms.json lists, or a transforms_train.json and its siblings.
+    """The photographs listed in a transforms.json, or in a transforms_train.json and its siblings.
 
     Listed files that do not exist are left out with a DataWarning that counts them, as are frames without a
-    finite pose and those that no list of a split names, where there are such lists. What two lists name is of
-    the later one of train, val, test: it is not fitted. Distorted photographs are straightened (see
-    `gsjax.data.lens`). A photograph of another size than is said is taken for one that was made smaller.
+    finite pose and, if the file lists splits, frames in none of them. A file in two lists belongs to the
+    later of train, val and test, so held-out photographs are never fitted. Distorted photographs are
+    undistorted (see `gsjax.data.lens`). A photograph whose size differs from the stated one is treated as a
+    downscaled copy.
 
     Args:
         path: the folder, or one such file.
-        background: RGB, 0 to 1, behind transparent photographs; white unless given, as is usual.
-        depth_unit_m: lengths of one step of depth.
+        background: RGB, 0 to 1, behind transparent photographs; default: white, as is usual.
+        depth_unit_m: length of one depth step.
 
     Raises:
-        DataError: a file is missing or has another form, no frame is left, or a camera is of no known model.
-        ValueError: a pose is no rigid motion.
+        DataError: a file is missing or malformed, no frame is left, or a camera model is unknown.
+        ValueError: a pose is not a rigid motion.
     """
     root, files = _files(Path(path))
     frames: list[_Frame] = []
@@ -77,32 +78,32 @@ def read_transforms(
     for file, split in files.items():
         meta = read_json(file)
         if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-            raise DataError(file, "frames, a list of one or more", "none", "Is it a transforms.json?")
+            raise DataError(file, "frames, a non-empty list", "none", "Is it a transforms.json?")
         named = _named_splits(file, meta)
         listed += len(meta["frames"])
         for number, entry in enumerate(meta["frames"]):
-            what = _Entry(file, number, meta, entry)
-            image = what.image(root)
-            own = split or named.get(Path(entry["file_path"]))
-            if named and own is None:
+            frame = _Entry(file, number, meta, entry)
+            image = frame.image(root)
+            own_split = split or named.get(Path(entry["file_path"]))
+            if named and own_split is None:
                 unnamed += 1
                 continue
             if image is None:
                 missing.append(str(entry["file_path"]))
                 continue
-            pose = what.pose()
+            pose = frame.pose()
             if pose is None:
                 lost.append(str(entry["file_path"]))
                 continue
-            frames.append(what.read(root, image, pose, own))
+            frames.append(frame.read(root, image, pose, own_split))
         if cloud is None and meta.get("ply_file_path") is not None:
             cloud = read_cloud(root / str(meta["ply_file_path"]))
-    _say_left_out(root, listed, missing, lost, unnamed, len(frames))
+    _report_left_out(root, listed, missing, lost, unnamed, len(frames))
     return _photographs(root, frames, cloud, background, depth_unit_m)
 
 
 def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
-    """The folder, and the files to read with the split that each is."""
+    """The folder, and the files to read, each with its split."""
     if path.suffix == ".json":
         return path.parent, {path: None}
     if (path / "transforms.json").is_file():
@@ -122,7 +123,7 @@ def _files(path: Path) -> tuple[Path, dict[Path, str | None]]:
 
 
 def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
-    """Which split each photograph is of, where the file says so."""
+    """The split of each photograph that the file assigns to one."""
     named = {}
     for split in SPLITS:
         names = meta.get(f"{split}_filenames") or []
@@ -134,28 +135,29 @@ def _named_splits(file: Path, meta: dict[str, Any]) -> dict[Path, str]:
         found = (
             f"only {' and '.join(key for key in (f'{split}_filenames' for split in SPLITS) if meta.get(key))}"
         )
-        raise DataError(file, "train_filenames beside other lists", found, "Add it, or remove the others.")
+        advice = "Add it, or remove the other lists."
+        raise DataError(file, "train_filenames besides other lists", found, advice)
     known = {Path(str(entry.get("file_path"))) for entry in meta["frames"] if isinstance(entry, dict)}
-    if strange := [str(name) for name in named if name not in known]:
+    if unknown := [str(name) for name in named if name not in known]:
         expected = "names of frames in train_filenames, val_filenames and test_filenames"
-        found = f"{len(strange)} that no frame has, as {strange[0]}"
+        found = f"{len(unknown)} that no frame has, for example {unknown[0]}"
         raise DataError(file, expected, found, "Correct or remove them.")
     return named
 
 
 class _Entry(NamedTuple):
-    """One of the frames of a file, with what the file says of all."""
+    """One frame of a file, together with the values that the file gives for all frames."""
 
     file: Path
     number: int
     meta: dict[str, Any]
     entry: dict[str, Any]
 
-    def wrong(self, expected: str, found: Any, advice: str) -> DataError:
+    def error(self, expected: str, found: Any, advice: str) -> DataError:
         return DataError(f"{self.file}, frame {self.number}", expected, str(found), advice)
 
     def value(self, *names: str) -> Any:
-        """The first of these that the frame or, after it, the file has; or None."""
+        """The first of these keys that the frame or else the file has; or None."""
         for name in names:
             for place in (self.entry, self.meta):
                 if place.get(name) is not None:
@@ -167,19 +169,19 @@ class _Entry(NamedTuple):
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise self.wrong(f"{name}, a number", repr(value), "Correct the file.")
+            raise self.error(f"{name}, a number", repr(value), "Correct the file.")
         return float(value)
 
     def image(self, root: Path) -> Path | None:
-        """The file of its photograph, whose name may lack the extension; None where there is none."""
+        """Path of its photograph, whose name may lack the extension; None if there is no such file."""
         if not isinstance(self.entry, dict) or not isinstance(self.entry.get("file_path"), str):
-            raise self.wrong("file_path and transform_matrix", repr(self.entry)[:80], "Correct the file.")
+            raise self.error("file_path and transform_matrix", repr(self.entry)[:80], "Correct the file.")
         path = root / self.entry["file_path"]
         choices = (path, *(path.with_name(path.name + suffix) for suffix in _SUFFIXES))
         return next((choice for choice in choices if os.path.isfile(choice)), None)
 
     def pose(self) -> Float[np.ndarray, "4 4"] | None:
-        """World to camera, OpenCV axes; None where it is not finite."""
+        """World to camera, OpenCV axes; None if it is not finite."""
         try:
             matrix = np.array(self.entry.get("transform_matrix"), np.float64)
         except (TypeError, ValueError):
@@ -187,13 +189,13 @@ class _Entry(NamedTuple):
         if matrix.shape == (3, 4):
             matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
         if matrix.shape != (4, 4):
-            raise self.wrong(
-                "transform_matrix, 4 lines of 4 numbers", f"shape {matrix.shape}", "Correct the file."
+            raise self.error(
+                "transform_matrix, 4 rows of 4 numbers", f"shape {matrix.shape}", "Correct the file."
             )
         if not np.isfinite(matrix).all():
             return None
         where = f"{self.file}, frame {self.number} ({self.entry['file_path']})"
-        advice = "It must be a rotation and a shift; correct or remove that frame."
+        advice = "It must be a rotation and a translation; correct or remove that frame."
         check_poses("transform_matrix", matrix[None, None], lambda i, _: where, advice)
         return viewmat_from_opengl(matrix)
 
@@ -212,66 +214,66 @@ class _Entry(NamedTuple):
         )
 
     def beside(self, root: Path, key: str) -> Path | None:
-        """The file that belongs to its photograph, where it has one."""
+        """Path of the mask or depth image of its photograph, if it has one."""
         name = self.value(key)
         if name is not None and not isinstance(name, str):
-            raise self.wrong(f"{key}, a name", repr(name), "Correct the file.")
+            raise self.error(f"{key}, a name", repr(name), "Correct the file.")
         return root / name if name else None
 
     def lens(self, width: int, height: int) -> Lens:
         """The camera, for a photograph of this size."""
-        said_width, said_height = self.numeral("w") or width, self.numeral("h") or height
+        stated_width, stated_height = self.numeral("w") or width, self.numeral("h") or height
         fx, angle = self.numeral("fl_x"), self.numeral("camera_angle_x")
         for name in ("camera_angle_x", "camera_angle_y"):
-            if (width_of_view := self.numeral(name)) is not None and not 0 < width_of_view < np.pi:
-                raise self.wrong(
-                    f"{name} between 0 and pi", f"{width_of_view:g}", "It is in radians; correct it."
+            if (field_of_view := self.numeral(name)) is not None and not 0 < field_of_view < np.pi:
+                raise self.error(
+                    f"{name} between 0 and pi", f"{field_of_view:g}", "It is in radians; correct it."
                 )
         if fx is None:
             if angle is None:
-                raise self.wrong("fl_x or camera_angle_x", "neither", "Add one, of the frame or of all.")
-            fx = said_width / (2 * np.tan(angle / 2))
+                raise self.error("fl_x or camera_angle_x", "neither", "Add one, per frame or for all.")
+            fx = stated_width / (2 * np.tan(angle / 2))
         fy, angle_y = self.numeral("fl_y"), self.numeral("camera_angle_y")
         if fy is None:
-            fy = fx if angle_y is None else said_height / (2 * np.tan(angle_y / 2))
+            fy = fx if angle_y is None else stated_height / (2 * np.tan(angle_y / 2))
         if not (0 < fx < np.inf and 0 < fy < np.inf):
-            raise self.wrong("focal lengths above 0", f"{fx:g} and {fy:g}", "Correct the file.")
+            raise self.error("focal lengths above 0", f"{fx:g} and {fy:g}", "Correct the file.")
         cx, cy = self.numeral("cx"), self.numeral("cy")
-        center = (said_width / 2 if cx is None else cx, said_height / 2 if cy is None else cy)
+        center = (stated_width / 2 if cx is None else cx, stated_height / 2 if cy is None else cy)
         K = intrinsics(fx, 0, 0, center)
         K[1, 1] = fy
         model = self.value("camera_model") or ("OPENCV_FISHEYE" if self.value("is_fisheye") else "OPENCV")
         if str(model) not in _MODELS:
-            raise self.wrong(
-                f"a camera_model of {', '.join(_MODELS)}", model, "Undistort the photographs first."
+            raise self.error(
+                f"camera_model to be one of {', '.join(_MODELS)}", model, "Undistort the photographs first."
             )
         fisheye = _MODELS[model]
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         coeffs = tuple(self.numeral(name) or 0.0 for name in names)
-        if not fisheye and self.numeral("k4"):  # nerfstudio's is of r^8, which OpenCV's model does not have
-            raise self.wrong(
-                "a k4 of 0 but for a fisheye", self.value("k4"), "Undistort the photographs first."
+        if not fisheye and self.numeral("k4"):  # nerfstudio's is the r^8 term, which OpenCV's model lacks
+            raise self.error(
+                "k4 to be 0 except for a fisheye", self.value("k4"), "Undistort the photographs first."
             )
-        K = shrunk(K, (said_width, said_height), (width, height), f"{self.file}, frame {self.number}")
+        where = f"{self.file}, frame {self.number}"
+        K = scaled_intrinsics(K, (stated_width, stated_height), (width, height), where)
         return Lens(K, coeffs, fisheye)
 
 
-def _say_left_out(
-    root: Path, listed: int, missing: list[str], lost: list[str], unnamed: int, left: int
+def _report_left_out(
+    root: Path, listed: int, missing: list[str], lost: list[str], unnamed: int, kept: int
 ) -> None:
-    said = []
-    for names, what in ((missing, "that have no file"), (lost, "without a finite pose")):
+    left_out = []
+    for names, what in ((missing, "with no file"), (lost, "without a finite pose")):
         if names:
             some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-            said.append(f"{len(names)} {what} ({some})")
+            left_out.append(f"{len(names)} {what} ({some})")
     if unnamed:
-        said.append(f"{unnamed} that no list of train, val or test names")
-    if not left:
-        raise DataError(
-            root, "a photograph with a pose", f"of {listed} listed {' and '.join(said)}", "Check the folder."
-        )
-    if said:
-        message = f"{root}: of {listed} listed photographs {' and '.join(said)} are left out"
+        left_out.append(f"{unnamed} in none of the train, val and test lists")
+    if not kept:
+        found = f"{listed} listed, {' and '.join(left_out)}"
+        raise DataError(root, "a photograph with a pose", found, "Check the folder.")
+    if left_out:
+        message = f"{root}: of {listed} listed photographs, {' and '.join(left_out)} are left out"
         warnings.warn(message, DataWarning, stacklevel=4)
 
 
@@ -280,21 +282,21 @@ def _is_transparent(pixels: np.ndarray) -> bool:
 
 
 def _photographs(root, frames, cloud, background, depth_unit_m) -> Photographs:
-    ideal = [straighten(frame.lens, *frame.size) for frame in frames]
-    clear = np.array(background)
+    ideal = [undistort(frame.lens, *frame.size) for frame in frames]
+    behind = np.array(background)
 
     def load_image(i: int) -> np.ndarray:
         pixels = read_rgba(frames[i].image, *frames[i].size)
         if pixels.shape[-1] == 4:
             alpha = pixels[..., 3:] / 255
-            pixels = np.round(alpha * pixels[..., :3] + (1 - alpha) * 255 * clear).astype(np.uint8)
+            pixels = np.round(alpha * pixels[..., :3] + (1 - alpha) * 255 * behind).astype(np.uint8)
         return ideal[i][1](pixels, cv2.INTER_LINEAR)
 
     def load_mask(i: int) -> np.ndarray | None:
         if frames[i].mask is None:
             return None
-        counts = (read_mask(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
-        return ideal[i][1](counts, cv2.INTER_NEAREST) > 0
+        mask = (read_mask(frames[i].mask, *frames[i].size) != 0).astype(np.uint8)
+        return ideal[i][1](mask, cv2.INTER_NEAREST) > 0
 
     def load_depth(i: int) -> np.ndarray | None:
         if frames[i].depth is None:

@@ -1,8 +1,8 @@
-"""The TUM RGB-D benchmark (Sturm et al. 2012): one moving camera with depth, poses by motion capture.
+"""The TUM RGB-D benchmark (Sturm et al. 2012): one moving camera with depth and poses from motion capture.
 
-rgb.txt            lines "stamp rgb/STAMP.png", seconds; # begins a comment, in all three
-depth.txt          lines "stamp depth/STAMP.png": 16 bit, 5000 steps a metre, 0 = invalid; each pixel is the
-                   same pixel of the colour image
+rgb.txt            lines "stamp rgb/STAMP.png", seconds; # starts a comment, in all three files
+depth.txt          lines "stamp depth/STAMP.png": 16 bits, 5000 steps per metre, 0 = invalid; registered to
+                   the colour image pixel by pixel
 groundtruth.txt    lines "stamp tx ty tz qx qy qz qw": camera to world, OpenCV axes, at its own rate
 """
 
@@ -25,14 +25,14 @@ from gsjax.data.sequence import Sequence
 from gsjax.geometry.distortion import undistort_map
 
 MAX_SKEW_S = 0.02
-"""The benchmark's own limit on how far apart in time colour, depth and pose of one frame may be."""
+"""The benchmark's own limit on the time between colour, depth and pose of a frame."""
 
 DEPTH_UNIT_M = 1 / 5000
-"""The depth factor of the benchmark's files: metres of one step."""
+"""Metres per depth step in the benchmark's files."""
 
 
 class _Calibration(NamedTuple):
-    """Intrinsics as the benchmark publishes them: fx, fy, cx, cy with pixel centres at integers."""
+    """Intrinsics as published with the benchmark: fx, fy, cx, cy with pixel centres at integers."""
 
     pinhole: tuple[float, float, float, float]
     distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2, k3
@@ -41,11 +41,11 @@ class _Calibration(NamedTuple):
 _CALIBRATIONS = {
     1: _Calibration((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     2: _Calibration((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    3: _Calibration((535.4, 539.2, 320.1, 247.6), ()),  # its images come undistorted
+    3: _Calibration((535.4, 539.2, 320.1, 247.6), ()),  # its images are published undistorted
 }
 _SIZE = (640, 480)
-_COMPLETE = "Check the folder; was it copied whole?"
-_UNIT_TOLERANCE = 0.01  # of a quaternion's length, which files write with four digits
+_COMPLETE = "Check the folder; was it copied completely?"
+_UNIT_TOLERANCE = 0.01  # on a quaternion's length: files have four digits
 
 
 def read_tum(
@@ -58,27 +58,27 @@ def read_tum(
 ) -> Sequence:
     """The sequence in a folder of this layout: one camera, 0, whose frames are the colour images.
 
-    Colour, depth and poses run by their own clocks: each colour image takes the depth image nearest in time,
-    and the pose between the two that were measured before and after it (linear in place, along the shortest
-    turn), for at 1 rad/s the nearest of 100 Hz poses would be 2 to 3 pixels off. Frames for which depth or a
-    measured pose is farther than `max_skew` are left out, and so are those whose files are missing, second
-    lines of one stamp, and poses that are not finite: each with a DataWarning that counts them. Lines need
-    not be in order. Times are the stamps; `frame_ids` count the stamps of rgb.txt from 0.
+    Colour, depth and poses are not synchronised: each colour image is paired with the depth image nearest in
+    time and with a pose interpolated between the measurements before and after it (linear in position,
+    spherical in rotation), since at 1 rad/s the nearest of 100 Hz poses would be 2 to 3 pixels off. Frames
+    farther than `max_skew` from any depth image or measured pose are left out, as are those whose files are
+    missing, lines that repeat a stamp, and poses that are not finite: each with a DataWarning that counts
+    them. Lines may be in any order. Times are the stamps; `frame_ids` count the stamps of rgb.txt from 0.
 
-    Where the lens distorts (freiburg1 and 2), colour and depth are resampled to a pinhole camera of the same
-    K; what lies beyond the photograph is black and without depth.
+    If the lens has distortion (freiburg1 and 2), colour and depth are resampled to a pinhole camera of the
+    same K; pixels outside the photograph are black and have no depth.
 
     Args:
         path: the folder.
-        K: intrinsics with pixel centres at +0.5; those of the benchmark, which it has for freiburg1, 2 and 3
-            and which the folder's name tells apart, unless given.
-        distortion: with a K of your own, OpenCV's coefficients of the lens: none, 4, 5 or 8.
-        max_skew: seconds.
-        depth_unit_m: metres of one step of depth.
+        K: intrinsics with pixel centres at +0.5; default: those published for freiburg1, 2 or 3, chosen by
+            the folder's name.
+        distortion: OpenCV distortion coefficients that belong to a given K: none, 4, 5 or 8.
+        max_skew: largest time between colour, depth and pose, seconds.
+        depth_unit_m: metres per depth step.
 
     Raises:
-        DataError: a file is missing or has lines of another form, the name tells no camera, or no frame has
-            colour, depth and pose.
+        DataError: a file is missing or has malformed lines, the folder's name does not identify the camera,
+            or no frame has colour, depth and pose.
     """
     root = Path(path)
     colors, depths = _Listed.read(root, "rgb.txt"), _Listed.read(root, "depth.txt")
@@ -103,14 +103,14 @@ def read_tum(
         frame_ids=tuple(colors.numbers[matched[:, 0]].tolist()),
         Ks=np.broadcast_to(K, (frames, 1, 3, 3)),
         viewmats=np.linalg.inv(_poses_at(times, stamps, poses))[:, None],
-        load_image=lambda t, c: lens.straighten(read_image(images[t], width, height)),
-        load_depth=lambda t, c: lens.straighten(read_depth(depth_images[t], depth_unit_m, width, height)),
+        load_image=lambda t, c: lens.undistort(read_image(images[t], width, height)),
+        load_depth=lambda t, c: lens.undistort(read_depth(depth_images[t], depth_unit_m, width, height)),
         locate=lambda kind, t, c: str(files[kind][t]),
     )
 
 
 class _Listed(NamedTuple):
-    """The files that a list names, in order of time, with their places in it."""
+    """The files named in a list, sorted by time, with their positions in it."""
 
     numbers: Int[np.ndarray, "n"]
     stamps: Float[np.ndarray, "n"]
@@ -118,27 +118,28 @@ class _Listed(NamedTuple):
 
     @classmethod
     def read(cls, root: Path, name: str) -> "_Listed":
-        """Without files that do not exist, which are counted."""
+        """Read a list, leaving out files that do not exist, with a warning that counts them."""
         stamps, rows = _read_lines(root / name, "stamp file", columns=2)
-        there = np.array([(root / row[0]).is_file() for row in rows])
-        if not there.any():
+        exists = np.array([(root / row[0]).is_file() for row in rows])
+        if not exists.any():
             found = f"none of {len(rows)}, for example no {rows[0][0]}"
             raise DataError(root / name, "files that exist", found, _COMPLETE)
-        if not there.all():
-            message = f"{root / name}: {np.sum(~there)} of {len(rows)} files do not exist and are left out"
+        if not exists.all():
+            message = f"{root / name}: {np.sum(~exists)} of {len(rows)} files do not exist and are left out"
             warnings.warn(message, DataWarning, stacklevel=4)
-        numbers = np.flatnonzero(there)
-        return cls(numbers, stamps[there], [root / rows[i][0] for i in numbers])
+        numbers = np.flatnonzero(exists)
+        return cls(numbers, stamps[exists], [root / rows[i][0] for i in numbers])
 
 
 def _read_lines(path: Path, form: str, columns: int) -> tuple[Float[np.ndarray, "n"], list[list[str]]]:
-    """Stamps in increasing order, and what stands behind each; second lines of one stamp are counted."""
+    """Stamps in increasing order, and the fields after each; lines that repeat a stamp are left out, with a
+    warning that counts them."""
     try:
         lines = path.read_text().splitlines()
     except FileNotFoundError:
         raise DataError(path, f"lines '{form}'", "no such file", _COMPLETE) from None
     except UnicodeDecodeError as error:
-        raise DataError(path, f"lines '{form}'", f"no text ({error})", "Fetch the file again.") from None
+        raise DataError(path, f"lines '{form}'", f"binary data ({error})", "Fetch the file again.") from None
     stamps, rows = [], []
     for number, line in enumerate(lines, start=1):
         fields = line.partition("#")[0].replace(",", " ").split()
@@ -146,7 +147,7 @@ def _read_lines(path: Path, form: str, columns: int) -> tuple[Float[np.ndarray, 
             continue
         if len(fields) != columns or not _is_finite(fields[0]):
             expected, found = f"'{form}' in line {number}", repr(line[:80])
-            raise DataError(path, expected, found, "Correct the line, or begin it with #.")
+            raise DataError(path, expected, found, "Correct the line, or comment it out with #.")
         stamps.append(float(fields[0]))
         rows.append(fields[1:])
     if not rows:
@@ -166,12 +167,14 @@ def _is_finite(text: str) -> bool:
 
 
 def _read_poses(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 7"]]:
-    """Stamps, and positions with quaternions x y z w; what is not finite is counted and left out."""
+    """Stamps, and positions with quaternions x y z w; poses that are not finite are left out, with a warning
+    that counts them."""
     stamps, rows = _read_lines(path, "stamp tx ty tz qx qy qz qw", columns=8)
     try:
         poses = np.array(rows, np.float64)
     except ValueError as error:
-        raise DataError(path, "numbers only", str(error), "Correct the line, or begin it with #.") from None
+        advice = "Correct the line, or comment it out with #."
+        raise DataError(path, "numbers only", str(error), advice) from None
     known = np.isfinite(poses).all(axis=1)
     if not known.any():
         raise DataError(path, "finite poses", "none", "Fetch the file again.")
@@ -184,19 +187,20 @@ def _read_poses(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "
     if bad.any():
         i = int(np.argmax(bad))
         found = f"one of length {lengths[i]:.3g} at {stamps[i]:.6f} s"
-        raise DataError(path, "unit quaternions", found, "Correct that line, or begin it with #.")
+        raise DataError(path, "unit quaternions", found, "Correct that line, or comment it out with #.")
     return stamps, poses
 
 
 def _poses_at(
     times: Float[np.ndarray, "t"], stamps: Float[np.ndarray, "n"], poses: Float[np.ndarray, "n 7"]
 ) -> Float[np.ndarray, "t 4 4"]:
-    """Camera-to-world transforms between those measured; before the first and after the last, those."""
+    """Camera-to-world transforms interpolated between the measured ones; constant before the first and after
+    the last."""
     inside = np.clip(times, stamps[0], stamps[-1])
-    turns = Rotation.from_quat(poses[:, 3:])
+    measured = Rotation.from_quat(poses[:, 3:])
     transforms = np.tile(np.eye(4), (len(times), 1, 1))
-    turned = Slerp(stamps, turns)(inside) if len(stamps) > 1 else turns[np.zeros(len(times), int)]
-    transforms[:, :3, :3] = turned.as_matrix()
+    rotations = Slerp(stamps, measured)(inside) if len(stamps) > 1 else measured[np.zeros(len(times), int)]
+    transforms[:, :3, :3] = rotations.as_matrix()
     transforms[:, :3, 3] = np.stack([np.interp(inside, stamps, axis) for axis in poses[:, :3].T], axis=1)
     return transforms
 
@@ -204,23 +208,23 @@ def _poses_at(
 def _published(
     root: Path, image: Path, size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "3 3"], tuple[float, ...]]:
-    """K, centres at +0.5, and distortion of the camera that the folder's name tells."""
+    """K, centres at +0.5, and distortion of the camera that the folder's name identifies."""
     name = root.resolve().name
-    told = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
-    if told is None:
-        expected = "a folder's name with freiburg1, freiburg2 or freiburg3, which tells its camera"
+    camera = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
+    if camera is None:
+        expected = "a folder name with freiburg1, freiburg2 or freiburg3, which identifies the camera"
         advice = "Rename the folder, or give its intrinsics: read_tum(path, K=...)."
         raise DataError(root, expected, repr(name), advice)
     if size != _SIZE:
-        expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{told[1]} is calibrated"
+        expected = f"{_SIZE[0]}x{_SIZE[1]} pixels, for which freiburg{camera[1]} is calibrated"
         found = f"{size[0]}x{size[1]}"
         raise DataError(image, expected, found, "Give its intrinsics: read_tum(path, K=...).")
-    (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(told[1])]
+    (fx, fy, cx, cy), distortion = _CALIBRATIONS[int(camera[1])]
     return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), distortion
 
 
 class _Lens:
-    """Resamples what a lens has bent as a pinhole camera of the same K would see it."""
+    """Resamples distorted pictures to a pinhole camera of the same K."""
 
     def __init__(self, K: Float[np.ndarray, "3 3"], distortion: Numbers[float], width: int, height: int):
         self.map = None
@@ -229,11 +233,11 @@ class _Lens:
             self.map = np.asarray(where, np.float32) - 0.5  # OpenCV's centres
             self.outside = ((self.map < -0.5) | (self.map >= np.array([width, height]) - 0.5)).any(axis=-1)
 
-    def straighten(self, picture: np.ndarray) -> np.ndarray:
-        """Colour is interpolated. Depth is that of the nearest pixel: a mean of two surfaces is neither."""
+    def undistort(self, picture: np.ndarray) -> np.ndarray:
+        """Colour is interpolated; depth takes the nearest pixel: a mean of two surfaces lies on neither."""
         if self.map is None:
             return picture
-        how = cv2.INTER_LINEAR if picture.ndim == 3 else cv2.INTER_NEAREST
-        flat = cv2.remap(picture, self.map, None, how, borderMode=cv2.BORDER_REPLICATE)
-        flat[self.outside] = 0
-        return flat
+        interpolation = cv2.INTER_LINEAR if picture.ndim == 3 else cv2.INTER_NEAREST
+        result = cv2.remap(picture, self.map, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
+        result[self.outside] = 0
+        return result

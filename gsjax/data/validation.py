@@ -1,4 +1,4 @@
-"""Checks of cameras, poses, times and depth. Each says where the trouble is, and what to do."""
+"""Checks of cameras, poses, times and depth, whose messages name the location and the remedy."""
 
 import warnings
 from collections.abc import Callable
@@ -9,19 +9,19 @@ from jaxtyping import Float
 from gsjax.data.errors import DataError, DataWarning
 
 ROTATION_TOLERANCE = 1e-2
-"""Largest entry of |R^T R - I| that passes; calibrations are often written with few digits."""
+"""Largest accepted entry of |R^T R - I|; calibrations are often written with few digits."""
 
 FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M = 50.0, 0.02
-"""A median depth outside of this range means a wrong unit rather than a strange scene."""
+"""A median depth outside this range means a wrong unit rather than an unusual scene."""
 
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless an array has a shape.
+    """Raises ValueError unless an array has the expected shape.
 
     Args:
-        name: of the array, for the message.
-        array: what is looked at.
-        shape: what it has to be.
+        name: name of the array, for the message.
+        array: the array to check.
+        shape: the expected shape.
     """
     if np.shape(array) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(array)}")
@@ -30,27 +30,27 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 def check_poses(
     name: str, poses: Float[np.ndarray, "frames things 4 4"], where: Callable[[int, int], str], advice: str
 ) -> None:
-    """Checks that every matrix is a rigid motion.
+    """Check that every matrix is a rigid motion.
 
     Args:
-        name: what the matrices are called.
-        poses: of things in frames.
-        where: (frame, thing) to words, for the message.
-        advice: with which it ends.
+        name: name of the matrices, for the message.
+        poses: the matrices of things in frames.
+        where: (frame, thing) -> description of that entry, for the message.
+        advice: last sentence of the message.
 
     Raises:
-        ValueError: a matrix is not finite, its last row is not 0 0 0 1, or its upper left 3x3 is no rotation;
-            the message says `where(frame, thing)` and ends in `advice`.
+        ValueError: a matrix is not finite, its last row is not 0 0 0 1, or its upper left 3x3 is not a
+            rotation; the message contains `where(frame, thing)` and ends with `advice`.
     """
     rotations = poses[..., :3, :3]
     finite = np.isfinite(poses).all((-1, -2))
     safe = np.where(finite[..., None, None], rotations, np.eye(3))
     skew = np.abs(np.swapaxes(safe, -1, -2) @ safe - np.eye(3)).max((-1, -2))
     problems = [
-        (~finite, lambda i: "it holds NaN or infinity"),
+        (~finite, lambda i: "it contains NaN or infinity"),
         (np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1) > 1e-6, lambda i: f"its last row is {poses[i][3]}"),
-        (skew > ROTATION_TOLERANCE, lambda i: f"R is no rotation: |R^T R - I| reaches {skew[i]:.3g}"),
-        (np.linalg.det(safe) < 0, lambda i: "R is a mirror image, its determinant is negative"),
+        (skew > ROTATION_TOLERANCE, lambda i: f"R is not a rotation: |R^T R - I| reaches {skew[i]:.3g}"),
+        (np.linalg.det(safe) < 0, lambda i: "R is a reflection: its determinant is negative"),
     ]
     for bad, describe in problems:
         if bad.any():
@@ -59,7 +59,7 @@ def check_poses(
 
 
 def check_intrinsics(Ks: Float[np.ndarray, "frames cameras 3 3"], where: Callable[[int, int], str]) -> None:
-    """Raises ValueError where K is not finite, has a focal length <= 0, or a last row other than 0 0 1."""
+    """Raises ValueError if a K is not finite, has a focal length <= 0, or a last row other than 0 0 1."""
     bad = ~np.isfinite(Ks).all((-1, -2)) | (Ks[..., 0, 0] <= 0) | (Ks[..., 1, 1] <= 0)
     bad |= np.abs(Ks[..., 2, :] - [0, 0, 1]).max(-1) > 1e-6
     if bad.any():
@@ -82,17 +82,17 @@ def check_times(times: Float[np.ndarray, "frames"]) -> None:
         before = f" after {times[frame - 1]} s" if frame else ""
         raise ValueError(
             f"times must be finite and increase, but frame {frame} is at {times[frame]} s{before}. "
-            "Sort the frames and drop those that occur twice."
+            "Sort the frames and drop duplicates."
         )
 
 
 def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np.ndarray, "height width"]:
-    """The depth with NaN, infinite and negative pixels made 0 (invalid), after a look at its range.
+    """The depth with NaN, infinite and negative pixels set to 0 (invalid), after a check of its range.
 
-    Warns with DataWarning where no pixel is valid.
+    Warns with DataWarning if no pixel is valid.
 
     Raises:
-        DataError: the median of the valid pixels is beyond 50 m or below 20 mm: the unit is wrong.
+        DataError: the median of the valid pixels is above 50 m or below 20 mm: the unit is wrong.
     """
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     valid = depth[depth > 0]
@@ -101,7 +101,7 @@ def check_depth(depth: Float[np.ndarray, "height width"], what: str) -> Float[np
         return depth
     median = float(np.median(valid))
     if not NEAREST_MEDIAN_M <= median <= FARTHEST_MEDIAN_M:
-        expected = f"depth in metres, its median from {NEAREST_MEDIAN_M} to {FARTHEST_MEDIAN_M}"
-        advice = "The unit is likely wrong: set depth_unit_m, the metres of one step of the depth image."
+        expected = f"depth in metres with a median from {NEAREST_MEDIAN_M} to {FARTHEST_MEDIAN_M}"
+        advice = "The unit is likely wrong: set depth_unit_m, the metres per step of the depth image."
         raise DataError(what, expected, f"a median of {median:.4g} m", advice)
     return depth

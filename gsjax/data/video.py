@@ -1,4 +1,4 @@
-"""Frames of a video by number."""
+"""Random access to the frames of a video."""
 
 import threading
 from pathlib import Path
@@ -10,12 +10,12 @@ from jaxtyping import UInt8
 
 from gsjax.data.errors import DataError
 
-# Decoding on is faster than a seek, which starts at the key frame before.
+# Decoding a few more frames is faster than seeking, which restarts at the previous key frame.
 _SKIP_AT_MOST = 12
 
 
 class VideoFile(NamedTuple):
-    """What a video file says of itself."""
+    """Metadata of a video file."""
 
     width: int
     height: int
@@ -27,31 +27,31 @@ def describe_video(path: Path) -> VideoFile:
     """The size, number of frames and rate of a video.
 
     Raises:
-        DataError: the file is missing or no video.
+        DataError: the file is missing or not a video.
     """
     if not path.exists():
-        raise DataError(path, "a video", "no such file", "Check the folder; was it copied whole?")
+        raise DataError(path, "a video", "no such file", "Check the folder; was it copied completely?")
     capture = cv2.VideoCapture(str(path))
-    wanted = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
-    width, height, frames = (int(capture.get(which)) for which in wanted)
+    properties = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
+    width, height, frames = (int(capture.get(number)) for number in properties)
     rate_hz = capture.get(cv2.CAP_PROP_FPS)
     capture.release()
     if min(width, height, frames, rate_hz) <= 0:
-        raise DataError(path, "a video", "something that does not open", "Fetch the file again.")
+        raise DataError(path, "a video", "a file that does not open", "Fetch the file again.")
     return VideoFile(width, height, frames, rate_hz)
 
 
 class Video:
-    """A video file whose frames are read by number; reading in order is fast. Opened at the first read."""
+    """A video file whose frames are read by number, fastest in order. It is opened at the first read."""
 
     def __init__(self, path: Path, width: int, height: int, num_frames: int):
-        """Expects `num_frames` frames of width x height pixels.
+        """Create a reader that expects `num_frames` frames of width x height pixels.
 
         Raises:
             DataError: the file is missing.
         """
         if not path.exists():
-            raise DataError(path, "a video", "no such file", "Check the folder; was it copied whole?")
+            raise DataError(path, "a video", "no such file", "Check the folder; was it copied completely?")
         self.path, self.width, self.height, self.num_frames = path, int(width), int(height), num_frames
         self._capture: cv2.VideoCapture | None = None
         self._next = 0
@@ -61,7 +61,7 @@ class Video:
         """RGB.
 
         Raises:
-            DataError: the file is no video, has another size or number of frames, or is cut off.
+            DataError: the file is not a video, has another size or number of frames, or is truncated.
         """
         with self._lock:
             capture = self._open()
@@ -70,9 +70,9 @@ class Video:
                 self._next = index
             while self._next < index and capture.grab():
                 self._next += 1
-            read, image = capture.read()
+            success, image = capture.read()
             self._next = index + 1
-        if not read:
+        if not success:
             found = f"no frame {index}"
             raise DataError(
                 self.path, f"{self.num_frames} frames", found, "Fetch the file again; is it cut off?"
@@ -86,10 +86,10 @@ class Video:
         if self._capture is None:
             capture = cv2.VideoCapture(str(self.path))
             if not capture.isOpened():
-                raise DataError(self.path, "a video", "something that does not open", "Fetch the file again.")
+                raise DataError(self.path, "a video", "a file that does not open", "Fetch the file again.")
             count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
             if count != self.num_frames:
-                expected = f"{self.num_frames} frames, one a timestamp"
+                expected = f"{self.num_frames} frames, one per timestamp"
                 raise DataError(self.path, expected, f"{count}", "Fetch the video and its JSON file again.")
             self._capture = capture
         return self._capture

@@ -20,7 +20,7 @@ def save(path: str | os.PathLike, now: Tick) -> None:
     if getattr(method, "extra_losses", ()):
         method = dataclasses.replace(method, extra_losses=())
     stored = {"method": method, "run": now.run, "result": now.result, "info": now.info}
-    times = {"seconds": now.seconds, "compile_seconds": now.compile_seconds}
+    times = {name: getattr(now, name) for name in ("seconds", "compile_seconds", "progress")}
     save_checkpoint(path, stored, times)
 
 

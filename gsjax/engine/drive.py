@@ -45,6 +45,7 @@ class Tick:
         info: losses and diagnostics of this step by name, on the device; see `gsjax.optim.step`.
         seconds: wall time of the step, compiling apart.
         compile_seconds: time that went into tracing and compiling.
+        progress: how far the schedule was before this step, 0 to 1.
     """
 
     method: Method
@@ -53,6 +54,7 @@ class Tick:
     info: dict[str, Any]
     seconds: float
     compile_seconds: float
+    progress: float = 0.0
 
     @property
     def step(self) -> int:
@@ -117,7 +119,7 @@ class Drive(Iterator[Tick]):
                 break
             self.run = self.run.grown(names, info["needed"], self._headroom)
         self.run = self.run.having(step=run.step + 1)
-        self.tick = Tick(method, problem, self.run, info, *clock.read())
+        self.tick = Tick(method, problem, self.run, info, *clock.read(), progress)
         return self.tick
 
 

@@ -33,8 +33,8 @@ _FOLDERS = (
 )
 _PATTERNS = ("video_*.mp4", ".*.partial*")
 # What a run that was stopped has come to.
-_OF_WORTH = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
-_OF_WORTH += ("deformation.npz",)
+_VALUABLE = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
+_VALUABLE += ("deformation.npz",)
 # What it can go on from; `gsjax parts` has a fit within, which may be all that there is.
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
@@ -160,7 +160,7 @@ class RunFolder:
                 "--overwrite"
             )
         resumable = any(any(self.path.glob(pattern)) for pattern in _RESUMED)
-        worth = resumable or any((self.path / name).exists() for name in _OF_WORTH)
+        worth = resumable or any((self.path / name).exists() for name in _VALUABLE)
         if worth and not (resume or overwrite):
             advice = "go on with it by --resume, or " if resumable and resume is not None else ""
             raise FileExistsError(

@@ -16,7 +16,7 @@ Told = TypeVar("Told")
 Ids = Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")]
 Frames = Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")]
 
-OF_NO_BEARING = ("out", "minutes", "resume", "overwrite", "cores", "debug")
+RESUME_MAY_CHANGE = ("out", "minutes", "resume", "overwrite", "cores", "debug")
 """On what is computed: a run may be resumed with others."""
 
 

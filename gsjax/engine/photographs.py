@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.progress import track
 
 from gsjax.data.errors import DataWarning
-from gsjax.data.open import ReadOptions, is_of_photographs, is_recording, open_photographs
+from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_options
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.machine import available_mb
 from gsjax.engine.recording import expect_enough_left, open_recording, parse_frames
-from gsjax.methods.fit import View
+from gsjax.scene.frame import Frame
 
 _LARGE = 1600  # pixels, a side
 _BYTES_A_PIXEL = 8  # a photograph, as it is and on the device, and a mask
@@ -50,7 +50,7 @@ def choose_photographs(
             folder of a run.
     """
     expect_dataset(dataset)
-    if is_of_photographs(dataset) or not is_recording(dataset):
+    if is_photographs(dataset) or not is_recording(dataset):
         photographs = open_photographs(dataset, read)
         for option, ids in (("--cameras", cameras), ("--eval-cameras", eval_cameras)):
             if ids:
@@ -108,7 +108,7 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
 
 
 def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
-    """Which photographs are fitted and which are held out: as the data says, else every so-manieth.
+    """Which photographs are fitted and which are held out: as the data says, else every n-th.
 
     Raises:
         ValueError: none is left to fit.
@@ -126,8 +126,8 @@ def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], I
     return chosen, indices[held_out]
 
 
-def read_views(photographs: Photographs, console: Console) -> list[View]:
-    """All photographs in memory.
+def read_frames(photographs: Photographs, console: Console) -> list[Frame]:
+    """All photographs in memory, each as a frame of one camera.
 
     Raises:
         DataError: one is bad.
@@ -140,13 +140,8 @@ def read_views(photographs: Photographs, console: Console) -> list[View]:
             f"{free / 1e3:.1f} GB are free; try --scale, or fewer --frames"
         )
 
-    def read(i: int) -> View:
-        mask, depth = photographs.mask(i), photographs.depth(i)
-        viewmat, K = photographs.viewmats[i], photographs.Ks[i]
-        return View(photographs.image(i), mask, depth, viewmat, K, photographs.near)
-
     with ThreadPoolExecutor(2) as executor:
-        jobs = [executor.submit(read, i) for i in range(photographs.num)]
+        jobs = [executor.submit(photographs.frame, i) for i in range(photographs.num)]
         try:
             shown = track(jobs, "reading photographs", console=console, transient=True)
             return [job.result() for job in shown]

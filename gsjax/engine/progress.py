@@ -44,6 +44,7 @@ class Progress:
         compile_seconds: of tracing and compiling.
         skipped: steps up to the last row that changed nothing, for a number in them was not finite.
         stopped: what ended it early, or None.
+        pace: steps a second of late; 0 before any is known.
     """
 
     about: Mapping[str, str | None] = field(default_factory=dict)
@@ -53,6 +54,7 @@ class Progress:
     compile_seconds: float = 0.0
     skipped: int = 0
     stopped: BaseException | None = None
+    pace: float = field(default=0.0, init=False)
 
     @property
     def used_seconds(self) -> float:
@@ -67,6 +69,9 @@ class Progress:
         """One step more."""
         self.seconds += tick.seconds
         self.compile_seconds += tick.compile_seconds
+        if tick.seconds and not tick.compile_seconds:
+            now = 1 / tick.seconds
+            self.pace = 1 / (0.95 / self.pace + 0.05 / now) if self.pace else now
         self.recent.append({name: tick.info[name] for name in _scalars(tick.info)})
 
     def metadata(self) -> dict[str, Any]:
@@ -102,23 +107,23 @@ class Schedule:
     Attributes:
         doing: in a word: "distilling".
         total: steps, in all.
-        row: infos of the steps since the last row, on the host, without skipped ones -> what the row has
-            beside step and seconds. See `means_of`.
+        row: (tick, infos of the steps since the last row, on the host, without skipped ones) -> what the row
+            has beside step and seconds. See `means_of`.
         words: a row in words.
         every: steps between rows.
     """
 
     doing: str
     total: int
-    row: Callable[[list[Mapping[str, Any]]], dict[str, Any]]
+    row: Callable[[Tick, list[Mapping[str, Any]]], dict[str, Any]]
     words: Callable[[Mapping[str, Any]], str]
     every: int = 10
 
 
-def means_of(*names: str) -> Callable[[list[Mapping[str, Any]]], dict[str, Any]]:
+def means_of(*names: str) -> Callable[[Tick, list[Mapping[str, Any]]], dict[str, Any]]:
     """The row of a schedule that has the mean of each loss by name, None where no step had it."""
 
-    def row(infos: list[Mapping[str, Any]]) -> dict[str, Any]:
+    def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
         found = {}
         for name in ("loss", *names):
             values = [float(info[name]) for info in infos if name in info]
@@ -263,7 +268,7 @@ def _add_row(
     sound = [info for info in infos if not info["skipped"]]
     progress.skipped += len(infos) - len(sound)
     progress.recent = []
-    row = {"step": now.step, "seconds": progress.used_seconds, **schedule.row(sound), **more}
+    row = {"step": now.step, "seconds": progress.used_seconds, **schedule.row(now, sound), **more}
     progress.rows.append(row)
     with atomic_write(folder.metrics_lines) as temporary:
         temporary.write_text("".join(json.dumps(one) + "\n" for one in progress.rows), encoding="utf-8")

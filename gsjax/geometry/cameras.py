@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,7 +15,7 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 NEAR = 0.01
-"""Metres; so near is nothing that a camera sees sharply."""
+"""Default near plane, metres; cameras do not focus closer than this."""
 
 
 class Camera(eqx.Module):
@@ -25,7 +26,8 @@ class Camera(eqx.Module):
         K: intrinsics in pixels; the principal point counts pixel centres at +0.5.
         width: pixels, static.
         height: pixels, static.
-        near: what is nearer is not drawn, metres, static: the rig itself, where cameras see each other.
+        near: distance of the near plane, metres, static. Anything nearer is not drawn, such as parts of the
+            rig where cameras see each other.
     """
 
     viewmat: Float[Array | np.ndarray, "*batch 4 4"]
@@ -43,7 +45,7 @@ def viewmat_from_opengl(camera_to_world: Float[np.ndarray, "*batch 4 4"]) -> Flo
 def look_at(
     eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "4 4"]:
-    """The view matrix of a camera at `eye` that looks at `target`; `up` is +z unless told.
+    """The view matrix of a camera at `eye` that looks at `target`; `up` defaults to +z.
 
     Raises:
         ValueError: the viewing direction is zero or parallel to `up`.
@@ -64,11 +66,11 @@ def look_at(
 def intrinsics(
     focal: float, width: int, height: int, center: tuple[float, float] | None = None
 ) -> Float[np.ndarray, "3 3"]:
-    """K of a camera with square pixels; the principal point is the middle of the image unless told.
+    """K of a camera with square pixels; the principal point defaults to the middle of the image.
 
     Args:
-        focal: pixels, of both axes.
-        width, height: of the image, pixels.
+        focal: focal length along both axes, pixels.
+        width, height: size of the image, pixels.
         center: principal point (cx, cy), pixel centres at +0.5.
     """
     cx, cy = center or (width / 2, height / 2)
@@ -83,12 +85,12 @@ def on_device(camera: Camera) -> Camera:
 
 
 def resized(camera: Camera, scale: float, width: int, height: int) -> Camera:
-    """The same view in pictures of another size, whose pixels are 1 / `scale` times as wide.
+    """The same view at another resolution, with pixels 1 / `scale` times as wide.
 
     Args:
-        camera: of the pictures as they are.
-        scale: pixels of the new ones for each of these.
-        width, height: of the new ones, pixels.
+        camera: camera at the present resolution.
+        scale: new pixels per old pixel.
+        width, height: new size of the image, pixels.
     """
     K = camera.K * jnp.array([[scale], [scale], [1.0]])
     return Camera(camera.viewmat, K, width, height, camera.near)
@@ -104,7 +106,7 @@ def world_to_camera(points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"]) 
 def project(
     points: Float[Array, "*n 3"], viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
-    """Pixel positions and depths of world points in one camera; those nearer than 1e-6 m as if there.
+    """Pixel positions and depths of world points in one camera; the division clamps depths to 1e-6 m.
 
     Args:
         points: world, metres.
@@ -117,13 +119,13 @@ def project(
     return homogeneous[..., :2] / jnp.maximum(z, 1e-6)[..., None], z
 
 
-class PixelsOf(NamedTuple):
-    """The pixels on which points fall.
+class PointPixels(NamedTuple):
+    """The pixels onto which points project.
 
     Attributes:
-        columns, rows: of the pixel; 0 of a point outside.
+        columns, rows: indices of the pixel; 0 for a point outside the image.
         depths: z in the camera's frame, metres.
-        inside: before the camera and in the picture.
+        inside: whether the point is in front of the camera and inside the image.
     """
 
     columns: Int[np.ndarray, "n"]
@@ -138,13 +140,13 @@ def pixels_of(
     K: Float[np.ndarray, "3 3"],
     width: int,
     height: int,
-) -> PixelsOf:
-    """Which pixel of a picture each point falls on, on the host; whether it is seen there, a depth tells.
+) -> PointPixels:
+    """The pixel onto which each point projects, on the host. Occlusion is not tested.
 
     Args:
         points: world, metres.
-        viewmat, K: of the camera.
-        width, height: of the picture, pixels.
+        viewmat, K: pose and intrinsics of the camera.
+        width, height: size of the image, pixels.
     """
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = local[:, 2]
@@ -152,7 +154,7 @@ def pixels_of(
     xy = (local @ K.T)[:, :2] / ahead[:, None]
     inside = np.isfinite(ahead) & (xy >= 0).all(axis=1) & (xy < (width, height)).all(axis=1)
     columns, rows = np.where(inside[:, None], xy, 0).astype(int).T
-    return PixelsOf(columns, rows, depths, inside)
+    return PointPixels(columns, rows, depths, inside)
 
 
 @partial(jax.jit, inline=True)
@@ -162,12 +164,12 @@ def unproject(
     viewmat: Float[Array, "4 4"],
     K: Float[Array, "3 3"],
 ) -> Float[Array, "*n 3"]:
-    """World points at z-depth `depths` behind `pixels` of one camera; the inverse of `project`.
+    """World points at z-depth `depths` on the rays through `pixels`; the inverse of `project`.
 
     Args:
         pixels: (x, y), centres at +0.5.
         depths: along the optical axis, metres.
-        viewmat, K: of the camera, as for `project`.
+        viewmat, K: pose and intrinsics of the camera, as for `project`.
     """
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * (pixels[..., 1] - K[1, 2]) / K[1, 1]) / K[0, 0]
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
@@ -179,6 +181,23 @@ def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch
     """Positions of cameras in the world: -R^T t."""
     rotations, translations = viewmats[..., :3, :3], viewmats[..., :3, 3]
     return -jnp.einsum("...ji,...j->...i", rotations, translations, precision="highest")
+
+
+def perturbed(
+    viewmats: Float[Array, "c 4 4"], twist: Float[Array, "6"], radius: float
+) -> Float[Array, "c 4 4"]:
+    """View matrices of cameras that are rotated about their own centres and shifted, all by one twist.
+
+    Args:
+        viewmats: world to camera.
+        twist: a rotation vector (radians) and a shift (in units of `radius`), both along the world's axes.
+        radius: radius of the scene, metres.
+    """
+    turn = jaxlie.SO3.exp(twist[:3]).as_matrix()
+    rotations = jnp.matmul(viewmats[:, :3, :3], turn.T, precision="highest")
+    centers = -jnp.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3]) + radius * twist[3:]
+    shifts = -jnp.einsum("cij,cj->ci", rotations, centers)
+    return viewmats.at[:, :3, :3].set(rotations).at[:, :3, 3].set(shifts)
 
 
 def pixel_grid(width: int, height: int) -> Float[Array, "height width 2"]:

@@ -1,7 +1,7 @@
-"""Lens distortion as OpenCV models it, of points and of whole images, differentiable in everything.
+"""OpenCV's models of lens distortion for points and whole images, differentiable in every argument.
 
-Points are normalised, (x, y) = (X/Z, Y/Z), without unit. `model="opencv"` has 4, 5 or 8 coefficients in
-OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6), those left out being 0; with r^2 = x^2 + y^2
+Points are normalised and dimensionless, (x, y) = (X/Z, Y/Z). `model="opencv"` has 4, 5 or 8 coefficients in
+OpenCV's order (k1, k2, p1, p2, k3, k4, k5, k6); missing ones are 0. With r^2 = x^2 + y^2
 
     s  = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
     x' = s x + 2 p1 x y + p2 (r^2 + 2 x^2)            y' = s y + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -10,9 +10,9 @@ and `model="opencv_fisheye"` has 4 (k1, k2, k3, k4); with theta = atan(r)
 
     (x', y') = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r (x, y)
 
-Pixel centres lie at +0.5 here and at integers in OpenCV: a K for OpenCV has cx, cy smaller by 0.5, and so are
-the positions in its maps. A K may have skew. An unknown model, or another number of coefficients, is a
-ValueError everywhere.
+Pixel centres lie at +0.5 here and at integers in OpenCV: cx and cy of a K for OpenCV are smaller by 0.5, and
+so are the positions in its maps. K may have skew. Every function raises ValueError for an unknown model or a
+wrong number of coefficients.
 
 Sources: docs.opencv.org, modules calib3d and fisheye; Brown 1966; Kannala, Brandt, PAMI 28(8), 2006.
 """
@@ -31,39 +31,39 @@ Coeffs = Float[Array, "k"]
 Image = Float[Array, "rows columns channels"]
 
 MODELS = {"opencv": (4, 5, 8), "opencv_fisheye": (4,)}
-"""The models, and how many coefficients each may have."""
+"""The models, and the numbers of coefficients that each accepts."""
 
 _ITERATIONS = 20  # Newton needs 4 to 8 of them; at a fold, where the Jacobian is singular, more
-_RAY = 16  # where the way to a solution is looked at for folds
-_CONDITION = 1e-4  # least det J / |J|^2, about 1 over the condition number, that counts as invertible
-_HORIZON = 1.57  # radians off axis, 0.05 degrees short of a right angle, where x and y end
-_EDGE = 1e-3  # pixels: K and its inverse do not cancel to the bit
+_RAY = 16  # points on the way to a solution that are checked for folds
+_CONDITION = 1e-4  # smallest det J / |J|^2, about 1 over the condition number, that counts as invertible
+_HORIZON = 1.57  # largest angle off axis, radians; 0.05 degrees short of a right angle, where x and y diverge
+_EDGE = 1e-3  # pixels; K and its inverse do not cancel exactly
 
 
 class Undistorted(NamedTuple):
-    """Points before distortion, and where there are such."""
+    """Undistorted points, and which of them exist."""
 
     points: Float[Array, "*n 2"]  # always finite
     valid: Bool[Array, "*n"]
 
 
 class Warped(NamedTuple):
-    """A resampled image, and which of its pixels are known."""
+    """A resampled image, and which of its pixels are valid."""
 
     image: Float[Array, "height width channels"]  # 0 where not valid
     valid: Bool[Array, "height width"]
 
 
 def distort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv") -> Float[Array, "*n 2"]:
-    """Where a lens moves normalised points. Zero coefficients of "opencv" move nothing by a bit.
+    """Distort normalised points. With zero coefficients, "opencv" is exactly the identity.
 
-    Far out the polynomials fold back, and a point that the camera cannot see may land in the image. What is
-    not finite, or so far out that r^6 is not, becomes NaN with gradients of zero; if coefficients are not
-    finite, all points do.
+    Far off axis the polynomials fold back, and a point that the camera cannot see may land in the image.
+    Points that are not finite, or so far out that r^6 overflows, become NaN with zero gradients; if any
+    coefficient is not finite, all points do.
 
     Args:
         points: normalised, (X/Z, Y/Z).
-        coeffs: of the lens, in the order above.
+        coeffs: coefficients of the lens, in the order above.
         model: "opencv" or "opencv_fisheye".
     """
     c, sound = _padded(coeffs, model)
@@ -76,15 +76,15 @@ def distort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv")
 
 
 def undistort(points: Float[Array, "*n 2"], coeffs: Coeffs, model: str = "opencv") -> Undistorted:
-    """The inverse of `distort`, by Newton's method, with the exact derivative of the implicit function.
+    """The inverse of `distort`, by Newton's method, differentiated exactly by the implicit function theorem.
 
-    Not valid are points beyond the fold (nothing is distorted to there), those nearer to it than a condition
-    number of 1e4, those 90 degrees off axis, and what is not finite; no point is if coefficients are not.
-    There the result is finite and its gradients are zero.
+    A point is invalid if it lies beyond the fold (nothing is distorted to there) or so near to it that the
+    condition number exceeds 1e4, if it is 90 degrees off axis, or if it is not finite; all points are invalid
+    if a coefficient is not finite. For invalid points the result is finite and its gradients are zero.
 
     Args:
-        points: normalised, as the lens shows them.
-        coeffs, model: of the lens, as for `distort`.
+        points: distorted, normalised.
+        coeffs, model: the lens, as for `distort`.
     """
     c, sound = _padded(coeffs, model)
     dtype = jnp.result_type(points, c)
@@ -105,8 +105,8 @@ def undistort_map(
 
     Args:
         K, coeffs, model: the camera that took the photograph.
-        width, height: of the pinhole image.
-        pinhole_K: of the pinhole image; K unless given.
+        width, height: size of the pinhole image, pixels.
+        pinhole_K: intrinsics of the pinhole image; default: K.
     """
     ideal = _normalized_grid(width, height, K if pinhole_K is None else pinhole_K)
     return _to_pixels(distort(ideal, coeffs, model), K)
@@ -117,7 +117,7 @@ def distort_map(
 ) -> Undistorted:
     """Where in an ideal pinhole image the pixels of a photograph lie, pixels [height, width, 2].
 
-    Arguments as for `undistort_map`, but width and height are those of the photograph.
+    Arguments as for `undistort_map`, except that width and height are those of the photograph.
     """
     ideal, valid = undistort(_normalized_grid(width, height, K), coeffs, model)
     return Undistorted(_to_pixels(ideal, K if pinhole_K is None else pinhole_K), valid)
@@ -132,9 +132,9 @@ def undistort_image(
     size: tuple[int, int] | None = None,
     model: str = "opencv",
 ) -> Warped:
-    """A photograph as an ideal pinhole camera would have taken it, to compare with what is rendered.
+    """The photograph that an ideal pinhole camera would have taken, to compare with a rendered image.
 
-    Arguments as for `undistort_map`; `size` is (width, height) of the result, the photograph's unless given.
+    Arguments as for `undistort_map`; `size` is (width, height) of the result, by default the photograph's.
     """
     width, height = size or image.shape[1::-1]
     return sample(image, undistort_map(K, coeffs, width, height, pinhole_K, model))
@@ -149,17 +149,17 @@ def distort_image(
     size: tuple[int, int] | None = None,
     model: str = "opencv",
 ) -> Warped:
-    """A rendered pinhole image as the camera with this lens sees it: how a lens is fitted to photographs.
+    """A rendered pinhole image as seen through a lens; used to fit a lens to photographs.
 
-    Differentiable in image, K, pinhole_K and coeffs. What a lens pulls in from outside the frame has to be
-    rendered too: render with `with_margin`, and ask for the `size` of the photograph. Do not
-    leave out of a loss what is not valid: a lens that folds everything away would cost nothing.
+    Differentiable in image, K, pinhole_K and coeffs. A lens may pull in pixels from outside the frame, and
+    these have to be rendered too: render with `with_margin`, and pass the `size` of the photograph. Do not
+    exclude invalid pixels from a loss: a lens that folds everything away would then cost nothing.
 
     Args:
-        image: the rendered one.
-        K, coeffs, model: of the camera with the lens, as for `undistort_map`.
-        pinhole_K: of the rendered image; K unless given.
-        size: (width, height) of the result, the image's unless given.
+        image: the rendered image.
+        K, coeffs, model: the camera with the lens, as for `undistort_map`.
+        pinhole_K: intrinsics of the rendered image; default: K.
+        size: (width, height) of the result; default: that of `image`.
     """
     width, height = size or image.shape[1::-1]
     pixels, valid = distort_map(K, coeffs, width, height, pinhole_K, model)
@@ -168,26 +168,26 @@ def distort_image(
 
 
 def with_margin(K: Matrix, width: int, height: int, margin: int) -> tuple[Matrix, int, int]:
-    """(K, width, height) of the same camera with `margin` more pixels on each side."""
+    """(K, width, height) of the same camera with a margin of `margin` pixels added on each side."""
     return jnp.asarray(K).at[:2, 2].add(margin), width + 2 * margin, height + 2 * margin
 
 
 def sample(image: Image, pixels: Float[Array, "height width 2"]) -> Warped:
     """Bilinear interpolation of `image` at positions (x, y) in pixels, centres at +0.5.
 
-    Valid is what lies between the outermost centres and has only finite pixels for neighbours.
+    A position is valid if it lies between the outermost pixel centres and all of its neighbours are finite.
     """
     last = jnp.array(image.shape[1::-1]) - 1
     finite = jnp.isfinite(image).all(axis=-1)
     image = jnp.where(finite[..., None], image, 0.0)
     at = pixels - 0.5
-    valid = ((at >= -_EDGE) & (at <= last + _EDGE)).all(axis=-1)  # NaN is not
+    valid = ((at >= -_EDGE) & (at <= last + _EDGE)).all(axis=-1)  # False for NaN
     at = jnp.clip(jnp.where(valid[..., None], at, 0.0), 0.0, last)
     low = jnp.floor(at)
     total = jnp.zeros((*valid.shape, image.shape[-1]), image.dtype)
     for corner in jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]):
         weight = jnp.where(corner == 1, at - low, 1 - (at - low)).prod(axis=-1)
-        # Beside the last row or column lies nothing, but that has weight 0.
+        # Beyond the last row or column there is no pixel, but its weight is 0.
         x, y = jnp.moveaxis(jnp.minimum(low + corner, last).astype(jnp.int32), -1, 0)
         total += weight[..., None] * image[y, x]
         valid &= finite[y, x] | (weight == 0)
@@ -195,22 +195,23 @@ def sample(image: Image, pixels: Float[Array, "height width 2"]) -> Warped:
 
 
 def _padded(coeffs: Coeffs, model: str) -> tuple[Float[Array, "9"], Bool[Array, ""]]:
-    """Coefficients of `_bend`: the numerator's of r^2 to r^8, the denominator's of r^2 to r^6, p1, p2.
+    """Coefficients of `_bend` (numerator r^2..r^8, denominator r^2..r^6, p1, p2), and whether all are finite.
 
-    Zeros, and False, if one of them is not finite.
+    If any is not, all are replaced by zeros.
     """
     if model not in MODELS:
-        raise ValueError(f"model is one of {', '.join(MODELS)}, not {model!r}")
+        raise ValueError(f"model: expected one of {', '.join(MODELS)}, found {model!r}")
     counts, coeffs = MODELS[model], jnp.asarray(coeffs)
     if coeffs.ndim != 1 or len(coeffs) not in counts:
-        raise ValueError(f"coeffs of {model} are {counts} in number, but have shape {coeffs.shape}")
+        listed = " or ".join(map(str, counts))
+        raise ValueError(f"coeffs: expected {listed} coefficients for {model}, found shape {coeffs.shape}")
     order = (0, 1, 2, 3, 8, 8, 8, 8, 8) if model == "opencv_fisheye" else (0, 1, 4, 8, 5, 6, 7, 2, 3)
     sound = jnp.isfinite(coeffs).all()
     return jnp.pad(jnp.where(sound, coeffs, 0.0), (0, 9 - len(coeffs)))[np.array(order)], sound
 
 
 def _bend(points: Float[Array, "*n 2"], c: Float[Array, "9"]) -> Float[Array, "*n 2"]:
-    """The distortion of points; of the fisheye, of points at a distance of theta from the axis."""
+    """Apply the distortion; for the fisheye, the points' distance from the axis is theta."""
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     numerator = 1 + r2 * (c[0] + r2 * (c[1] + r2 * (c[2] + r2 * c[3])))
@@ -223,7 +224,7 @@ def _bend(points: Float[Array, "*n 2"], c: Float[Array, "9"]) -> Float[Array, "*
 def _slope(
     points: Float[Array, "*n 2"], c: Float[Array, "9"]
 ) -> tuple[Float[Array, "*n 4"], Bool[Array, "*n"]]:
-    """d bend / d points by rows, and whether it is sound: invertible, and not turned over by a fold."""
+    """The Jacobian of `_bend`, row-major, and whether it is sound: invertible, and not flipped by a fold."""
 
     def along(axis):
         direction = jnp.zeros_like(points).at[..., axis].set(1.0)
@@ -245,11 +246,11 @@ def _divide(v: Float[Array, "*n 2"], J: Float[Array, "*n 4"]) -> Float[Array, "*
 def _unbend(
     points: Float[Array, "*n 2"], coeffs: Float[Array, "9"]
 ) -> tuple[Float[Array, "*n 2"], Bool[Array, "*n"]]:
-    """The inverse of `_bend`, and where it is one. Steps that come no nearer, or cross a fold, shrink."""
+    """The inverse of `_bend`, and where it exists. Steps that raise the error or cross a fold shrink."""
     target = jnp.where(jnp.isfinite(points).all(axis=-1, keepdims=True), points, 0.0)
 
     def iteration(_, carry):
-        at, distance, rate = carry  # at: the point, where it is bent to, and the slope there
+        at, distance, rate = carry  # at: the point, its image under `_bend`, and the Jacobian there
         point = at[..., :2] + rate * _divide(target - at[..., 2:4], at[..., 4:])
         bent = _bend(point, coeffs)
         slope, sound = _slope(point, coeffs)
@@ -265,12 +266,12 @@ def _unbend(
     solution = jax.lax.fori_loop(0, _ITERATIONS, iteration, start)[0][..., :2]
 
     tolerance = 32 * jnp.finfo(points.dtype).eps * (1 + jnp.abs(points))
-    solved = (jnp.abs(_bend(solution, coeffs) - points) <= tolerance).all(axis=-1)  # NaN is not
+    solved = (jnp.abs(_bend(solution, coeffs) - points) <= tolerance).all(axis=-1)  # False for NaN
 
-    def look(i, solved):
+    def check_for_fold(i, solved):
         return solved & _slope(solution * ((i + 1) / _RAY).astype(points.dtype), coeffs)[1]
 
-    return solution, jax.lax.fori_loop(0, _RAY, look, solved)
+    return solution, jax.lax.fori_loop(0, _RAY, check_for_fold, solved)
 
 
 @_unbend.defjvp
@@ -278,21 +279,21 @@ def _unbend_jvp(primals, tangents):
     """bend(u, c) = d, so du = J^-1 (dd - d bend/dc dc)."""
     (points, coeffs), (d_points, d_coeffs) = primals, tangents
     solution, solved = _unbend(points, coeffs)
-    u = jnp.where(solved[..., None], solution, 0.0)  # where J is the identity
+    u = jnp.where(solved[..., None], solution, 0.0)  # at 0, J is the identity
     _, by_coeffs = jax.jvp(lambda c: _bend(u, c), (coeffs,), (d_coeffs,))
     moved = jnp.where(solved[..., None], _divide(d_points - by_coeffs, _slope(u, coeffs)[0]), 0.0)
     return (solution, solved), (moved, np.zeros(solved.shape, jax.dtypes.float0))
 
 
 def _atan_over_r(r2):
-    """atan(r) / r of r^2; a series near 0, where the root has no derivative."""
+    """atan(r) / r as a function of r^2; a series near 0, where the square root has no derivative."""
     small = r2 < 1e-4
     r = jnp.sqrt(jnp.where(small, 1.0, r2))
     return jnp.where(small, 1 - r2 * (1 / 3 - r2 * (1 / 5 - r2 * (1 / 7 - r2 / 9))), jnp.arctan(r) / r)
 
 
 def _tan_over_t(t2):
-    """tan(t) / t of t^2, the same way."""
+    """tan(t) / t as a function of t^2, likewise."""
     small = t2 < 1e-4
     t = jnp.sqrt(jnp.where(small, 1.0, t2))
     series = 1 + t2 * (1 / 3 + t2 * (2 / 15 + t2 * (17 / 315 + t2 * 62 / 2835)))

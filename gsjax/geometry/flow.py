@@ -1,10 +1,10 @@
-"""Optical flow: pixels (x, y) that each pixel of one picture moves until another one; NaN where unknown."""
+"""Optical flow: displacements (x, y) of pixels from one image to another, in pixels; NaN where unknown."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import map_coordinates
 
-# Of squared lengths in pixels, as Sundaram, Brox and Keutzer (2010) and Lai et al. (2018) have them.
+# Thresholds on squared lengths in pixels, as in Sundaram, Brox and Keutzer (2010) and Lai et al. (2018).
 _ROUND_TRIP, _ROUND_TRIP_LEAST = 0.01, 0.5
 _EDGE, _EDGE_LEAST = 0.01, 0.002
 
@@ -12,13 +12,13 @@ _EDGE, _EDGE_LEAST = 0.01, 0.002
 def warp(
     image: Shaped[np.ndarray, "H W *channels"], flow: Float[np.ndarray, "H W 2"]
 ) -> Float[np.ndarray, "H W *channels"]:
-    """The other picture as it looks from the first one: each pixel x takes image(x + flow(x)), bilinear.
+    """Warp an image back along a flow: pixel x of the result is image(x + flow(x)), interpolated bilinearly.
 
-    NaN where the flow is unknown or leaves the picture, and where it ends on or beside a pixel that is NaN.
+    NaN where the flow is unknown or leaves the image, and where it ends on or next to a NaN pixel.
 
     Args:
-        image: the picture to which the flow leads; of a mask the share that is True comes out.
-        flow: from each pixel of the picture that comes out.
+        image: the image to which the flow leads. A mask gives the fraction that is True.
+        flow: flow from each pixel of the result to `image`, pixels.
     """
     rows, columns = np.indices(flow.shape[:2])
     known = np.isfinite(flow).all(-1)
@@ -35,18 +35,18 @@ def warp(
 def seen_in_both(
     forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray, "H W 2"]
 ) -> Bool[np.ndarray, "H W"]:
-    """Where the flow of the first picture can be believed: the way there and back ends where it began, and
-    the flow has no edge.
+    """Pixels of the first image that are visible in both: forward and backward flow agree, and the flow has
+    no edge there.
 
         |f + b'|^2 <= 0.01 (|f|^2 + |b'|^2) + 0.5    and    |grad u|^2 + |grad v|^2 <= 0.01 |f|^2 + 0.002
 
-    with f = (u, v) the flow forward, and b' the flow backward where f ends. These are the thresholds with
-    which Lai et al., "Learning Blind Video Temporal Consistency" (ECCV 2018), leave occlusions out, after
-    Sundaram, Brox and Keutzer (ECCV 2010). What leaves the picture is not seen in both.
+    with f = (u, v) the forward flow, and b' the backward flow where f ends. These are the thresholds with
+    which Lai et al., "Learning Blind Video Temporal Consistency" (ECCV 2018), exclude occlusions, after
+    Sundaram, Brox and Keutzer (ECCV 2010). Pixels that leave the image are not visible in both.
 
     Args:
-        forward: from the first picture to the second.
-        backward: from the second to the first.
+        forward: flow from the first image to the second.
+        backward: flow from the second image to the first.
     """
     back = warp(backward, forward)
     squared = _squared(forward)
@@ -60,5 +60,5 @@ def _squared(flow: np.ndarray) -> np.ndarray:
 
 
 def _last(flow: np.ndarray, axis: int) -> np.ndarray:
-    """The last row or column, so that there is no step behind it."""
+    """The last row or column; appended, it makes the last difference zero."""
     return np.take(flow, [-1], axis=axis)

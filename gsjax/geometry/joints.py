@@ -1,4 +1,4 @@
-"""Joints: how a part can move against what it is fixed to, and which joint fits a motion that was seen."""
+"""Joints: how a part can move relative to what it is attached to, and which joint fits an observed motion."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,16 +12,16 @@ KINDS = ("prismatic", "revolute")
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint whose axis stands still, and how far it was open over time.
+    """A joint with a fixed axis, and how far it was open over time.
 
     Attributes:
         kind: "prismatic" (slides along the axis) or "revolute" (turns about it, right-handed).
-        axis: direction in the world, of length 1, [3].
-        point: on the axis, metres, world, [3].
-        values: metres or radians, [T].
+        axis: unit direction of the axis in the world, [3].
+        point: a point on the axis, world, metres, [3].
+        values: displacement (metres) or angle (radians) at each frame, [T].
 
     Raises:
-        ValueError: shapes or the kind are wrong, or the axis is not of length 1.
+        ValueError: a shape or the kind is wrong, or the axis is not of length 1.
     """
 
     kind: str
@@ -41,7 +41,7 @@ class Joint:
             raise ValueError(f"axis: expected a direction of length 1, found length {length:.4g}")
 
     def motions(self) -> Float[np.ndarray, "frames 4 4"]:
-        """The rigid motions of the world that take a part from value 0 to where it was."""
+        """Rigid motions, in the world, that take the part from value 0 to its pose at each frame."""
         motions = np.broadcast_to(np.eye(4), (len(self.values), 4, 4)).copy()
         along = self.values[:, None] * self.axis
         if self.kind == "prismatic":
@@ -53,15 +53,15 @@ class Joint:
 
 
 class FittedJoint(NamedTuple):
-    """What a part's motion says of its joint.
+    """The joint inferred from a part's motion.
 
     Attributes:
         kind: "fixed", "prismatic", "revolute", or "free" where no joint explains the motion.
-        joint: of that kind; None for the others.
-        errors_m: how far points of the part are from where a part that is fixed, prismatic or revolute would
-            have them, by name, root mean square.
-        confidence: 0 to 1; how far the errors are from where the answer would be another, as a share: 0 is as
-            well free as on a joint, or as well on the other joint as on this one.
+        joint: the fitted joint if `kind` is prismatic or revolute, else None.
+        errors_m: root mean square distance, metres, of the part's points from their positions under the best
+            fixed, prismatic and revolute joint, by name.
+        confidence: 0 to 1; relative distance of the errors from the decision boundary. At 0, the part is as
+            likely free as on a joint, or as likely on the other joint as on this one.
     """
 
     kind: str
@@ -80,19 +80,21 @@ def fit_joint(
 ) -> FittedJoint:
     """The simplest joint that explains a rigid motion, in closed form.
 
-    A slide is the line of the points' middle; a turn has the axis that the rotations share (the first
-    principal direction of their rotation vectors), each angle by the nearest rotation about it, and the point
-    that these leave in place, in least squares. Each is judged by where it takes the part's own points.
+    A prismatic joint is fitted as a line to the path of the points' centroid. A revolute joint takes its axis
+    from the first principal direction of the rotation vectors, each angle from the nearest rotation about
+    that axis, and its point as the one that these rotations keep in place, in the least-squares sense. Both
+    are judged by where they move the part's own points.
 
     Args:
-        motions: that take the part from its canonical place to where it is, in the frame of what it is fixed
-            to (the world, if that stands still).
-        points: of the part, canonical, metres.
-        noise_m: what moves less is fixed; an error that counts as none.
-        tolerance: error of a joint, as a share of the motion's own size, up to which it explains the motion.
-            A box that slides and turns steadily at once is 4 to 8 % from a hinge: more allows for noise, and
-            calls that box a hinge, of which it is then not very sure.
-        least_turn_rad: a turn by less is none: about an axis far away it is as good as a slide.
+        motions: rigid motions that take the part from its canonical pose to its pose at each frame, in the
+            frame of what it is attached to (the world, if that is static).
+        points: points of the part in its canonical pose, metres.
+        noise_m: a part that moves less than this is fixed, and a smaller error counts as none; metres.
+        tolerance: largest error of a joint, as a fraction of the extent of the motion, at which it still
+            explains the motion. A box that slides and turns steadily at the same time is 4 to 8 % from a
+            hinge: a larger tolerance allows for noise, but calls that box a hinge, with low confidence.
+        least_turn_rad: a joint that turns by less is never revolute, since about a distant axis a small
+            rotation looks like a translation; radians.
     """
     moved = np.einsum("tij,nj->tni", motions[:, :3, :3], points) + motions[:, None, :3, 3]
     found = {
@@ -101,8 +103,8 @@ def fit_joint(
     }
     errors = {"fixed": _rms(moved - points)}
     for kind, joint in found.items():
-        told = joint.motions()
-        predicted = np.einsum("tij,nj->tni", told[:, :3, :3], points) + told[:, None, :3, 3]
+        along = joint.motions()
+        predicted = np.einsum("tij,nj->tni", along[:, :3, :3], points) + along[:, None, :3, 3]
         errors[kind] = _rms(moved - predicted)
     if errors["fixed"] <= noise_m:
         return FittedJoint("fixed", None, errors, 1 - errors["fixed"] / noise_m)
@@ -131,13 +133,13 @@ def _turn(
     along = np.einsum("i,tij,j->t", axis, rotations, axis)
     angles = np.unwrap(np.arctan2(skew @ axis, np.trace(rotations, axis1=1, axis2=2) - along))
     about = Rotation.from_rotvec(angles[:, None] * axis).as_matrix()
-    # (I - R)(p - middle) = middle_t - middle; of all p along the axis the one nearest to the middle.
+    # (I - R)(p - middle) = middle_t - middle; of all p along the axis, the one nearest to the middle.
     offset = np.linalg.lstsq((np.eye(3) - about).reshape(-1, 3), (middles - middle).ravel(), rcond=1e-6)[0]
     return Joint("revolute", axis, middle + offset, angles)
 
 
 def _principal(vectors: Float[np.ndarray, "frames 3"]) -> Float[np.ndarray, "3"]:
-    """The direction that all share most, to the side to which the longest points."""
+    """The principal direction of the vectors, with the sign of the longest one."""
     axis = np.linalg.svd(vectors, full_matrices=False)[2][0]
     longest = vectors[np.argmax(np.linalg.norm(vectors, axis=1))]
     return -axis if longest @ axis < 0 else axis

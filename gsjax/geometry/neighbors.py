@@ -1,4 +1,4 @@
-"""Neighbour queries on the host, where point sets are built; nothing here runs inside a jitted step."""
+"""Neighbour queries on the host, for building point sets; nothing here runs inside a jitted step."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,12 +8,12 @@ from scipy.spatial import cKDTree
 def nearest(
     queries: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"], max_distance: float = np.inf
 ) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-    """Index of the nearest point of each query, and its distance in metres; -1 and inf where none is near.
+    """Index of the point nearest to each query, and its distance in metres; -1 and inf if none is in range.
 
     Args:
-        queries: metres.
-        points: among which they look, metres.
-        max_distance: farther ones are none, metres.
+        queries: positions, metres.
+        points: the points to search, metres.
+        max_distance: points farther away than this are ignored, metres.
     """
     if len(points) == 0:
         return np.full(len(queries), -1), np.full(len(queries), np.inf)
@@ -22,7 +22,7 @@ def nearest(
 
 
 def neighbor_spacing(points: Float[np.ndarray, "n 3"], k: int = 3) -> Float[np.ndarray, "n"]:
-    """Root mean square distance to the `k` nearest other points, as 3DGS initialises scales; metres."""
+    """Root mean square distance to the `k` nearest other points, metres; 3DGS initialises scales with it."""
     k = min(k, len(points) - 1)
     if k < 1:
         return np.full(len(points), 0.01)
@@ -31,7 +31,7 @@ def neighbor_spacing(points: Float[np.ndarray, "n 3"], k: int = 3) -> Float[np.n
 
 
 def voxel_thin(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray, "m"]:
-    """Indices of one point a cubic voxel of edge `voxel` metres: the one nearest to the mean of its voxel."""
+    """Indices of one point per cubic voxel of edge `voxel` metres: the one nearest to the voxel's mean."""
     if len(points) == 0 or voxel <= 0:
         return np.arange(len(points))
     cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)

@@ -5,26 +5,26 @@ from jaxtyping import Float
 
 from gsjax.geometry.cameras import look_at
 
-_WIDEST_GAP = np.deg2rad(120)  # between neighbours of a ring of cameras that still counts as closed
-_SWING = np.deg2rad(8)  # of a path whose cameras all stand in one direction
-_NEAREST = 0.02  # radius of a path, over the distance of what is looked at
+_WIDEST_GAP = np.deg2rad(120)  # between neighbours in a ring of cameras that still counts as closed
+_SWING = np.deg2rad(8)  # swing of the path if all cameras stand in one direction
+_NEAREST = 0.02  # smallest radius of a path, as a fraction of the distance to the focus
 
 
 def orbit(
     viewmats: Float[np.ndarray, "n 4 4"], focus: Float[np.ndarray, "3"], frames: int
 ) -> Float[np.ndarray, "frames 4 4"]:
-    """A closed path about what cameras look at, as high and as far away as they are: all around where they
-    stand all around, else to and fro where they stand.
+    """A closed path around a focus, at the height and distance of the given cameras: a full circle if the
+    cameras surround the focus, else a swing to and fro within their arc.
 
     Args:
-        viewmats: of the cameras, world to camera.
-        focus: what they look at.
-        frames: how many view matrices.
+        viewmats: view matrices of the cameras, world to camera.
+        focus: the point that the cameras look at.
+        frames: number of view matrices to return.
     """
     rotations = viewmats[:, :3, :3]
     offsets = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3]) - focus
     up = -rotations[:, 1].mean(0)
-    if np.linalg.norm(up) < 1e-6:  # upside down as often as not
+    if np.linalg.norm(up) < 1e-6:  # as many cameras upside down as upright
         up = -rotations[0, 1]
     up /= np.linalg.norm(up)
     side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
@@ -43,7 +43,7 @@ def orbit(
 
 
 def _angles(at: Float[np.ndarray, "n"], turn: Float[np.ndarray, "frames"]):
-    """Where on the circle each frame stands, and whether that is all around."""
+    """Angle of each frame on the circle, and whether the path goes all the way around."""
     gaps = np.diff(np.append(at, at[0] + 2 * np.pi))
     widest = int(gaps.argmax())
     if gaps[widest] < _WIDEST_GAP:

@@ -1,6 +1,6 @@
 """Quaternions as this package stores them: [w, x, y, z], of any non-zero length.
 
-Rigid motions themselves are `jaxlie.SE3`; what stands here is the little that jaxlie leaves out.
+Rigid motions are `jaxlie.SE3`; this module has only what jaxlie lacks.
 """
 
 from functools import partial
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 MIN_SQUARED_NORM = 1e-12
-"""Below this |q|^2 a quaternion names no rotation; the rasterizer culls a Gaussian that has it."""
+"""Below this |q|^2 a quaternion does not define a rotation, and the rasterizer culls its Gaussian."""
 
 
 @partial(jax.jit, inline=True)
 def normalize_quats(quats: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-    """Unit quaternions. One that is too short to name a rotation becomes the identity, with zero gradient."""
+    """Unit quaternions. One too short to define a rotation becomes the identity, with zero gradient."""
     squared = jnp.sum(quats * quats, axis=-1, keepdims=True)
     usable = squared >= MIN_SQUARED_NORM
     identity = jnp.zeros_like(quats).at[..., 0].set(1.0)

@@ -1,4 +1,4 @@
-"""Points picked from many, so that few stand for all."""
+"""Farthest point sampling: a few points that represent many."""
 
 from typing import NamedTuple
 
@@ -8,33 +8,33 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class Sample(NamedTuple):
-    """Points picked from many: their indices, and False where none was left to pick."""
+    """Sampled points: their indices, and whether each is valid; False once no point was left to sample."""
 
     indices: Int[Array, "count"]
     valid: Bool[Array, "count"]
 
 
 def farthest_points(points: Float[Array, "n c"], count: int, valid: Bool[Array, "n"] | None = None) -> Sample:
-    """Points that cover all: the one farthest from the mean, then always the one farthest from those picked.
-    So none is farther from the nearest picked one than any two of those are from each other.
+    """Farthest point sampling: the point farthest from the mean, then repeatedly the one farthest from those
+    sampled. So no point is farther from its nearest sample than any two samples are from each other.
 
     Args:
-        points: positions. One that is not finite is not picked, nor a second one at the same place.
-        count: how many.
-        valid: which may be picked; all unless given.
+        points: positions. Points that are not finite are never sampled, nor are duplicates.
+        count: number of samples, static.
+        valid: points that may be sampled; default: all.
 
     Raises:
         ValueError: `count` is below 1.
     """
     if count < 1:
-        raise ValueError(f"count={count}: expected 1 or more")
+        raise ValueError(f"count: expected 1 or more, found {count}")
     there = jnp.isfinite(points).all(axis=-1)
     there = there if valid is None else there & valid
     points = jnp.where(there[:, None], points, 0.0)  # 0 times NaN would spread
     axes, places = tuple(points.T), jnp.arange(len(points))
     mean = points.sum(axis=0) / jnp.maximum(there.sum(), 1)
 
-    # A sum over a short last axis, and argmax, would take seven times as long on a CPU.
+    # On a CPU, argmax and a sum over a short last axis would take seven times as long.
     def squared_to(point):
         return sum((axis - at) ** 2 for axis, at in zip(axes, point, strict=True))
 

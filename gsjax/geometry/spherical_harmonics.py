@@ -18,7 +18,7 @@ _C3 = (
 
 
 def num_sh_bases(degree: int) -> int:
-    """Coefficients a channel at `degree`: 1, 4, 9, 16."""
+    """Number of coefficients per channel up to `degree`: 1, 4, 9, 16."""
     return (degree + 1) ** 2
 
 
@@ -29,7 +29,7 @@ def sh_bases(degree: int, directions: Float[Array, "*n 3"]) -> Float[Array, "*n 
         ValueError: `degree` is not 0, 1, 2 or 3.
     """
     if degree not in (0, 1, 2, 3):
-        raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {degree!r}")
+        raise ValueError(f"degree: expected 0, 1, 2 or 3, found {degree!r}")
     x, y, z = jnp.moveaxis(directions, -1, 0)
     bases = [jnp.full_like(x, SH_C0)]
     if degree >= 1:
@@ -61,10 +61,10 @@ def evaluate_sh(
 ) -> Float[Array, "*n channels"]:
     """Colours sum_k c_k Y_k(direction) + 0.5, not clamped. Directions need not be unit length.
 
-    Coefficients beyond `degree` are left unread, so a schedule can unlock degrees one by one.
+    Coefficients beyond `degree` are ignored, so a schedule can unlock degrees one by one.
     """
     squared = jnp.sum(directions * directions, axis=-1, keepdims=True)
-    # A camera in the very centre of a Gaussian has no direction: take +z, with zero gradient.
+    # A camera exactly at the centre of a Gaussian has no viewing direction: use +z, with zero gradient.
     usable = squared > 1e-24
     fallback = jnp.zeros_like(directions).at[..., 2].set(1.0)
     unit = jnp.where(usable, directions, fallback) / jnp.sqrt(jnp.where(usable, squared, 1.0))

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: written under a temporary name, then renamed."""
+"""Atomic file writes: files are written under a temporary name, then renamed."""
 
 import contextlib
 import json
@@ -13,37 +13,40 @@ import numpy as np
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path beside `path`, with its suffix; rename it to `path` when the block ends well.
+    """Yield a temporary path beside `path`, with the same suffix; rename it to `path` if the block succeeds.
 
-    After an exception (Ctrl-C too) the temporary file is removed and whatever stood at `path` still does.
-    Missing parent folders are made.
+    After an exception (Ctrl-C too) the temporary file is removed and an existing file at `path` is unchanged.
+    Missing parent folders are created.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The process id keeps two writers apart; a hidden name keeps half a file out of `ls *.ply`.
+    # The process id separates concurrent writers; a hidden name keeps partial files out of `ls *.ply`.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
         if error.filename is not None and Path(error.filename) == temporary:
-            error.filename = os.fspath(path)  # the name that the user gave
+            error.filename = os.fspath(path)  # report the name that the user gave
         raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def write_new(paths: Iterable[Path], write: Callable[[Path], None]) -> Path:
-    """Write to the first of the paths that nothing has, and return it. None is written over, whoever else
-    writes there, and where `write` fails nothing is left.
+    """Write to the first of the paths that does not exist, and return it. Existing files are never
+    overwritten, even with concurrent writers, and nothing is left behind if `write` fails.
 
     Args:
-        paths: as many as it may take; their folder is there.
-        write: puts a file at a path.
+        paths: candidate paths in order; their folder must exist.
+        write: writes the file at a given path.
+
+    Raises:
+        FileExistsError: all of the paths exist.
     """
     for path in paths:
         try:
-            path.open("x").close()  # the name is ours
+            path.open("x").close()  # reserves the name
         except FileExistsError:
             continue
         try:
@@ -52,15 +55,15 @@ def write_new(paths: Iterable[Path], write: Callable[[Path], None]) -> Path:
             path.unlink(missing_ok=True)
             raise
         return path
-    raise FileExistsError("paths: expected one that nothing has, found none")
+    raise FileExistsError("paths: expected one that does not exist yet, found none")
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
-    """Write `value` as JSON. numpy numbers and arrays become plain ones; NaN and infinities become null,
-    because JSON has none and browsers refuse files that hold them.
+    """Write `value` as JSON. NumPy numbers and arrays become plain numbers and lists; NaN and infinities
+    become null, since JSON does not have them and browsers reject files that contain them.
 
     Raises:
-        TypeError: `value` holds something that has no JSON form.
+        TypeError: `value` contains something that JSON cannot represent.
     """
     text = json.dumps(_plain(value), indent=2, allow_nan=False)
     with atomic_write(path) as temporary:
@@ -68,27 +71,28 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
 
 
 def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
-    """Write named arrays as an .npz that loads with `allow_pickle=False`, compressed unless told.
+    """Write named arrays as an .npz that loads with `allow_pickle=False`.
 
     Args:
-        path: the file; its folder has to be there.
-        arrays: by name.
-        compress: smaller, and slower to write.
+        path: the file; missing parent folders are created.
+        arrays: the arrays, by name.
+        compress: compress the file, which is then smaller but slower to write.
 
     Raises:
-        ValueError: an array holds Python objects, which only pickle could store.
+        ValueError: an array holds Python objects, which would require pickle.
     """
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     objects = [name for name, value in arrays.items() if value.dtype.hasobject]
     if objects:
-        raise ValueError(f"write_npz: {objects} hold Python objects; want numbers, booleans or strings")
-    # Through a stream, because np.savez appends .npz to names that lack it.
+        found = f"Python objects in {objects}"
+        raise ValueError(f"write_npz: expected numbers, booleans or strings, found {found}")
+    # Written through a stream, because np.savez appends .npz to names without it.
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         (np.savez_compressed if compress else np.savez)(stream, **arrays)
 
 
 def _plain(value: Any) -> Any:
-    """`value` in the types that `json` knows."""
+    """`value` converted to types that `json` supports."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -76,7 +76,7 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[Any, dict[str, Any]]:
 
 
 def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
-    """The metadata that was saved at `path`.
+    """The metadata saved at `path`.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
@@ -206,7 +206,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     ) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint, found a file that cannot be read as one ({error}). "
-            "It may be cut off or damaged: take another one"
+            "It may be cut off or damaged: use another one"
         ) from error
     if written != _FORMAT:
         raise CheckpointError(
@@ -225,11 +225,11 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_stored(leaf: Any) -> tuple[np.ndarray, str]:
-    """A leaf as an array that .npz can hold, and the name of its true dtype."""
+    """A leaf as an array that .npz can store, and the name of its actual dtype."""
     if _is_key(leaf):
         return np.asarray(jax.random.key_data(leaf)), f"key<{jax.random.key_impl(leaf)}>"
     array = np.asarray(leaf)
-    # bfloat16 and its like are no dtypes of numpy's own; .npz would turn them into nameless bytes.
+    # bfloat16 and the like are not native NumPy dtypes; .npz would store them as raw void bytes.
     plain = array if array.dtype.isbuiltin == 1 else array.view(np.dtype(f"u{array.dtype.itemsize}"))
     return plain, str(array.dtype)
 
@@ -244,7 +244,7 @@ def _from_stored(array: np.ndarray, dtype: str, kind: str) -> Any:
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 over the names, dtypes, shapes and bytes of arrays, in order of name."""
+    """SHA-256 of the names, dtypes, shapes and bytes of arrays, in order of name."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

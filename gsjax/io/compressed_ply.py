@@ -1,20 +1,21 @@
-"""PlayCanvas's compressed PLY, which SuperSplat and splat-transform write: 16 bytes a Gaussian and harmonics.
+"""PlayCanvas's compressed PLY, written by SuperSplat and splat-transform: 16 bytes per Gaussian, plus SH.
 
-Gaussians stand in chunks of 256; the last may hold fewer. Element `chunk` has the range of each quantity in
-each chunk, element `vertex` four uint32 a Gaussian. In them k of b bits stands for k / (2^b - 1) of a range:
+Gaussians come in chunks of 256; the last may hold fewer. Element `chunk` has the range of each quantity in
+each chunk, element `vertex` four uint32 per Gaussian. In these, an integer k of b bits encodes the fraction
+k / (2^b - 1) of a range:
 
     packed_position  11-10-11    x y z in the scene's unit, from min_x.. to max_x..
-    packed_rotation  2-10-10-10  which of w x y z is largest, then the other three, -1/sqrt(2) to 1/sqrt(2)
+    packed_rotation  2-10-10-10  index of the largest of w x y z; the other three, -1/sqrt(2) to 1/sqrt(2)
     packed_scale     11-10-11    log scales, from min_scale_x.. to max_scale_x..
     packed_color     8-8-8-8     red green blue, from min_r.. to max_r.. (older files lack these: 0 to 1);
                                  opacity, 0 to 1
 
-An element `sh`, if there is one, has f_rest_* in the order of 3DGS, a byte each. The writer cuts [-4, 4] into
-256 bins. As in splat-transform, byte k is read as the middle of its bin, 8 ((k + 0.5) / 256 - 0.5), but 0 as
--4 and 255 as 4; so a coefficient of 0 comes back as 1/64. (The PlayCanvas engine reads 8 k / 255 - 4, which
+The optional element `sh` has f_rest_* in the order of 3DGS, one byte each. The writer divides [-4, 4] into
+256 bins. As in splat-transform, byte k is read as the centre of its bin, 8 ((k + 0.5) / 256 - 0.5), but 0 as
+-4 and 255 as 4; so a coefficient of 0 is read back as 1/64. (The PlayCanvas engine reads 8 k / 255 - 4, which
 differs by less than 1/64.)
 
-Axes are those of the 3DGS PLY. Source: decompress-ply.ts, compressed-chunk.ts and write-compressed-ply.ts of
+Axes are those of the 3DGS PLY. Source: decompress-ply.ts, compressed-chunk.ts and write-compressed-ply.ts in
 github.com/playcanvas/splat-transform.
 """
 
@@ -34,25 +35,25 @@ _SCALE = ("scale_x", "scale_y", "scale_z")
 _COLOR = ("r", "g", "b")
 _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES[1:])
 _REST_VALUES = 8 * ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5)
-_REST_VALUES[[0, 255]] = -4, 4  # they also stand for what was clipped
+_REST_VALUES[[0, 255]] = -4, 4  # these also encode clipped values
 
 _ADVICE = "It may be damaged or of another format: export it again (SuperSplat and splat-transform write it)"
-_NAN_ADVICE = "One bad Gaussian spoils its chunk: remove those that are NaN or infinite before compressing"
+_NAN_ADVICE = "One bad Gaussian corrupts its chunk: remove NaN and infinite ones before compressing"
 
 Fault = tuple[str, str, str]
-"""What was expected, what was found, what to do."""
+"""What was expected, what was found, and what to do."""
 
 
 def is_compressed(ply: PlyData) -> bool:
-    """Whether the vertices of `ply` are packed (or some of their properties are: `find_fault` tells)."""
+    """Whether the vertices of `ply` have packed properties; `find_fault` checks that none is missing."""
     return not set(PACKED).isdisjoint(ply["vertex"].data.dtype.names or ())
 
 
 def decompress(ply: PlyData) -> Gaussians:
-    """The Gaussians of a compressed PLY without a fault, float32.
+    """The Gaussians of a compressed PLY in which `find_fault` finds nothing, float32.
 
-    Colours and opacities are stored as one sees them, so they (and scales) take the clamps of
-    `gaussians_from_activated`: an opacity of 0 or 255 has a finite logit.
+    Colours and opacities are stored after activation, so they (and scales) are clamped by
+    `gaussians_from_activated`: stored opacities of 0 and 255 get finite logits.
     """
     chunks, vertices = ply["chunk"].data, ply["vertex"].data
     positions = _fractions(vertices["packed_position"], (11, 10, 11))
@@ -71,7 +72,7 @@ def decompress(ply: PlyData) -> Gaussians:
 
 
 def _fractions(words: UInt32[np.ndarray, "N"], bits: tuple[int, ...]) -> Float[np.ndarray, "N parts"]:
-    """The last sum(bits) bits of each word cut into unsigned integers, highest first, as fractions 0 to 1."""
+    """The low sum(bits) bits of each word as unsigned integers, highest first, scaled to fractions 0 to 1."""
     shifts = sum(bits) - np.cumsum(bits)
     largest = (1 << np.array(bits)) - 1
     return (np.asarray(words)[:, None] >> shifts & largest) / largest
@@ -80,8 +81,8 @@ def _fractions(words: UInt32[np.ndarray, "N"], bits: tuple[int, ...]) -> Float[n
 def _in_range(
     chunks: np.ndarray, quantities: tuple[str, ...], fractions: Float[np.ndarray, "N parts"]
 ) -> Float[np.ndarray, "N parts"]:
-    """`fractions` of the way from min_* to max_* of each Gaussian's chunk."""
-    # float64, in which the difference of two float32 cannot overflow
+    """`fractions` interpolated between min_* and max_* of each Gaussian's chunk."""
+    # float64, so that the difference of two float32 cannot overflow
     low, high = (
         np.stack([chunks[f"{end}_{name}"] for name in quantities], axis=1).astype(np.float64)
         for end in ("min", "max")
@@ -101,7 +102,7 @@ def _quats(words: UInt32[np.ndarray, "N"]) -> Float[np.ndarray, "N 4"]:
 
 
 def _harmonics(rows: np.ndarray) -> Float[np.ndarray, "N rest 3"]:
-    """shN of the element `sh`."""
+    """shN from the rows of the element `sh`."""
     names = _rest_names(rows)
     values = _REST_VALUES[np.stack([rows[name] for name in names], axis=1)]
     # The file is channel-major, as in 3DGS.
@@ -109,12 +110,12 @@ def _harmonics(rows: np.ndarray) -> Float[np.ndarray, "N rest 3"]:
 
 
 def _rest_names(rows: np.ndarray) -> list[str]:
-    """f_rest_0 and so on, as many as there are properties f_rest_*."""
+    """f_rest_0, f_rest_1, ..., as many as there are properties f_rest_*."""
     return [f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in rows.dtype.names or ()))]
 
 
 def _bounds(chunks: np.ndarray) -> list[str]:
-    """The properties that an element `chunk` must have; those of colours if it has any of them."""
+    """The properties required of an element `chunk`; those of colours only if it has any of them."""
     position, scale, color = (
         [f"{end}_{name}" for end in ("min", "max") for name in group] for group in (_POSITION, _SCALE, _COLOR)
     )
@@ -124,7 +125,7 @@ def _bounds(chunks: np.ndarray) -> list[str]:
 
 def find_fault(ply: PlyData) -> Fault | None:
     """Why `decompress` cannot read `ply`; None if it can."""
-    # Each looks at a file in which those before it found nothing.
+    # Each check relies on the previous ones having found nothing.
     return _element_fault(ply) or _count_fault(ply) or _range_fault(ply["chunk"].data)
 
 
@@ -132,7 +133,7 @@ def _element_fault(ply: PlyData) -> Fault | None:
     """An element or property that is missing or of another type."""
     if "chunk" not in ply:
         found = ", ".join(element.name for element in ply.elements)
-        return "an element 'chunk' beside packed vertices", f"only elements {found}", _ADVICE
+        return "an element 'chunk' for packed vertices", f"only elements {found}", _ADVICE
     chunk = ply["chunk"]
     fault = _property_fault(chunk, _bounds(chunk.data), ("float32", "float64"))
     fault = fault or _property_fault(ply["vertex"], PACKED, ("uint32",))
@@ -140,13 +141,13 @@ def _element_fault(ply: PlyData) -> Fault | None:
         return fault
     names = _rest_names(ply["sh"].data)
     if len(names) not in _REST_COUNTS:
-        wanted = ", ".join(map(str, _REST_COUNTS))
-        return f"{wanted} properties f_rest_* (degree 1 to 3) in element 'sh'", f"{len(names)}", _ADVICE
+        counts = ", ".join(map(str, _REST_COUNTS[:-1])) + f" or {_REST_COUNTS[-1]}"
+        return f"{counts} properties f_rest_* (degree 1 to 3) in element 'sh'", f"{len(names)}", _ADVICE
     return _property_fault(ply["sh"], names, ("uint8",))
 
 
 def _property_fault(element: PlyElement, names: Sequence[str], types: Sequence[str]) -> Fault | None:
-    """A property of `element` that is missing or has none of `types`."""
+    """A property of `element` that is missing or has a type other than `types`."""
     dtype = element.data.dtype
     found = dtype.names or ()
     missing = [name for name in names if name not in found]
@@ -160,14 +161,14 @@ def _property_fault(element: PlyElement, names: Sequence[str], types: Sequence[s
 
 
 def _count_fault(ply: PlyData) -> Fault | None:
-    """Elements whose numbers of rows do not belong together."""
+    """Elements with inconsistent numbers of rows."""
     count, chunks = ply["vertex"].count, ply["chunk"].count
-    wanted = -(-count // CHUNK_SIZE)
-    if chunks != wanted:
-        expected = f"{wanted} rows of element 'chunk' ({count} Gaussians, {CHUNK_SIZE} a chunk)"
+    needed = -(-count // CHUNK_SIZE)
+    if chunks != needed:
+        expected = f"{needed} rows of element 'chunk' ({count} Gaussians, {CHUNK_SIZE} per chunk)"
         return expected, f"{chunks}", _ADVICE
     if "sh" in ply and ply["sh"].count != count:
-        expected = f"{count} rows of element 'sh' (one a Gaussian)"
+        expected = f"{count} rows of element 'sh' (one per Gaussian)"
         return expected, f"{ply['sh'].count}", _ADVICE
     return None
 

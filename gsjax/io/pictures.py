@@ -1,4 +1,4 @@
-"""Pictures as files."""
+"""Writing pictures to files."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ from gsjax.io.atomic import atomic_write
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:
-    """Writes an RGB picture [H,W,3] or a grey one [H,W], uint8.
+    """Write an RGB picture [H,W,3] or a grey one [H,W], uint8, as PNG.
 
     Raises:
-        OSError: it could not be written.
+        OSError: the file could not be written.
     """
     with atomic_write(path) as temporary:
         rows = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
         if not cv2.imwrite(str(temporary), rows):
-            raise OSError(f"{path}: the picture could not be written; is there space, and permission?")
+            raise OSError(f"{path}: the picture could not be written; check disk space and permissions")

@@ -1,8 +1,8 @@
-"""Gaussians as PLY files in the layout of 3DGS (Kerbl et al. 2023), which most viewers and trainers read.
+"""Gaussians as PLY files in the 3DGS layout (Kerbl et al. 2023), which most viewers and trainers read.
 
-One vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
-then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. Ours adds feature_* and label
-where a scene has them; other readers pass over both. PlayCanvas's compressed PLY is read too, not written.
+One vertex per Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* channel-major (all of red, then green,
+then blue), opacity as a logit, scale_0..2 as logarithms, rot_0..3 as w x y z. gsjax adds feature_* and label
+if a scene has them; other readers ignore both. PlayCanvas's compressed PLY can be read, but not written.
 """
 
 import os
@@ -30,7 +30,7 @@ _REST_COUNTS = tuple(3 * (size - 1) for size in SH_SIZES)
 
 
 class PlyError(ValueError):
-    """A file that is no PLY of Gaussians: names the path, what was expected, what was found, what to do."""
+    """A file is not a PLY of Gaussians; the message has the path, what was expected and found, and advice."""
 
     def __init__(self, path: str | os.PathLike, expected: str, found: str, advice: str):
         super().__init__(f"{path}: expected {expected}, found {found}. {advice}")
@@ -38,14 +38,14 @@ class PlyError(ValueError):
 
 @dataclass(frozen=True)
 class PlyReport:
-    """What a PLY file held beside the Gaussians that were returned.
+    """Contents of a PLY file besides the returned Gaussians.
 
     Attributes:
-        stored: rows in the file.
-        culled: rows left out, for a value that is NaN or infinite or a quaternion of no length.
+        stored: number of rows in the file.
+        culled: number of rows left out because of a NaN, an infinity or a zero quaternion.
         extra: properties that were not read.
-        rows: of the file, one for each Gaussian returned.
-        labels: int32 label of each Gaussian returned, or None where the file has no labels.
+        rows: row in the file of each returned Gaussian, [N].
+        labels: int32 label of each returned Gaussian, [N]; None if the file has no labels.
     """
 
     stored: int
@@ -58,15 +58,15 @@ class PlyReport:
 def write_ply(
     path: str | os.PathLike, gaussians: Gaussians, *, labels: Integer[np.ndarray, "labels"] | None = None
 ) -> None:
-    """Write Gaussians (and their `labels`) as a binary little-endian PLY of float32; atomic.
+    """Write Gaussians (and their `labels`) as a binary little-endian PLY of float32, atomically.
 
     Args:
         path: the file.
-        gaussians: on the host or a device.
-        labels: integers [N], which become a column.
+        gaussians: the Gaussians, on the host or a device.
+        labels: integers [N], written as a property `label`.
 
     Raises:
-        ValueError: `labels` are not one integer a Gaussian.
+        ValueError: `labels` is not one integer per Gaussian.
     """
     columns = _columns(gaussians)
     fields = [(name, "<f4") for name in columns]
@@ -74,7 +74,7 @@ def write_ply(
         labels = np.asarray(labels)
         if labels.shape != (gaussians.num,) or not np.issubdtype(labels.dtype, np.integer):
             raise ValueError(
-                f"labels: got {labels.dtype} of shape {labels.shape}, want integers [{gaussians.num}]"
+                f"labels: expected integers [{gaussians.num}], found {labels.dtype} of shape {labels.shape}"
             )
         columns["label"] = labels
         fields.append(("label", "<i4"))
@@ -93,7 +93,7 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
     columns |= {name: np.zeros(gaussians.num) for name in _NORMALS}
     columns |= {f"f_dc_{i}": sh0[:, i] for i in range(3)}
     if gaussians.shN is not None:
-        # [N, K-1, 3] -> [N, 3, K-1]: the file is channel-major, the trap of this format.
+        # [N, K-1, 3] -> [N, 3, K-1]: the file is channel-major, which is easy to miss.
         rest = np.asarray(gaussians.shN).transpose(0, 2, 1).reshape(gaussians.num, 3 * gaussians.shN.shape[1])
         columns |= {f"f_rest_{i}": column for i, column in enumerate(rest.T)}
     columns["opacity"] = np.asarray(gaussians.logit_opacities)
@@ -105,15 +105,15 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
-    """Gaussians of a PLY of 3DGS or a compressed one of PlayCanvas (the header tells), as float32.
+    """The Gaussians of a 3DGS PLY or a PlayCanvas compressed PLY (detected from the header), as float32.
 
-    Binary of either byte order, or ascii. Rows that no renderer could draw (a NaN, an infinity, a zero
-    quaternion) are culled and counted. `gsjax.io.compressed_ply` says how packed values are read.
+    The file may be binary of either byte order, or ASCII. Rows that cannot be rendered (with a NaN, an
+    infinity or a zero quaternion) are culled and counted. See `gsjax.io.compressed_ply` for packed values.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
-        PlyError: the file is no PLY, is cut off, or lacks properties of a Gaussian; or a compressed one has
-            another number of chunks than its Gaussians fill, or a chunk whose bounds are not finite.
+        PlyError: the file is not a PLY, is truncated, or lacks properties of a Gaussian; or the number of
+            chunks of a compressed one does not match its Gaussians, or a chunk's bounds are not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -140,7 +140,7 @@ def read_ply(path: str | os.PathLike) -> tuple[Gaussians, PlyReport]:
 
 
 def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]]:
-    """The Gaussians of the layout of 3DGS, and the properties that belong to it."""
+    """The Gaussians of a PLY in the 3DGS layout, and the names of the properties of that layout."""
     names = vertices.dtype.names or ()
     missing = [name for name in _REQUIRED if name not in names]
     if missing:
@@ -152,9 +152,10 @@ def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]
         )
     rest, features = _numbered(names, "f_rest_"), _numbered(names, "feature_")
     if len(rest) not in _REST_COUNTS:
+        counts = ", ".join(map(str, _REST_COUNTS[:-1])) + f" or {_REST_COUNTS[-1]}"
         raise PlyError(
             path,
-            f"{', '.join(map(str, _REST_COUNTS))} properties f_rest_* (degree 0 to 3)",
+            f"{counts} properties f_rest_* (degree 0 to 3)",
             f"{len(rest)}",
             "Export the scene with spherical harmonics of degree 3 or less",
         )
@@ -172,17 +173,17 @@ def _uncompressed(path: Path, vertices: np.ndarray) -> tuple[Gaussians, set[str]
 
 
 def _parse(path: Path) -> PlyData:
-    """The elements of a PLY, one of which is `vertex`."""
+    """Parse a PLY file that has an element `vertex`."""
     with open(path, "rb") as stream:
         start = stream.read(4)
     if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
-        raise PlyError(path, "a PLY file, which starts with 'ply'", repr(start), "Export it as PLY")
+        raise PlyError(path, "a PLY file, which starts with 'ply'", repr(start), "Export the scene as PLY")
     try:
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, UnicodeDecodeError, MemoryError, OverflowError) as error:
         raise PlyError(
             path,
-            "a whole PLY file",
+            "a complete PLY file",
             f"one that cannot be parsed ({error})",
             "It may be cut off or damaged: copy or export it again",
         ) from error
@@ -193,7 +194,7 @@ def _parse(path: Path) -> PlyData:
 
 
 def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
-    """Properties prefix0, prefix1, ... as far as they go without a gap."""
+    """Properties prefix0, prefix1, ... up to the first gap."""
     count = 0
     while f"{prefix}{count}" in names:
         count += 1
@@ -201,14 +202,14 @@ def _numbered(names: tuple[str, ...], prefix: str) -> list[str]:
 
 
 def _stack(vertices: np.ndarray, names) -> np.ndarray:
-    """Columns of a structured array side by side, float32."""
+    """Columns of a structured array stacked along axis 1, float32."""
     return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
 
 
 def _advice(names: tuple[str, ...]) -> str:
-    """What to do about a PLY that lacks properties, by what it seems to be."""
+    """Advice for a PLY that lacks properties, depending on what it seems to be."""
     if {"scale_0", "scale_1"} <= set(names) and "scale_2" not in names:
-        return "This seems to be 2D Gaussian splatting, which has no third axis"
+        return "This seems to be a scene of 2D Gaussian splatting, which has no third axis"
     if {"x", "y", "z"} <= set(names):
-        return "This seems to be a point cloud or a mesh: make Gaussians of it with gaussians_from_points"
+        return "This seems to be a point cloud or a mesh: convert it with gaussians_from_points"
     return "Export the scene in the 3D Gaussian splatting PLY format"

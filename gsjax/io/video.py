@@ -1,4 +1,4 @@
-"""Videos that browsers play: H.264, yuv420p, through the ffmpeg that imageio-ffmpeg brings along."""
+"""Videos that browsers can play: H.264, yuv420p, encoded by the ffmpeg bundled with imageio-ffmpeg."""
 
 import contextlib
 import os
@@ -15,37 +15,37 @@ from jaxtyping import Num, UInt8
 class VideoWriter:
     """Write frames to an .mp4: `with VideoWriter(path, fps) as video: video.write(frame)`.
 
-    Frames go to a temporary file, which gets its name when the block ends. It also does when the block ends
-    by an exception or Ctrl-C, so that the frames so far can be watched. All frames have the size of the
-    first; an odd width or height is padded by repeating the last column or row: yuv420p asks for even ones.
+    Frames go to a temporary file, which is renamed to `path` when the block ends, even with an exception or
+    Ctrl-C, so that the frames written so far can be watched. All frames must have the size of the first. An
+    odd width or height is padded by repeating the last column or row, since yuv420p requires even sizes.
     """
 
     def __init__(self, path: str | os.PathLike, fps: float, *, quality: int = 18):
         """
         Args:
-            path: of the video, ending in .mp4; missing folders are made.
-            fps: frames a second.
-            quality: H.264's constant rate factor; 0 is lossless, 18 looks so, 51 is the worst.
+            path: the video file, ending in .mp4; missing folders are created.
+            fps: frames per second.
+            quality: H.264's constant rate factor; 0 is lossless, 18 visually lossless, 51 the worst.
 
         Raises:
             ValueError: `fps` is not positive, or the path does not end in .mp4.
         """
         self.path = Path(path)
         if not fps > 0:
-            raise ValueError(f"fps: got {fps}, want a positive number")
+            raise ValueError(f"fps: expected a positive number, found {fps}")
         if self.path.suffix != ".mp4":
-            raise ValueError(f"path: got {self.path}, want a name that ends in .mp4")
+            raise ValueError(f"path: expected a name that ends in .mp4, found {self.path}")
         self._rate, self._quality = f"{fps:.6g}", str(quality)
         self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
         self._encoder: _Encoder | None = None
 
     def write(self, frame: Num[np.ndarray, "..."]) -> None:
-        """Append a frame [H, W, 3]: uint8, or floats 0 to 1 (clipped; NaN is black).
+        """Append a frame [H, W, 3]: uint8, or floats 0 to 1 (clipped; NaN becomes black).
 
         Raises:
-            ValueError: the frame is no [H, W, 3] picture or not of the size of the first.
-            OSError: ffmpeg failed; the message holds its own.
+            ValueError: the frame is not an [H, W, 3] picture or differs in size from the first.
+            OSError: ffmpeg failed; the message includes its output.
         """
         pixels = _to_bytes(np.asarray(frame))
         height, width = pixels.shape[:2]
@@ -54,11 +54,12 @@ class VideoWriter:
             even = f"{width + width % 2}x{height + height % 2}"
             self._shape, self._encoder = pixels.shape, self._start(even)
         if pixels.shape != self._shape:
-            raise ValueError(f"frame: got shape {pixels.shape}, want {self._shape} like the first frame")
+            expected = f"shape {self._shape} like the first frame"
+            raise ValueError(f"frame: expected {expected}, found {pixels.shape}")
         self._encoder.write(np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").tobytes())
 
     def close(self) -> None:
-        """Finish the file and give it its name. Without any frame there is no file."""
+        """Finish the file and rename it to its final name. Without any frame no file is written."""
         if self._encoder is None:
             return
         encoder, self._encoder = self._encoder, None
@@ -79,14 +80,14 @@ class VideoWriter:
 
 
 class _Encoder:
-    """An ffmpeg process that eats raw RGB frames and writes an .mp4."""
+    """An ffmpeg process that reads raw RGB frames and writes an .mp4."""
 
     def __init__(self, path: Path, *, size: str, rate: str, quality: str):
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
         target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", quality, "-movflags", "+faststart"]
-        # Its messages go to a file: a pipe that nobody reads would fill up and stop it.
+        # Its messages go to a file, because an unread pipe would fill up and block it.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  (`finish` closes it)
-        # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock beside JAX's threads.
+        # imageio-ffmpeg's own writer forks with a `preexec_fn`, which may deadlock with JAX's threads.
         self._process = subprocess.Popen(
             [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target, str(path)],
             stdin=subprocess.PIPE,
@@ -95,26 +96,26 @@ class _Encoder:
         )
 
     def write(self, data: bytes) -> None:
-        """Feed it; OSError with its own words if it has stopped."""
+        """Send data to ffmpeg. Raises OSError with its output if it has stopped."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(data)
         except BrokenPipeError as error:
             self._process.wait()
-            raise OSError(f"ffmpeg stopped: {self._said()}") from error
+            raise OSError(f"ffmpeg stopped: {self._read_messages()}") from error
 
     def finish(self) -> None:
-        """End the file and the process; OSError with its own words if it failed."""
+        """Finish the file and end the process. Raises OSError with ffmpeg's output if it failed."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
         failed = self._process.wait() != 0
-        message = self._said()
+        message = self._read_messages()
         self._messages.close()
         if failed:
             raise OSError(f"ffmpeg could not write the video: {message}")
 
-    def _said(self) -> str:
+    def _read_messages(self) -> str:
         self._messages.seek(0)
         return self._messages.read().decode(errors="replace").strip() or "no message"
 
@@ -133,22 +134,22 @@ def read_video_frames(path: str | os.PathLike) -> UInt8[np.ndarray, "T H W 3"]:
         frames.append(cv2.cvtColor(grabbed[1], cv2.COLOR_BGR2RGB))
     capture.release()
     if not frames:
-        raise ValueError(f"{path}: expected a video, found a file of which no frame can be read")
+        raise ValueError(f"{path}: expected a video, found a file without a readable frame")
     return np.stack(frames)
 
 
 def _to_bytes(frame: np.ndarray) -> np.ndarray:
     if frame.ndim != 3 or frame.shape[2] != 3:
-        raise ValueError(f"frame: got shape {frame.shape}, want [H, W, 3]")
+        raise ValueError(f"frame: expected shape [H, W, 3], found {frame.shape}")
     if frame.dtype == np.uint8:
         return frame
     if not np.issubdtype(frame.dtype, np.floating):
-        raise ValueError(f"frame: got dtype {frame.dtype}, want uint8 or floats 0 to 1")
+        raise ValueError(f"frame: expected uint8 or floats 0 to 1, found dtype {frame.dtype}")
     return np.round(255 * np.clip(np.nan_to_num(frame), 0, 1)).astype(np.uint8)
 
 
 def _own_process_group() -> dict[str, int]:
-    """Options that keep the terminal's Ctrl-C away from ffmpeg: it must outlive us to finish the file."""
+    """Options that shield ffmpeg from the terminal's Ctrl-C: it must survive it to finish the file."""
     if os.name == "posix":
         return {"process_group": 0}
     return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}

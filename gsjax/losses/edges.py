@@ -1,14 +1,15 @@
-"""Edges of a graph over nodes seen at several times, and how well matches what they tie (papers/003, 2.3).
+"""Edges of a spatiotemporal graph, and the affinity of the nodes they join (SurstSplat, section 2.3).
 
-Nodes are points picked from those of each frame (`gsjax.geometry.sampling`). Frames, nodes and edges are as
-many everywhere, with masks for what is absent. Edges lead to the nearest nodes of the same frame and to those
-of others that match:
+Nodes are points sampled from each frame (`gsjax.geometry.sampling`). All frames have the same number of nodes
+and edges, with masks for absent ones. Edges lead to the nearest nodes of the same frame and to matching nodes
+of other frames:
 
     edges = spatial_edges(positions, k=8) | temporal_edges(teacher, k=4, window=2)
     weights = edge_weights(positions, teacher, times, edges, tau_x=0.02, tau_t=0.5)
     wanted = edge_affinities(teacher, edges)
 
-All that is the teacher's, and made once; `gsjax.losses.graph` asks it of features that learn.
+All of this comes from the teacher and is computed once; the losses in `gsjax.losses.graph` make trained
+features agree with it.
 """
 
 from collections.abc import Callable
@@ -27,24 +28,24 @@ from gsjax.losses.features import Likeness, cosine_error
 from gsjax.losses.sinkhorn import Derivative, sinkhorn
 
 Features = Float[Array, "t n d"]
-There = Bool[Array, "t n"]
+NodeMask = Bool[Array, "t n"]
 
-_LEAST = 1e-12  # squared: what is shorter has no direction
+_LEAST = 1e-12  # squared length below which a feature has no direction
 
 
 # -- edges ---------------------------------------------------------------------------------------------------
 
 
 class Edges(eqx.Module):
-    """As many edges from every node: number e from frame t ends in frame t + offsets[e].
+    """The same number of edges from every node: edge e from frame t ends in frame t + offsets[e].
 
-    `one | other` has those of both.
+    `one | other` has the edges of both.
     """
 
     nodes: Int[Array, "t n e"]
-    """Where in its frame an edge ends."""
+    """Index of the node at the end of each edge, in its frame."""
     valid: Bool[Array, "t n e"]
-    """False where there is none."""
+    """False where there is no edge."""
     offsets: tuple[int, ...] = eqx.field(static=True)
 
     def __or__(self, other: "Edges") -> "Edges":
@@ -55,60 +56,61 @@ class Edges(eqx.Module):
 
 @dataclass(frozen=True)
 class Matching:
-    """How features become affinities (eqs. 9 and 10); `sinkhorn` has the meaning of each."""
+    """How features become affinities (eqs. 9 and 10); see `sinkhorn` for the meaning of each field."""
 
     temperature: float = 1.0
-    """In units of sqrt(d), as far as chance takes the score of two layer-normalised features."""
+    """In units of sqrt(d), the standard deviation of the score of two random layer-normalised features."""
     slack: float | None = None
-    """A score: those of two features lie between -d and d."""
+    """Score of being unmatched; scores of two features lie between -d and d."""
     iterations: int = 20
     derivative: Derivative = "unrolled"
 
 
-def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: There | None = None) -> Edges:
-    """From each node to its `k` nearest of the same frame.
+def spatial_edges(positions: Float[Array, "t n c"], k: int, valid: NodeMask | None = None) -> Edges:
+    """Edges from each node to its `k` nearest neighbours in the same frame.
 
     Args:
-        positions: metres, of n nodes in t frames.
+        positions: positions of n nodes in t frames, metres.
         k: edges from each node.
-        valid: which nodes are there; all unless given.
+        valid: which nodes are present (default: all).
     """
     positions, there = present(positions, valid)
     return _strongest(lambda _: -_squared_distances(positions), there, k)
 
 
 def temporal_edges(
-    features: Features, k: int, window: int, valid: There | None = None, matching: Matching = Matching()
+    features: Features, k: int, window: int, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Edges:
-    """From each node to the `k` of highest affinity in every other frame at most `window` away (Algorithm 1).
+    """Edges from each node to the `k` of highest affinity in every other frame at most `window` away
+    (SurstSplat, Algorithm 1).
 
-    One matrix serves both ways, its rows for the later frame and its columns for the earlier.
+    One matrix serves both directions: rows rank nodes of the later frame, columns those of the earlier.
 
     Args:
-        features: of n nodes in t frames.
+        features: features of n nodes in t frames.
         k: edges from each node into each other frame.
-        window: frames.
-        valid: which nodes are there; all unless given.
+        window: largest distance between frames.
+        valid: which nodes are present (default: all).
         matching: how features become affinities.
 
     Raises:
         ValueError: `window` is below 1.
     """
     if window < 1:
-        raise ValueError(f"window={window}: expected 1 frame or more; spatial_edges lead to a frame's own")
+        raise ValueError(f"window={window}: expected 1 frame or more; use spatial_edges within a frame")
     _, there = present(features, valid)
     return _strongest(lambda offset: affinities(features, offset, there, matching), there, k, window)
 
 
-def similar_edges(features: Features, k: int, window: int = 0, valid: There | None = None) -> Edges:
-    """From each node to the `k` of highest cosine in its own frame (papers/004, eq. 7), or with a `window` in
-    every other frame at most that far away. None from or to a feature without a length.
+def similar_edges(features: Features, k: int, window: int = 0, valid: NodeMask | None = None) -> Edges:
+    """Edges from each node to the `k` of highest cosine similarity in its own frame (GaussianClin, eq. 7), or
+    with a `window` in every other frame at most that far away. Features of length zero have no edges.
 
     Args:
-        features: of n nodes in t frames.
+        features: features of n nodes in t frames.
         k: edges from each node into each frame.
-        window: frames; 0 for the own one.
-        valid: which nodes are there; all unless given.
+        window: largest distance between frames; 0 for edges within a frame.
+        valid: which nodes are present (default: all).
     """
     features, there = present(features, valid)
     squared = jnp.sum(features**2, axis=-1)
@@ -117,8 +119,8 @@ def similar_edges(features: Features, k: int, window: int = 0, valid: There | No
     return _strongest(lambda offset: _products(directions, offset), there, k, window)
 
 
-def all_edges(valid: There, window: int = 0) -> Edges:
-    """From each node to every other one of its frame and of those at most `window` away."""
+def all_edges(valid: NodeMask, window: int = 0) -> Edges:
+    """Edges from each node to every other node of its frame and of the frames at most `window` away."""
     frames, n = valid.shape
     window = min(window, frames - 1)
     runs = []
@@ -141,9 +143,9 @@ def edge_weights(
     there is no edge.
 
     Args:
-        positions, tau_x: in metres.
-        features: the teacher's.
-        times, tau_t: in seconds.
+        positions, tau_x: positions of the nodes and their length scale, metres.
+        features: the teacher's features.
+        times, tau_t: times of the frames and their time scale, seconds.
     """
     positions, placed = present(positions)
     features, there = present(features)
@@ -158,17 +160,17 @@ def edge_weights(
 
 
 def affinities(
-    features: Features, offset: int, valid: There | None = None, matching: Matching = Matching()
+    features: Features, offset: int, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Float[Array, "s n n"]:
-    """A of frames 0 and `offset`, 1 and `offset` + 1, ... (eqs. 9 and 10): Sinkhorn of Phi_U Phi_V^T, Phi the
-    layer-normalised features, at temperature tau sqrt(d).
+    """Affinity matrices A of frames 0 and `offset`, 1 and `offset` + 1, ... (eqs. 9 and 10): Sinkhorn of
+    Phi_U Phi_V^T, with Phi the layer-normalised features, at temperature tau sqrt(d).
 
-    No node is matched with itself: that score is the highest there is, and would take most of its row.
+    No node is matched with itself: that score is the highest possible, and would take most of its row.
 
     Args:
-        features: of n nodes in t frames.
-        offset: frames between the two that are matched, 0 or more.
-        valid: which nodes are there; all unless given.
+        features: features of n nodes in t frames.
+        offset: distance between the two frames that are matched, 0 or more.
+        valid: which nodes are present (default: all).
         matching: temperature, slack and iterations.
     """
     features, there = present(features, valid)
@@ -191,17 +193,17 @@ def affinities(
 
 
 def edge_affinities(
-    features: Features, edges: Edges, valid: There | None = None, matching: Matching = Matching()
+    features: Features, edges: Edges, valid: NodeMask | None = None, matching: Matching = Matching()
 ) -> Float[Array, "t n e"]:
-    """A of each edge, times the number of nodes that it might have led to: chance gives 1.
+    """A of each edge times the number of nodes that it could have led to, so that chance gives 1.
 
-    For rows of A sum to 1: with twice the nodes its entries, and a loss of them, would be half of what they
-    were.
+    The factor is needed because rows of A sum to 1: with twice the nodes, its entries, and losses on them,
+    would be half as large.
 
     Args:
-        features: of n nodes in t frames.
-        edges: between them.
-        valid: which nodes are there; all unless given.
+        features: features of n nodes in t frames.
+        edges: edges between the nodes.
+        valid: which nodes are present (default: all).
         matching: how features become affinities.
     """
     _, there = present(features, valid)
@@ -217,13 +219,13 @@ def edge_affinities(
     return jnp.concatenate(runs, axis=2) * choices[:, None]
 
 
-# -- parts of these, and of the losses -----------------------------------------------------------------------
+# -- helpers, shared with the losses -------------------------------------------------------------------------
 
 
 def present(
     values: Float[Array, "*n c"], valid: Bool[Array, "*n"] | None = None
 ) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
-    """Values with 0 where absent or not finite, for 0 times NaN would spread; and where they are there."""
+    """Values with 0 where absent or not finite, because 0 times NaN would spread; and which are present."""
     there = jnp.isfinite(values).all(axis=-1)
     if valid is not None:
         there &= valid
@@ -231,7 +233,7 @@ def present(
 
 
 def _layer_normalized(features: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-    """Each with mean 0 and variance 1 over its channels; 0, without a slope, where all those are alike."""
+    """Features normalised to mean 0 and variance 1 over the channels; 0, with zero gradient, if constant."""
     centred = features - features.mean(axis=-1, keepdims=True)
     variance = jnp.mean(centred**2, axis=-1, keepdims=True)
     varies = variance > _LEAST * (1 + jnp.mean(features**2, axis=-1, keepdims=True))
@@ -239,29 +241,32 @@ def _layer_normalized(features: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
 
 
 def _products(features: Features, offset: int) -> Float[Array, "s n n"]:
-    """Of every node with every one `offset` frames later."""
+    """Inner products of every node with every node `offset` frames later."""
     earlier, later = features[: len(features) - offset], features[offset:]
     return jnp.matmul(earlier, later.swapaxes(1, 2), precision="highest")
 
 
 def _squared_distances(positions: Float[Array, "t n c"]) -> Float[Array, "t n n"]:
-    """Of differences, as products would lose what is near."""
+    """Squared distances within each frame, from differences: inner products would lose small distances."""
     return jnp.sum((positions[:, :, None] - positions[:, None]) ** 2, axis=-1)
 
 
-def _pairs(there: There, offset: int) -> Bool[Array, "s n n"]:
-    """Which nodes an edge may tie: both there, and not a node with itself."""
+def _pairs(there: NodeMask, offset: int) -> Bool[Array, "s n n"]:
+    """Pairs of nodes that an edge may join: both present, and not a node with itself."""
     pairs = there[: len(there) - offset, :, None] & there[offset:, None, :]
     return pairs & ~jnp.eye(there.shape[1], dtype=bool) if offset == 0 else pairs
 
 
 def _strongest(
-    scores: Callable[[int], Float[Array, "s n n"]], there: There, k: int, window: int = 0
+    scores: Callable[[int], Float[Array, "s n n"]], there: NodeMask, k: int, window: int = 0
 ) -> Edges:
-    """Edges to the `k` of highest score in the same frame, or with a window in each of the others.
+    """Edges to the `k` nodes of highest score in the same frame, or with a window in each other frame.
 
     Args:
-        scores: of pairs of nodes, for each number of frames between them.
+        scores: frame offset -> scores of pairs of nodes.
+        there: which nodes are present.
+        k: edges from each node into each frame.
+        window: largest distance between frames; 0 for edges within a frame.
     """
     edges = Edges(jnp.zeros((*there.shape, 0), jnp.int32), jnp.zeros((*there.shape, 0), bool), ())
     for offset in range(1, min(window, len(there) - 1) + 1) if window else (0,):
@@ -273,7 +278,7 @@ def _strongest(
 
 
 def _highest(scores: Float[Array, "s n n"], k: int, offset: int) -> Edges:
-    """Edges from rows to the columns of highest score; -inf is for no pair."""
+    """Edges from rows to the columns of highest score; -inf marks pairs without an edge."""
     n = scores.shape[-1]
     highest, nodes = jax.lax.top_k(scores, min(k, n))
     valid = highest > -jnp.inf
@@ -283,31 +288,31 @@ def _highest(scores: Float[Array, "s n n"], k: int, offset: int) -> Edges:
 
 
 def _framed(values: Shaped[Array, "s ..."], offset: int) -> Shaped[Array, "t ..."]:
-    """With zeros for the frames from which so many lead out of the window."""
+    """Values padded with zeros for the frames whose edges with this offset would lead out of the sequence."""
     return jnp.pad(values, [(max(-offset, 0), max(offset, 0))] + [(0, 0)] * (values.ndim - 1))
 
 
 def _end_frames(edges: Edges) -> Int[Array, "t e"]:
-    """Where edges end, kept within the frames there are."""
+    """Frame in which each edge ends, clipped to the existing frames."""
     frames = len(edges.nodes)
     ends = np.arange(frames)[:, None] + np.array(edges.offsets, int)
     return jnp.asarray(ends.clip(0, frames - 1))
 
 
 def _at_ends(values: Shaped[Array, "t n ..."], edges: Edges) -> Shaped[Array, "t n e ..."]:
-    """What the node has in which an edge ends."""
+    """Values of the nodes at the ends of the edges."""
     return values[_end_frames(edges)[:, None], edges.nodes]
 
 
-def live_edges(edges: Edges, there: There) -> Bool[Array, "t n e"]:
-    """Which edges tie nodes that are there."""
+def live_edges(edges: Edges, there: NodeMask) -> Bool[Array, "t n e"]:
+    """Which edges join nodes that are present."""
     return edges.valid & there[:, :, None] & _at_ends(there, edges)
 
 
 def edge_cosines(
-    features: Features, edges: Edges, there: There
+    features: Features, edges: Edges, there: NodeMask
 ) -> tuple[Float[Array, "t n e"], Bool[Array, "t n e"]]:
-    """Cosines of the two features that an edge ties; and where both are there and have a length."""
+    """Cosine of the two features that each edge joins, and where both are `there` and non-zero."""
     squared = jnp.sum(features**2, axis=-1)
     products = jnp.sum(features[:, :, None] * _at_ends(features, edges), axis=-1)
     one = jnp.broadcast_to(squared[:, :, None], products.shape)

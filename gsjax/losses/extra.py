@@ -1,13 +1,13 @@
-"""Losses of one's own, beside those that a method has.
+"""User-defined losses, in addition to those of a method.
 
-A method that takes `extra_losses` adds them up with its own, and the gradient of the sum is what trains:
+A method that takes `extra_losses` adds them to its own and trains on the gradient of the sum:
 
     def above_the_table(scene, rendered, frame):
         return 10.0 * jnp.sum(jnp.minimum(scene.gaussians.means[:, 2], 0.0) ** 2)
 
     gsjax.track(scene, first, frames, config, extra_losses=(above_the_table,))
 
-What one counts beside the others is a factor within it. Without any, a method's program is what it was.
+The weight of a loss is a factor inside it. Without extra losses, a method's program is unchanged.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -21,14 +21,14 @@ from gsjax.scene.render import Rendered
 
 @runtime_checkable
 class ExtraLoss(Protocol):
-    """A pure function, differentiable in what it reads: of a scene as it was drawn, and of what was seen."""
+    """A pure, differentiable function of the scene, its rendering, and the observed frame."""
 
     def __call__(self, scene: Any, rendered: Rendered, frame: Frame) -> Float[Array, ""]:
-        """A scalar, the smaller the better.
+        """A scalar to be minimised.
 
         Args:
-            scene: the method's, with `scene.gaussians` [N] where they were drawn; what else it has, its
-                method says.
+            scene: the method's scene, with `scene.gaussians` [N] as they were drawn; see the method for its
+                other fields.
             rendered: colours, depths and alphas of C cameras; [C,H,W] and channels.
             frame: what these cameras saw: images [C,H,W,3], 0 to 1, and depths [C,H,W], metres, 0 where
                 unknown, or None.
@@ -37,18 +37,18 @@ class ExtraLoss(Protocol):
 
 
 ExtraLosses = tuple[ExtraLoss, ...]
-"""A tuple, for it is static under jit. A function made anew, as a lambda is, compiles anew: make it once."""
+"""A tuple, because it is static under jit. A new function object, such as a fresh lambda, recompiles."""
 
 
 def named_losses(losses: Any) -> dict[str, ExtraLoss]:
-    """Losses by the names of their functions, under which `info["extra"]` has their values.
+    """Losses by the names of their functions, under which `info["extra"]` reports their values.
 
     Raises:
-        ValueError: what is given is not a tuple of functions, or two have one name.
+        ValueError: `losses` is not a tuple of functions, or two have the same name.
     """
     if not isinstance(losses, tuple):
         raise ValueError(
-            f"extra_losses: expected a tuple of functions, (loss,) for one, found {type(losses).__name__}"
+            f"extra_losses: expected a tuple of functions, such as (loss,), found {type(losses).__name__}"
         )
     named = {}
     for loss in losses:
@@ -56,26 +56,26 @@ def named_losses(losses: Any) -> dict[str, ExtraLoss]:
             raise ValueError(f"extra_losses: expected functions loss(scene, rendered, frame), found {loss!r}")
         name = getattr(loss, "__name__", type(loss).__name__)
         if name in named:
-            raise ValueError(f"extra_losses: expected one function of each name, found two named {name!r}")
+            raise ValueError(f"extra_losses: expected functions of different names, found two named {name!r}")
         named[name] = loss
     return named
 
 
 def extra_terms(losses: Any, scene: Any, rendered: Any, frame: Any) -> dict[str, Float[Array, ""]]:
-    """What each of them comes to, by name.
+    """The value of each loss, by name.
 
     Args:
         losses: functions of scene, rendered and frame.
-        scene, rendered, frame: what they are given.
+        scene, rendered, frame: their arguments.
 
     Raises:
-        ValueError: as `named_losses`; or what one returns is no scalar.
+        ValueError: as `named_losses`, or a loss returns something other than a scalar.
     """
     terms = {name: loss(scene, rendered, frame) for name, loss in named_losses(losses).items()}
     for name, value in terms.items():
         if value is None or jnp.shape(value) != ():
             found = "None" if value is None else f"shape {jnp.shape(value)}"
             raise ValueError(
-                f"extra_losses: expected a scalar of {name}, found {found}; take a sum or a mean"
+                f"extra_losses: expected a scalar from {name}, found {found}; take a sum or a mean"
             )
     return terms

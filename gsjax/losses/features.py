@@ -1,12 +1,13 @@
-"""Losses between a rendered feature map and what a teacher says of its pixels (papers/002, section 3.4).
+"""Losses between a rendered feature map and a teacher's features of its pixels (FD-3DGS, section 3.4).
 
-A field of C channels meets a teacher of D through a linear map W, [D, C], without bias. With g a pixel's C
-rendered numbers and e the teacher's D, all that L_rec (eq. 4) and L_cos (eq. 5) need of W g is
+A field of C channels is compared with a teacher of D channels through a linear map W, [D, C], without bias.
+With g the C rendered channels of a pixel and e the teacher's D, all that L_rec (eq. 4) and L_cos (eq. 5) need
+of W g is
 
     |W g|^2 = g^T (W^T W) g    and    e . W g = (W^T e) . g,
 
-so neither forms D numbers a pixel; and a teacher that says one of K vectors of each pixel, as masks with an
-embedding each do, needs W^T e of those K alone. Both are exact.
+so neither forms D numbers per pixel; and a teacher that assigns one of K vectors to each pixel, such as masks
+with one embedding each, needs W^T e for those K only. Both are exact.
 """
 
 from typing import NamedTuple
@@ -21,7 +22,7 @@ _LEAST_NORM = 1e-12  # squared
 
 
 class Likeness(NamedTuple):
-    """How W g relates to e, pixel by pixel: |W g|^2, (W g) . e and |e|^2."""
+    """Products that compare W g with e, pixel by pixel: |W g|^2, (W g) . e and |e|^2."""
 
     squared: Float[Array, "*pixels"]
     product: Float[Array, "*pixels"]
@@ -34,13 +35,13 @@ def likeness(
     codebook: Float[Array, "k d"],
     ids: Int[Array, "*pixels"],
 ) -> Likeness:
-    """Of pixels to the rows of a codebook that the teacher names; -1 counts as 0.
+    """Likeness of pixels to the codebook rows that the teacher assigns to them; -1 counts as 0.
 
     Args:
         rendered: g.
         weights: W.
-        codebook: what the teacher may say.
-        ids: which of it.
+        codebook: the K vectors of the teacher.
+        ids: codebook row of each pixel.
     """
     gram = jnp.matmul(weights.T, weights, precision="highest")
     toward = jnp.matmul(codebook, weights, precision="highest")  # [k, c]
@@ -55,7 +56,7 @@ def likeness(
 def likeness_to_map(
     rendered: Float[Array, "*pixels c"], weights: Float[Array, "d c"], target: Float[Array, "*pixels d"]
 ) -> Likeness:
-    """Of pixels to a feature of their own each.
+    """Likeness of pixels to a separate feature for each.
 
     Args:
         rendered: g.
@@ -73,12 +74,12 @@ def feature_error(
 ) -> Float[Array, "*pixels"]:
     """L_rec of each pixel: the mean over D channels of (W g - alpha e)^2.
 
-    What is half transparent is to show half a feature, else Gaussians at the rim of the scene would have to
-    have larger ones than their neighbours.
+    A half-transparent pixel should show half a feature; otherwise Gaussians at the border of the scene would
+    need larger features than their neighbours.
 
     Args:
-        likeness: of W g to e.
-        alphas: how opaque each pixel is drawn.
+        likeness: likeness of W g to e.
+        alphas: rendered opacity of each pixel.
         dimension: D.
     """
     squared, product, target = likeness
@@ -86,7 +87,7 @@ def feature_error(
 
 
 def cosine_error(likeness: Likeness) -> Float[Array, "*pixels"]:
-    """L_cos of each pixel: 1 - cos(W g, e); its slope is 0 where one of the two has no length."""
+    """L_cos of each pixel: 1 - cos(W g, e); its gradient is 0 where one of the two is zero."""
     squared, product, target = likeness
     there = (squared > _LEAST_NORM) & (target > _LEAST_NORM)
     lengths = jnp.sqrt(jnp.where(there, squared * target, 1.0))
@@ -103,9 +104,9 @@ def cycle_error(
 
     Args:
         low: F'_low, in the field's channels.
-        high: F, in the teacher's.
-        weights: W, from the former to the latter.
-        inverse: W', the way back.
+        high: F, in the teacher's channels.
+        weights: W, from the field's channels to the teacher's.
+        inverse: W', from the teacher's channels to the field's.
     """
     back = jnp.matmul(high, inverse.T, precision="highest") - low
     forth = jnp.matmul(low, weights.T, precision="highest") - high
@@ -113,15 +114,15 @@ def cycle_error(
 
 
 def max_pooled(features: Float[Array, "h w c"], edge: int) -> Float[Array, "h_ w_ c"]:
-    """The largest of each channel in windows of `edge` x `edge` pixels; what is left over at the far sides is
-    left out."""
+    """Maximum of each channel over windows of `edge` x `edge` pixels; incomplete windows at the right and
+    bottom are left out."""
     high, wide = features.shape[0] // edge, features.shape[1] // edge
     windows = features[: high * edge, : wide * edge].reshape(high, edge, wide, edge, -1)
     return windows.max(axis=(1, 3))
 
 
 def pooled_ids(ids: Int[Array, "h w"], edge: int) -> Int[Array, "h_ w_"]:
-    """The one thing that each window of `max_pooled` shows, and -1 where it shows two or none."""
+    """The single id that each window of `max_pooled` shows, or -1 if it shows several or none."""
     high, wide = ids.shape[0] // edge, ids.shape[1] // edge
     windows = ids[: high * edge, : wide * edge].reshape(high, edge, wide, edge)
     most, least = windows.max(axis=(1, 3)), windows.min(axis=(1, 3))
@@ -131,18 +132,21 @@ def pooled_ids(ids: Int[Array, "h w"], edge: int) -> Int[Array, "h_ w_"]:
 def contrastive_loss(
     features: Float[Array, "n c"], ids: Int[Array, "n"], gamma: float = 1.0
 ) -> Float[Array, ""]:
-    """Features of one thing together, of different things apart (eq. 6 as the text describes it):
+    """Pull features of the same object together and push different objects apart (FD-3DGS, eq. 6, as its text
+    describes it):
 
-        - mean over A of log( sum over B of A's kind of K(A, B) / sum over all B of K(A, B) ),
+        - mean over A of log( sum over B with A's id of K(A, B) / sum over all B of K(A, B) ),
 
-    K(A, B) = exp(-gamma |A - B|^2), no A with itself. In logarithms, for K underflows where features are 10
-    apart. An A without another of its kind is no anchor; 0 where nothing is.
+    with K(A, B) = exp(-gamma |A - B|^2) and B different from A. Computed in logarithms, because K underflows
+    for features that are 10 apart. A pixel A without another of its id is not an anchor; without anchors the
+    loss is 0.
 
     Args:
-        features: of pixels.
-        ids: what each shows; those with -1 take no part.
+        features: features of pixels.
+        ids: object of each pixel; pixels with -1 are ignored.
+        gamma: inverse squared length scale of the kernel K.
     """
-    # About their mean, which changes no distance: what all have in common would take the digits.
+    # Centring changes no distance; without it a common offset would cost precision.
     features = features - jax.lax.stop_gradient(features.mean(axis=0))
     lengths = jnp.sum(features**2, axis=-1)
     products = jnp.matmul(features, features.T, precision="highest")
@@ -155,7 +159,7 @@ def contrastive_loss(
 
 
 def _log_sum(logs: Float[Array, "n n"], of: Bool[Array, "n n"]) -> Float[Array, "n"]:
-    """log sum exp of each row's chosen entries; 0 for a row without any."""
+    """Log-sum-exp of the selected entries of each row; 0 for a row without any."""
     some = of.any(axis=1)
     chosen = jnp.where(of, logs, -jnp.inf)
     return jax.nn.logsumexp(jnp.where(some[:, None], chosen, 0.0), axis=1) * some

@@ -1,13 +1,14 @@
-"""What a teacher asks of features that learn, over a graph of nodes and frames (papers/003, section 2.3, and
-papers/004, section 3.3).
+"""Losses between trained features and a teacher over a spatiotemporal graph (SurstSplat, section 2.3, and
+GaussianClin, section 3.3).
 
-`gsjax.losses.edges` makes edges, their weights and the affinities wanted, once. Then, of features that learn,
+`gsjax.losses.edges` computes edges, their weights and the wanted affinities once. Then, for trained features,
 
     loss = 0.1 * node_loss(features, teacher) + 0.1 * structure_loss(features, wanted, edges, weights)
 
-`features` and `teacher` are projections to as many channels. That of the Gaussians' features may learn; the
-teacher's is fixed (`orthonormal_projection`), for two that learn agree best where both are 0. Losses are
-means and not sums, so that their weights do not depend on how many nodes and edges there are.
+`features` and `teacher` are projections to the same number of channels. The projection of the Gaussians'
+features may be trained; the teacher's is fixed (`orthonormal_projection`), because two trained projections
+agree best where both are 0. Losses are means and not sums, so that their weights do not depend on the number
+of nodes and edges.
 """
 
 import jax
@@ -18,7 +19,7 @@ from gsjax.losses.edges import (
     Edges,
     Features,
     Matching,
-    There,
+    NodeMask,
     edge_affinities,
     edge_cosines,
     live_edges,
@@ -28,13 +29,13 @@ from gsjax.losses.photometric import weighted_mean
 
 
 def orthonormal_projection(key: PRNGKeyArray, channels: int, width: int) -> Float[Array, "width channels"]:
-    """A random map of `channels` numbers to `width`, for a teacher's features: V = F W^T. Its rows are
-    orthonormal, or its columns where `width` is the larger.
+    """A random map from `channels` to `width` numbers for a teacher's features: V = F W^T. Its rows are
+    orthonormal, or its columns if `width` is larger than `channels`.
 
     Args:
-        key: another one gives another map.
-        channels: of the teacher.
-        width: of what comes out.
+        key: random key.
+        channels: channels of the teacher.
+        width: channels of the projection.
     """
     return jax.nn.initializers.orthogonal()(key, (width, channels))
 
@@ -47,14 +48,14 @@ def node_loss(
     """L_node (eq. 11): the mean over nodes of |V^G - V^F|.
 
     Args:
-        features: V^G, those that learn.
+        features: V^G, the trained features.
         teacher: V^F, which gets no gradient.
-        valid: which nodes are there; all unless given.
+        valid: which nodes are present (default: all).
     """
     teacher, known = present(jax.lax.stop_gradient(teacher), valid)
     features, there = present(features, known)
     squared = jnp.where(there, jnp.sum((features - teacher) ** 2, axis=-1), 0.0)
-    apart = squared > 0  # where not, a length has no slope
+    apart = squared > 0  # elsewhere the norm has no derivative
     return weighted_mean(jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0), there * 1.0)
 
 
@@ -63,20 +64,21 @@ def structure_loss(
     wanted: Float[Array, "t n e"],
     edges: Edges,
     weights: Float[Array, "t n e"] | None = None,
-    valid: There | None = None,
+    valid: NodeMask | None = None,
     matching: Matching = Matching(),
 ) -> Float[Array, ""]:
-    """L_mat (eq. 12): the mean over edges of how far affinities of `features` are from those wanted.
+    """L_mat (eq. 12): the mean over edges of the absolute difference between the affinities of `features` and
+    the wanted ones.
 
-    No gradient reaches `wanted` and `weights`: a graph asks something of features, and does not move nodes.
-    Over `all_edges` without weights it is the mean L1 distance between rows of A, 0 to 2.
+    No gradient reaches `wanted` and `weights`: the graph constrains features and does not move nodes. Over
+    `all_edges` without weights it is the mean L1 distance between rows of A, 0 to 2.
 
     Args:
-        features: those that learn.
-        edges: of the graph.
-        wanted: the teacher's, from `edge_affinities`.
-        weights: of edges, from `edge_weights`; all alike unless given.
-        valid: which nodes are there; all unless given.
+        features: the trained features.
+        wanted: affinities of the teacher, from `edge_affinities`.
+        edges: edges of the graph.
+        weights: weights of the edges, from `edge_weights` (default: all equal).
+        valid: which nodes are present (default: all).
         matching: how features become affinities, as for `wanted`.
     """
     features, there = present(features, valid)
@@ -86,16 +88,16 @@ def structure_loss(
     return weighted_mean(jnp.abs(found - jax.lax.stop_gradient(wanted)), weights)
 
 
-def similarity_loss(features: Features, edges: Edges, valid: There | None = None) -> Float[Array, ""]:
-    """The mean over edges of (1 - cos)^2 (papers/004, eq. 8), without those of a feature that has no length.
+def similarity_loss(features: Features, edges: Edges, valid: NodeMask | None = None) -> Float[Array, ""]:
+    """The mean over edges of (1 - cos)^2 (GaussianClin, eq. 8), except edges of zero features.
 
-    L_s and L_t are this of `similar_edges` of the teacher, within frames and with a window, each with its own
-    weight. Features that are all alike have no such loss: something else has to tell them apart.
+    L_s and L_t are this loss over `similar_edges` of the teacher, within frames and with a window, each with
+    its own weight. Features that are all equal have no such loss: another loss must separate them.
 
     Args:
-        features: those that learn.
-        edges: between nodes that are to be alike.
-        valid: which nodes are there; all unless given.
+        features: the trained features.
+        edges: edges between nodes that should be similar.
+        valid: which nodes are present (default: all).
     """
     features, there = present(features, valid)
     cosines, known = edge_cosines(features, edges, there)

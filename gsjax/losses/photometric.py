@@ -15,7 +15,7 @@ _WINDOW /= _WINDOW.sum()
 
 
 def weighted_mean(values: Float[Array, "*n"], weights: Float[Array, "*n"]) -> Float[Array, ""]:
-    """Mean of `values` under `weights`; 0 where all weights are."""
+    """Weighted mean of `values`; 0 if all weights are 0."""
     return jnp.sum(values * weights) / jnp.maximum(jnp.sum(weights), 1e-12)
 
 
@@ -27,9 +27,9 @@ def l1_loss(
     """Mean absolute difference over channels and (weighted) pixels.
 
     Args:
-        image: what is drawn.
-        target: what was recorded.
-        weights: of pixels; all alike unless given.
+        image: the rendered image.
+        target: the recorded image.
+        weights: weights of the pixels (default: all equal).
     """
     difference = jnp.abs(image - target).mean(-1)
     return difference.mean() if weights is None else weighted_mean(difference, weights)
@@ -38,24 +38,26 @@ def l1_loss(
 def truncated_l1(
     values: Float[Array, "*n"], targets: Float[Array, "*n"], weights: Float[Array, "*n"], limit: float
 ) -> Float[Array, ""]:
-    """Weighted mean of min(|difference|, limit): what is further off is of something else.
+    """Weighted mean of min(|difference|, limit): larger differences belong to a different object.
 
     Args:
-        values: what is drawn, depths say.
-        targets: what was recorded.
-        weights: 0 where nothing was.
-        limit: in the unit of the values.
+        values: rendered values, such as depths.
+        targets: recorded values.
+        weights: weights of the values, 0 where nothing was recorded.
+        limit: largest difference that counts in full, in the unit of the values.
     """
     return weighted_mean(jnp.minimum(jnp.abs(values - targets), limit), weights)
 
 
 @jax.custom_jvp
 def ssim(image: Float[Array, "c h w k"], target: Float[Array, "c h w k"]) -> Float[Array, ""]:
-    """Mean structural similarity (Wang et al. 2004) with an 11-pixel Gaussian window, values 0 to 1: that of
-    scikit-image, of the pixels whose window lies in the image. One smaller than the window is black around.
+    """Mean structural similarity (Wang et al. 2004) with an 11-pixel Gaussian window, values 0 to 1: as in
+    scikit-image, over the pixels whose window lies in the image. An image smaller than the window is padded
+    with black.
 
-    Its derivative is worked out by hand: blurring is its own transpose, and three blurs more give the slope,
-    where transposed slices of autodiff took ten times as long. Forward and reverse mode alike; first order.
+    The derivative is written by hand: blurring is its own transpose, so three more blurs give the gradient,
+    while autodiff's transposed slices take ten times as long. It supports forward and reverse mode, to first
+    order.
     """
     moments = _moments(_planes(image), _planes(target))
     return jnp.vdot(_weights(moments.mx), _similarity(moments))
@@ -67,7 +69,7 @@ def _ssim_jvp(primals, tangents):
     score, change = jnp.vdot(_weights(x), _similarity(moments)), jnp.zeros((), x.dtype)
     swapped = _Moments(moments.my, moments.mx, moments.yy, moments.xx, moments.xy)
     for one, other, known, tangent in ((x, y, moments, tangents[0]), (y, x, swapped, tangents[1])):
-        if type(tangent) is not SymbolicZero:  # a photograph has none, and then its slope costs nothing
+        if type(tangent) is not SymbolicZero:  # a photograph has none, and its gradient then costs nothing
             change += jnp.vdot(_slope(one, other, known), _planes(tangent))
     return score, change
 
@@ -86,7 +88,7 @@ class _Moments(NamedTuple):
 
 
 def _planes(images: Float[Array, "c h w k"]) -> Float[Array, "n h w"]:
-    """One channel of one image after the other: only then do neighbours in a row lie side by side."""
+    """Channels of images as separate planes, so that neighbours in a row are adjacent in memory."""
     return jnp.moveaxis(images, -1, 1).reshape(-1, *images.shape[1:3])
 
 
@@ -102,7 +104,7 @@ def _blurred(planes: Float[Array, "n h w"]) -> Float[Array, "n h w"]:
 
 
 def _weights(planes: Float[Array, "n h w"]) -> Float[Array, "n h w"]:
-    """Of each pixel in the mean."""
+    """Weight of each pixel in the mean."""
     count, height, width = planes.shape
     half = len(_WINDOW) // 2
     if min(height, width) < len(_WINDOW):
@@ -143,8 +145,8 @@ def photometric_loss(
     """(1 - w) L1 + w (1 - SSIM) / 2 (Kerbl et al. 2023, eq. 7).
 
     Args:
-        image: C pictures, 0 to 1.
-        target: what was recorded.
+        image: C rendered images, 0 to 1.
+        target: the recorded images.
         dssim_weight: w, 0 to 1.
     """
     dssim = (1 - ssim(image, target)) / 2

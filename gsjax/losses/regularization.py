@@ -1,4 +1,4 @@
-"""Losses that ask nothing of the data."""
+"""Losses that do not depend on data."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -9,15 +9,15 @@ def total_variation(
     above: Float[Array, "w c"] | None = None,
     inside: Bool[Array, "h"] | None = None,
 ) -> Float[Array, ""]:
-    """Sum over neighbouring pixels and channels of |du| + |dv| (papers/002, eq. 7, before its division by
+    """Sum over neighbouring pixels and channels of |du| + |dv| (FD-3DGS, eq. 7, before its division by
     H W C).
 
-    A sum and not a mean, so that strips of an image can be added up.
+    A sum and not a mean, so that the values of strips of an image can be added.
 
     Args:
-        image: of any channels.
-        above: the row of pixels above the image; none at its top.
-        inside: rows that count; all unless given.
+        image: an image with any number of channels.
+        above: the row of pixels above a strip; None for the top of the image.
+        inside: rows that count (default: all).
     """
     before = jnp.concatenate([image[:1] if above is None else above[None], image[:-1]])
     rows = jnp.abs(jnp.diff(image, axis=1)).sum(axis=(1, 2)) + jnp.abs(image - before).sum(axis=(1, 2))
@@ -25,14 +25,14 @@ def total_variation(
 
 
 def plane_variation(planes: Float[Array, "p h w c"]) -> Float[Array, ""]:
-    """Mean squared difference between neighbours on planes, of both axes (4DGS, Wu et al. 2023; K-Planes,
+    """Mean squared difference between neighbours on planes along both axes (4DGS, Wu et al. 2023; K-Planes,
     Fridovich-Keil et al. 2023, eq. 4)."""
     return jnp.square(jnp.diff(planes, axis=1)).mean() + jnp.square(jnp.diff(planes, axis=2)).mean()
 
 
 def second_differences(planes: Float[Array, "p t w c"]) -> Float[Array, ""]:
-    """Mean squared second difference along the first axis of planes, the time: what moves evenly costs
-    nothing (K-Planes, eq. 5). 0 of fewer than three times."""
+    """Mean squared second difference of planes along their first axis, the time: uniform motion costs nothing
+    (K-Planes, eq. 5). 0 for fewer than three times."""
     if planes.shape[1] < 3:
         return jnp.zeros((), planes.dtype)
     return jnp.square(jnp.diff(planes, n=2, axis=1)).mean()

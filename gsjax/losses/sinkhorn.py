@@ -1,14 +1,14 @@
-"""Scores of pairs become a matching, whose rows and columns sum to one (papers/003, eq. 10).
+"""Sinkhorn: scores of pairs become a soft matching whose rows and columns sum to one (SurstSplat, eq. 10).
 
     A = exp(S / tau + f 1^T + 1 g^T),    f and g such that A 1 = 1 and A^T 1 = 1,
 
-has the largest sum of A (S - tau log A) of all such matrices (Cuturi 2013): nearly the best assignment where
-the temperature tau is small, all alike where it is large. Rows and columns are normalised in turn, which is
-to set f and then g; in logarithms, for exp(S / tau) overflows long before a matching is sharp.
+maximises the sum of A (S - tau log A) over all such matrices (Cuturi 2013): it is nearly the best assignment
+for a small temperature tau, and uniform for a large one. Rows and columns are normalised in turn by setting f
+and then g, in logarithms because exp(S / tau) overflows long before a matching is sharp.
 
-Where rows and columns are not as many, there is no such A. Then each side gets one more partner, the slack,
-which takes whom nobody matches (the dustbin of SuperGlue, Sarlin et al. 2020): as the temperature falls, two
-are matched only if that scores higher than the slack.
+If there are more rows than columns or vice versa, no such A exists. Then each side gets an extra partner, the
+slack, which absorbs the unmatched (the dustbin of SuperGlue, Sarlin et al. 2020): as the temperature falls, a
+pair is matched only if its score is higher than the slack.
 """
 
 from functools import partial
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 Derivative = Literal["unrolled", "implicit"]
 
-_NEVER = -1e30  # the logarithm of what cannot be; finite, so that no difference of two is NaN
+_NEVER = -1e30  # logarithm of an impossible pair; finite, so that no difference of two is NaN
 
 
 def sinkhorn(
@@ -33,36 +33,36 @@ def sinkhorn(
     iterations: int = 20,
     derivative: Derivative = "unrolled",
 ) -> Float[Array, "n m"]:
-    """The matching that `scores` ask for: near 1 where a row and a column belong together.
+    """The soft matching for `scores`: near 1 where a row and a column belong together.
 
-    Columns sum to 1 exactly, rows as nearly as `iterations` bring them there; with a slack both sum to less,
-    and what is missing is unmatched. A pair whose score is not finite is never matched, so -inf forbids one.
-    A row or column without any other pair takes no part, and its entries are 0.
+    Columns sum to 1 exactly, rows as closely as `iterations` allow; with a slack both sum to less, and the
+    remainder is unmatched. A pair whose score is not finite is never matched, so -inf forbids a pair. A row
+    or column without any allowed pair takes no part, and its entries are 0.
 
-    Derivatives reach scores, temperature and slack, in forward and in reverse mode. "unrolled" is the
-    derivative of what is returned, and works through all iterations again. "implicit" is that of the limit:
-    the same where the iterations have converged, so that rows sum to 1, wrong by as much as those sums where
-    not, and the faster of the two: it solves one linear system at the end, by conjugate gradients, which
-    converge at least as fast as the iterations did.
+    Derivatives reach scores, temperature and slack, in forward and reverse mode. "unrolled" is the derivative
+    of what is returned, and repeats all iterations. "implicit" is the derivative of the limit: equal to the
+    former if the iterations have converged (rows sum to 1), off by about the error of those sums if not, and
+    faster: it solves one linear system at the end, by conjugate gradients, which converge at least as fast as
+    the iterations did.
 
     Args:
-        scores: S, the larger the more alike.
+        scores: S, larger for more similar pairs.
         temperature: tau, in units of the scores, above 0.
-        rows, columns: which are there; all unless given.
-        slack: the score of being unmatched. Without one there is none where as many rows as columns take
-            part, and one of score 0 where not.
-        iterations: of rows and columns each.
+        rows, columns: which rows and columns are present (default: all).
+        slack: score of being unmatched (default: no slack if equally many rows and columns take part, else a
+            slack of score 0).
+        iterations: number of normalisations of rows and columns.
         derivative: how to differentiate.
 
     Raises:
-        ValueError: `derivative` is neither, `iterations` below 1, or a temperature not above 0.
+        ValueError: `derivative` is unknown, `iterations` is below 1, or `temperature` is not above 0.
     """
     if derivative not in ("unrolled", "implicit"):
         raise ValueError(f"derivative={derivative!r}: expected 'unrolled' or 'implicit'")
     if iterations < 1:
         raise ValueError(f"iterations={iterations}: expected 1 or more")
     if isinstance(temperature, int | float) and not temperature > 0:
-        raise ValueError(f"temperature={temperature}: expected one above 0")
+        raise ValueError(f"temperature={temperature}: expected a number above 0")
     pairs = jnp.isfinite(scores)
     if rows is not None:
         pairs &= rows[:, None]
@@ -75,7 +75,7 @@ def sinkhorn(
     possible = jnp.pad(pairs, (0, 1), constant_values=True) & (row_masses[:, None] > 0) & (column_masses > 0)
     slack = jnp.asarray(0.0 if slack is None else slack, scores.dtype)
     scores = jax.lax.pad(jnp.where(pairs, scores, 0.0), slack, [(0, 1, 0), (0, 1, 0)])
-    # Below their largest, which changes nothing: what all have in common would take the digits.
+    # Subtracting the largest changes nothing; without it a common offset would cost precision.
     largest = jax.lax.stop_gradient(jnp.max(scores, where=possible, initial=_NEVER))
     logits = jnp.where(possible, (scores - largest) / temperature, _NEVER)
     matching = _converged if derivative == "implicit" else _iterated
@@ -85,7 +85,7 @@ def sinkhorn(
 def _iterated(
     logits: Float[Array, "n m"], rows: Float[Array, "n"], columns: Float[Array, "m"], iterations: int
 ) -> Float[Array, "n m"]:
-    """exp(logits + f + g) after so many iterations, `rows` and `columns` the sums wanted; 0 is for absent."""
+    """exp(logits + f + g) after some iterations; `rows` and `columns` are the wanted sums, 0 if absent."""
 
     def iterate(potentials, _):
         _, g = potentials
@@ -94,13 +94,13 @@ def _iterated(
         return (f, g), None
 
     start = jnp.zeros_like(rows), jnp.zeros_like(columns)
-    # Of each iteration the way back needs matrices; it makes them again from f and g, which alone are kept.
+    # The backward pass needs matrices of each iteration; it recomputes them from f and g, which are stored.
     (f, g), _ = jax.lax.scan(jax.checkpoint(iterate), start, length=iterations)
     return jnp.exp(logits + f[:, None] + g)
 
 
 def _potential(logits: Float[Array, "n m"], sums: Float[Array, "k"], axis: int) -> Float[Array, "k"]:
-    """What has to be added along `axis` for exp(logits) to have these sums."""
+    """The potential to add along `axis` for exp(logits) to have these sums."""
     there = sums > 0
     return jnp.where(there, jnp.log(jnp.where(there, sums, 1.0)) - jax.nn.logsumexp(logits, axis=axis), 0.0)
 
@@ -111,13 +111,14 @@ def _converged(
 ) -> Float[Array, "n m"]:
     """As `_iterated`, with the derivative of the limit.
 
-    f and g give back what a change of the logits L adds to any row or column. With a and b the sums of A,
+    f and g compensate what a change of the logits L adds to any row or column. With a and b the sums of A,
 
         dA = A (dL + df 1^T + 1 dg^T),    a df + A dg = -(A dL) 1,    A^T df + b dg = -(A dL)^T 1.
 
-    Without df, and in h = sqrt(b) dg, that is (1 - Q^T Q) h = ..., Q = A / sqrt(a b^T), symmetric and without
-    negative eigenvalues. The second largest singular value s of Q decides how fast: the iterations gain s^2
-    each, conjugate gradients (1 - sqrt(1 - s^2)) / (1 + sqrt(1 - s^2)), which is less. So as many are enough.
+    Eliminating df, and with h = sqrt(b) dg, this is (1 - Q^T Q) h = ..., Q = A / sqrt(a b^T), symmetric and
+    positive semidefinite. The second largest singular value s of Q determines the convergence: each Sinkhorn
+    iteration reduces the error by s^2, each of conjugate gradients by (1 - sqrt(1 - s^2)) /
+    (1 + sqrt(1 - s^2)), which is smaller. So the same number of iterations is enough.
     """
     return _iterated(logits, rows, columns, iterations)
 
@@ -129,7 +130,7 @@ def _converged_jvp(iterations, primals, tangents):
     a = jnp.where(primals[1] > 0, matching.sum(axis=1), 1.0)
     b = jnp.where(primals[2] > 0, matching.sum(axis=0), 1.0)
     root, dot = jnp.sqrt(b), partial(jnp.matmul, precision="highest")
-    # A sharp matching is a permutation, Q^T Q = 1 but for rounding, of which this keeps h clear.
+    # For a sharp matching, a permutation, Q^T Q = 1 up to rounding, from which this term protects h.
     rounding = 10 * jnp.finfo(matching.dtype).eps
 
     def system(h):

@@ -1,22 +1,22 @@
-"""Where to grasp an object: antipodal grasps on labelled points, such as the tracker's Gaussians.
+"""Antipodal grasps on labelled points, such as the tracker's Gaussians.
 
-After Object-Aware Gaussian Splatting for Robotic Manipulation, section III-B: sample grasp poses near the
+Following Object-Aware Gaussian Splatting for Robotic Manipulation, section III-B: sample grasp poses near the
 object's points and take the one with the largest antipodal score. Two contacts hold an object if the line
-between them lies in both friction cones (Nguyen, Constructing force-closure grasps, IJRR 1988); for curved
+between them lies in both friction cones (Nguyen, Constructing force-closure grasps, IJRR 1988); on curved
 surfaces these are the antipodal points (Chen and Burdick, Finding antipodal point grasps on irregularly
 shaped objects, T-RA 1993). The score of a grasp is therefore the smaller of its two contacts' cosines between
-outward normal and closing axis. It has to be that of friction's cone at least: cos(arctan(friction)).
+outward normal and closing axis. It has to be at least that of the friction cone, cos(arctan(friction)).
 
-Tool axes: z is the approach, from the palm to the fingertips; y is the closing axis, from one finger to the
-other; x = y cross z. The origin lies midway between the middles of the two pads.
+Tool axes: z is the approach direction, from the palm to the fingertips; y is the closing axis, from one
+finger to the other; x = y cross z. The origin lies midway between the centres of the two pads.
 
-**Surfaces that nobody has seen.** Cameras on one side leave objects without a far side. If next to nothing of
-an object, anywhere on it, faces one of the fingers, that contact is unseen: the object is taken to be
-symmetric, so the contact gets the other one's cosine, and the score is multiplied by `unseen`, less than 1 so
-that a grasp with two seen contacts is preferred. The width is then that of what is seen, a lower bound.
+**Unobserved surfaces.** With cameras on one side only, objects have no far side. If hardly any surface of the
+object faces one of the fingers, that contact is unobserved: the object is assumed to be symmetric, so the
+contact gets the cosine of the other one, and the score is multiplied by `unseen`, less than 1, so that a
+grasp with two observed contacts is preferred. The width is then that of the observed part, a lower bound.
 
-The fingers close on all of the object that lies between them, so no part is grasped past another: a mug's
-handle only from where its body is not in the way.
+The fingers close on everything of the object that lies between them, so no part is grasped through another: a
+mug's handle only from where the body is not in the way.
 """
 
 from dataclasses import dataclass
@@ -26,36 +26,36 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-_PATCH = 0.005  # how far from the outermost point a contact's normals are still averaged, metres
+_PATCH = 0.005  # depth below the outermost point over which a contact's normals are averaged, metres
 _FACING = 0.3  # a surface whose cosine with the closing axis is below this does not face the finger
-_SEEN = 0.02  # share of an object's points that must face a finger for that side of it to count as seen
+_SEEN = 0.02  # fraction of an object's points that must face a finger for that side to count as observed
 _LEAST = 0.05  # weight of facing points near a contact below which its cosine fades to 0
-_TILT = 0.15  # standard deviation of the angle between a drawn normal and the closing axis, radians
-_BATCH = 32  # grasps scored at a time: their intermediate values stay in the cache
+_TILT = 0.15  # standard deviation of the angle between the contact's normal and the closing axis, radians
+_BATCH = 32  # grasps scored at a time, so that intermediate values stay in the cache
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """Two parallel fingers below a palm, as boxes; a Franka Panda's hand unless told. Lengths in metres."""
+    """Two parallel fingers and a palm, as boxes; by default the hand of a Franka Panda. Lengths in metres."""
 
     max_width: float = 0.08
-    """Between the open fingers."""
+    """Distance between the open fingers."""
     finger_thickness: float = 0.014
-    """Of one finger along y, the closing axis."""
+    """Size of a finger along y, the closing axis."""
     finger_depth: float = 0.021
-    """Of a finger along x, across both other axes."""
+    """Size of a finger along x."""
     finger_height: float = 0.046
-    """From the palm to the fingertips, along z."""
+    """Distance from the palm to the fingertips, along z."""
     tip: float = 0.009
-    """From the tool's origin, the middle of the pads, on to the fingertips."""
+    """Distance from the tool's origin, between the centres of the pads, to the fingertips."""
     palm_width: float = 0.204
-    """Of the palm along y."""
+    """Size of the palm along y."""
     palm_depth: float = 0.063
-    """Of the palm along x."""
+    """Size of the palm along x."""
     palm_height: float = 0.066
-    """Of the palm along z, away from the fingers; the arm behind it is the planner's concern."""
+    """Size of the palm along z, away from the fingers; the arm behind it is left to the planner."""
     friction: float = 1.0
-    """Coefficient between pads and object: about that of rubber on most things."""
+    """Friction coefficient between pads and object; the default is roughly that of rubber."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -67,10 +67,10 @@ class Grasp(NamedTuple):
     """One grasp.
 
     Attributes:
-        pose: tool to world; see the module's first lines for the axes.
-        width: between the contacts, metres.
+        pose: tool to world; see the module's docstring for the axes.
+        width: distance between the contacts, metres.
         score: the smaller cosine between a contact's outward normal and the closing axis, 0 to 1.
-        feasible: the object fits between the fingers and nothing is hit by them or the palm.
+        feasible: the object fits between the fingers, and neither they nor the palm collide with anything.
     """
 
     pose: Float[Array, "*batch 4 4"]
@@ -95,26 +95,27 @@ def best_grasp(
 ) -> Grasp:
     """The best of `samples` grasps drawn near the object's points.
 
-    Each draws a contact, a closing axis about against its normal, and a roll about that axis. Which points
-    are drawn depends on `key` and on `valid` alone, so with one key the samples ride with the object from
-    frame to frame. If none is feasible, the one with the largest score is returned and says so.
+    Each sample draws a contact, a closing axis roughly opposite to its normal, and a roll about that axis.
+    Which points are drawn depends only on `key` and `valid`, so with a fixed key the samples move with the
+    object from frame to frame. If no grasp is feasible, the one with the largest score is returned, with
+    `feasible` False.
 
     Args:
-        points, normals: of the object; outward, unit length or zero where unknown. What is not finite is
-            ignored. A point without a normal has extent but offers no contact.
-        valid: which rows count.
-        obstacles, obstacle_valid: points of everything else, and which of them count.
-        gripper: static.
-        samples: static.
-        approach: direction that the tool's z should have, such as straight down onto a table; any if None.
-        max_angle: largest angle between the two, radians.
-        unseen: what a contact that nobody has seen counts beside one that has, 0 to 1.
+        points, normals: points of the object, and their outward normals, of unit length, or zero where
+            unknown. Rows that are not finite are ignored. Points without a normal are never contacts.
+        valid: rows to use.
+        obstacles, obstacle_valid: points of everything else, and which of them to use.
+        gripper: the gripper, static.
+        samples: number of grasps to draw, static.
+        approach: desired direction of the tool's z, such as straight down onto a table; None allows any.
+        max_angle: largest angle between the tool's z and `approach`, radians.
+        unseen: weight of a grasp with an unobserved contact, 0 to 1.
 
     Raises:
-        ValueError: no samples.
+        ValueError: `samples` is below 1.
     """
     if samples < 1:
-        raise ValueError(f"best_grasp: samples is {samples}, expected 1 or more")
+        raise ValueError(f"samples: expected 1 or more, found {samples}")
     poses = sample_poses(
         key, points, normals, valid, gripper, samples, approach=approach, max_angle=max_angle
     )
@@ -149,15 +150,15 @@ def sample_poses(
     approach: Float[Array, "3"] | None = None,
     max_angle: float = 0.5,
 ) -> Float[Array, "samples 4 4"]:
-    """Tool poses that close on a drawn contact; NaN where there is nothing to draw.
+    """Tool poses that close on a randomly drawn contact; NaN if there is nothing to draw.
 
-    The draws are made relative to the object (a direction across the normal is that to another of its
-    points), so the poses turn with it; only `approach` is the world's.
+    The draws are relative to the object (the direction across a normal is that to another of its points), so
+    the poses rotate with it; only `approach` is fixed in the world.
 
     Args:
-        key: of the draws.
+        key: random key of the draws.
         points, normals, valid, gripper, approach, max_angle: as for `best_grasp`.
-        samples: how many poses, static.
+        samples: number of poses, static.
     """
     points, normals, valid = _usable(points, normals, valid)
     where, toward, tilt, roll, insert = jax.random.split(key, 5)
@@ -171,7 +172,7 @@ def sample_poses(
     angle = jax.random.uniform(roll, (samples, 1), points.dtype, -half, half)
     z = _unit(_reject(across if approach is None else jnp.broadcast_to(approach, y.shape), y))
     z = jnp.cos(angle) * z + jnp.sin(angle) * jnp.cross(y, z)
-    # The contact may lie anywhere on the pad, which reaches from the tip as far back behind its middle.
+    # The contact may lie anywhere on the pad, which extends from the tip equally far beyond its centre.
     along = jax.random.uniform(insert, (samples, 1), points.dtype, -gripper.tip, gripper.tip)
     return _pose(jnp.stack([jnp.cross(y, z), y, z], axis=-1), contact - along * z)
 
@@ -189,13 +190,12 @@ def score_grasp(
     max_angle: float = 0.5,
     unseen: float = 0.5,
 ) -> Grasp:
-    """Close the gripper at `pose` and say what it holds. A grasp may so be scored again in the next frame.
+    """Close the gripper at `pose` and score the grasp. A grasp can thus be scored again in the next frame.
 
-    The fingers close along y on all points that are as far along x and z as they are, and the grasp's pose is
-    `pose` moved along y to the middle of those. It is feasible if they fit between the open fingers, both
-    contacts are in friction's cone, and neither the palm nor the fingers on their way from open to closed hit
-    anything. Arguments as for `best_grasp`, and `pose`, the
-    tool's in the world.
+    The fingers close along y on all points within their extent along x and z, and the pose of the grasp is
+    `pose` moved along y to the middle of those points. It is feasible if the points fit between the open
+    fingers, both contacts are in the friction cone, and neither the palm nor the closing fingers collide with
+    anything. Arguments as for `best_grasp`, and `pose`, the pose of the tool in the world.
     """
     points, normals, valid = _usable(points, normals, valid)
     sound = jnp.isfinite(pose).all()
@@ -230,7 +230,7 @@ def score_grasp(
 
 
 def _usable(points, normals, valid):
-    """Finite points and unit normals: rows that are not finite no longer count; such normals are zero."""
+    """Points and unit normals; rows that are not finite become invalid, and such normals zero."""
     valid = valid & jnp.isfinite(points).all(axis=1)
     points = jnp.where(valid[:, None], points, 0.0)
     known = valid & jnp.isfinite(normals).all(axis=1)
@@ -238,18 +238,18 @@ def _usable(points, normals, valid):
 
 
 def _unit(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Of length 1, but zero where there is no direction."""
+    """Vectors scaled to length 1; zero where there is no direction."""
     length = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
     return jnp.where(length > 1e-9, vectors / jnp.maximum(length, 1e-9), 0.0)
 
 
 def _reject(vectors: Float[Array, "n 3"], axes: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """What of each vector is across its axis."""
+    """The component of each vector orthogonal to its axis."""
     return vectors - jnp.sum(vectors * axes, axis=-1, keepdims=True) * axes
 
 
 def _draw_rows(key: Key[Array, ""], chosen: Bool[Array, "n"], samples: int):
-    """Rows drawn with replacement from those chosen; row 0 if there is none."""
+    """Rows drawn with replacement from the chosen ones; row 0 if there are none."""
     count = jnp.cumsum(chosen)
     rank = 1 + jnp.floor(jax.random.uniform(key, (samples,)) * count[-1])
     return jnp.searchsorted(count, jnp.minimum(rank, count[-1]))
@@ -257,10 +257,10 @@ def _draw_rows(key: Key[Array, ""], chosen: Bool[Array, "n"], samples: int):
 
 def _pose(rotation: Float[Array, "s 3 3"], origin: Float[Array, "s 3"]) -> Float[Array, "s 4 4"]:
     """Rigid transforms; NaN where the axes are degenerate."""
-    fine = jnp.abs(jnp.linalg.det(rotation) - 1) < 1e-3
+    is_rotation = jnp.abs(jnp.linalg.det(rotation) - 1) < 1e-3
     top = jnp.concatenate([rotation, origin[..., None]], axis=-1)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], top.dtype), (len(top), 1, 4))
-    return jnp.where(fine[:, None, None], jnp.concatenate([top, bottom], axis=1), jnp.nan)
+    return jnp.where(is_rotation[:, None, None], jnp.concatenate([top, bottom], axis=1), jnp.nan)
 
 
 def _along(vectors: Float[Array, "n 3"], axis: Float[Array, "3"]) -> Float[Array, "n"]:
@@ -269,13 +269,13 @@ def _along(vectors: Float[Array, "n 3"], axis: Float[Array, "3"]) -> Float[Array
 
 
 def _into(pose: Float[Array, "4 4"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Points in the tool's axes."""
+    """Points in the tool's frame."""
     shifted = points - pose[:3, 3]
     return jnp.stack([_along(shifted, pose[:3, i]) for i in range(3)], axis=-1)
 
 
 def _at_fingers(local: Float[Array, "n 3"], gripper: Gripper) -> Bool[Array, "n"]:
-    """Which points are as far along and across as the fingers are, wherever along the closing axis."""
+    """Points within the extent of the fingers along x and z, anywhere along the closing axis."""
     x, _, z = jnp.moveaxis(local, -1, 0)
     return (
         (jnp.abs(x) <= gripper.finger_depth / 2)
@@ -285,13 +285,13 @@ def _at_fingers(local: Float[Array, "n 3"], gripper: Gripper) -> Bool[Array, "n"
 
 
 def _in_fingers(local: Float[Array, "n 3"], width: Float[Array, ""], gripper: Gripper) -> Bool[Array, "n"]:
-    """Which points the fingers sweep over while they close from open to `width`."""
+    """Points swept by the fingers while they close from fully open to `width`."""
     beside, outside = jnp.abs(local[:, 1]), gripper.max_width / 2 + gripper.finger_thickness
     return _at_fingers(local, gripper) & (beside > width / 2) & (beside <= outside)
 
 
 def _in_palm(local: Float[Array, "n 3"], gripper: Gripper) -> Bool[Array, "n"]:
-    """Which points the palm fills."""
+    """Points inside the palm."""
     behind = gripper.tip - gripper.finger_height - local[:, 2]
     beside = jnp.abs(local[:, :2]) <= jnp.array([gripper.palm_depth / 2, gripper.palm_width / 2])
     return beside.all(axis=1) & (behind > 0) & (behind <= gripper.palm_height)
@@ -300,11 +300,11 @@ def _in_palm(local: Float[Array, "n 3"], gripper: Gripper) -> Bool[Array, "n"]:
 def _contact(
     cosines: Float[Array, "n"], gaps: Float[Array, "n"], between: Bool[Array, "n"]
 ) -> Float[Array, ""]:
-    """Mean cosine of the surface that faces a finger where it touches; 0 if there is none.
+    """Mean cosine of the surface that faces a finger at the contact; 0 if there is none.
 
     Args:
-        cosines: of each outward normal with the direction to the finger.
-        gaps: how much deeper than the outermost point each point lies, metres.
+        cosines: cosine between each outward normal and the direction to the finger.
+        gaps: depth of each point below the outermost one, metres.
     """
     facing = jnp.maximum(cosines - _FACING, 0.0)
     weights = jnp.where(between, facing * jnp.exp(-((gaps / _PATCH) ** 2)), 0.0)

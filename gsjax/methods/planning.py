@@ -1,4 +1,4 @@
-"""How the tool gets to a grasp: what is asked of a motion planner, and straight lines, which need none."""
+"""Motion of the tool to a grasp: the interface of a motion planner, and a straight-line planner."""
 
 from typing import NamedTuple, Protocol
 
@@ -11,11 +11,11 @@ from gsjax.methods.grasping import Grasp
 
 
 class Path(NamedTuple):
-    """Where the tool goes, in order.
+    """Waypoints of the tool, in order.
 
     Attributes:
         poses: tool to world, with the axes of `gsjax.methods.grasping`.
-        closed: whether the gripper is closed there.
+        closed: whether the gripper is closed at each waypoint.
     """
 
     poses: Float[Array, "s 4 4"]
@@ -23,10 +23,10 @@ class Path(NamedTuple):
 
 
 class MotionPlanner(Protocol):
-    """Plans from where the tool is. It is asked again whenever the grasp has changed."""
+    """Plans a path from the present pose of the tool. It is called again whenever the grasp changes."""
 
     def __call__(self, start: Float[Array, "4 4"], grasp: Grasp) -> Path:
-        """A path from `start` to the grasp and on, with the gripper closed at the grasp."""
+        """A path from `start` to the grasp and beyond, with the gripper closing at the grasp."""
         ...
 
 
@@ -40,27 +40,27 @@ def straight_line(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     steps: int = 10,
 ) -> Path:
-    """Straight lines: to a pose before the grasp, along the tool's z to the grasp, close, and lift.
+    """A path of straight lines: to a pre-grasp pose, along the tool's z to the grasp, close, and lift.
 
-    How far the pose before the grasp stands back depends on how far off its approach line the tool is, so the
-    plan from any point of a plan is the rest of that plan, and a moving object does not send the tool back.
-    Nothing is avoided but what `best_grasp` has checked at the grasp.
+    The standoff of the pre-grasp pose depends on the tool's distance from the approach line. So replanning
+    from any point of a plan gives the rest of that plan, and a moving object does not send the tool back.
+    Obstacles are avoided only at the grasp itself, where `best_grasp` has checked them.
 
     Args:
-        standoff: how far the pose before the grasp stands back at most, metres.
-        funnel: half the angle of the cone about the approach line in which the tool may come nearer, radians.
-        lift: how far the closed gripper rises along `up`, metres.
-        steps: waypoints of each of the four legs, static.
-        start: where the tool is.
-        grasp: the goal.
+        start: present pose of the tool, tool to world.
+        grasp: the grasp to reach.
+        standoff: largest distance of the pre-grasp pose from the grasp, metres.
+        funnel: half-angle of the cone around the approach line in which the tool may advance, radians.
+        lift: distance by which the closed gripper rises along `up`, metres.
         up: direction of the lift, world.
+        steps: waypoints per leg (there are four), static.
     """
     goal = jaxlie.SE3.from_matrix(grasp.pose)
     approach = grasp.pose[:3, 2]
     offset = start[:3, 3] - grasp.pose[:3, 3]
     across = jnp.linalg.norm(offset - (offset @ approach) * approach)
     back = jnp.minimum(across / jnp.tan(funnel), standoff)
-    behind = jnp.clip(-offset @ approach, 0.0, standoff)  # on the line already: go on from there
+    behind = jnp.clip(-offset @ approach, 0.0, standoff)  # already on the line: continue from there
     before = _shifted(goal, -jnp.maximum(back, behind) * approach)
     lifted = _shifted(goal, lift * jnp.asarray(up, approach.dtype))
     first = _leg(jaxlie.SE3.from_matrix(start), before, steps)
@@ -75,7 +75,7 @@ def _shifted(pose: jaxlie.SE3, by: Float[Array, "3"]) -> jaxlie.SE3:
 
 
 def _leg(start: jaxlie.SE3, end: jaxlie.SE3, steps: int) -> Float[Array, "s 4 4"]:
-    """Poses after `start` up to and with `end`: the origin on a line, the axes turning at a constant rate."""
+    """Poses after `start`, up to and including `end`: linear in position, at a constant angular velocity."""
     turn = (start.rotation().inverse() @ end.rotation()).log()
     move = end.translation() - start.translation()
 

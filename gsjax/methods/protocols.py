@@ -1,8 +1,8 @@
-"""What methods ask of others: who says what belongs together, what a pixel is like, where it moves, what
-words mean, and what the answer to a question is.
+"""Interfaces that methods require of external models: segmentation, dense features, optical flow, language,
+and answers to questions.
 
-`gsjax.perception` has a default without weights for each, and adapters of foundation models. Nobody needs to
-inherit: whatever can be called like this fits. All of them work on the host, in numpy.
+`gsjax.perception` has a default without weights for most of them, and adapters for foundation models.
+No inheritance is needed: any callable with a matching signature works. All run on the host, in numpy.
 """
 
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Labels of a picture."""
+    """Labels of an image."""
 
     def __call__(
         self,
@@ -24,7 +24,7 @@ class Segmenter(Protocol):
         depth: Num[np.ndarray, "H W"] | None,
         K: Float[np.ndarray, "3 3"] | None,
     ) -> Int[np.ndarray, "H W"]:
-        """0 background, then 1, 2, ... from the largest object to the smallest.
+        """0 for background, then 1, 2, ... from the largest object to the smallest.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
@@ -36,17 +36,17 @@ class Segmenter(Protocol):
 
 @runtime_checkable
 class Propagator(Protocol):
-    """Labels of one picture, carried to others."""
+    """Propagation of the labels of one image to others."""
 
     def __call__(
         self, images: Num[np.ndarray, "V H W 3"], labels: Int[np.ndarray, "H W"]
     ) -> Int[np.ndarray, "V H W"]:
-        """Labels of all pictures; the same number means the same object, and 0 the background.
+        """Labels of all images; equal numbers denote the same object, and 0 the background.
 
         Args:
-            images: RGB, uint8 or floats 0 to 1, in an order in which neighbours are alike: views from side to
+            images: RGB, uint8 or floats 0 to 1, ordered so that neighbours are similar: views from side to
                 side, or frames of a video.
-            labels: of the first picture. They come back as they are.
+            labels: labels of the first image, which are returned unchanged.
         """
         ...
 
@@ -56,7 +56,7 @@ class DenseEncoder(Protocol):
     """A feature for each pixel."""
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C H W D"]:
-        """Features of pictures that are to be comparable with each other.
+        """Features of images that should be comparable with each other.
 
         Args:
             images: RGB, uint8 or floats 0 to 1.
@@ -66,12 +66,12 @@ class DenseEncoder(Protocol):
 
 @runtime_checkable
 class OpticalFlow(Protocol):
-    """Where each pixel of a picture is in another one."""
+    """Optical flow from one image to another."""
 
     def __call__(
         self, image: Num[np.ndarray, "H W 3"], other: Num[np.ndarray, "H W 3"]
     ) -> Float[np.ndarray, "H W 2"]:
-        """Pixels (x, y) that each pixel of `image` moves until `other`; NaN where unknown.
+        """Displacement (x, y) of each pixel of `image` to `other`, pixels; NaN where unknown.
 
         Args:
             image, other: RGB, uint8 or floats 0 to 1.
@@ -81,10 +81,10 @@ class OpticalFlow(Protocol):
 
 @runtime_checkable
 class LanguageEncoder(Protocol):
-    """Objects and words in one vector space, in which likeness is the cosine.
+    """Objects and text in one vector space, in which similarity is the cosine.
 
     Attributes:
-        min_score: a query whose best cosine is less means none of the objects.
+        min_score: a query whose best cosine is lower matches none of the objects.
     """
 
     min_score: float
@@ -92,12 +92,12 @@ class LanguageEncoder(Protocol):
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """A vector for each of the labels 1 to `count`; zeros for one that no pixel has.
+        """A vector for each of the labels 1 to `count`; zeros for a label without pixels.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
-            labels: of its pixels, 0 the background.
-            count: the largest label that is asked for.
+            labels: label of each pixel, 0 for background.
+            count: the largest label to embed.
         """
         ...
 
@@ -105,32 +105,32 @@ class LanguageEncoder(Protocol):
         """The vector of a query.
 
         Raises:
-            ValueError: the text says nothing that this encoder knows; the message says what it does know.
+            ValueError: the encoder does not understand the text; the message says what it understands.
         """
         ...
 
 
 @runtime_checkable
 class Answerer(Protocol):
-    """What is the answer to a question on a scene; `gsjax.methods.deform` has the default."""
+    """Answers questions about a scene; `gsjax.methods.deform` has the default."""
 
     def __call__(self, question: str, facts: "SceneFacts") -> "Answer":
-        """A sentence, and a value where it comes to one.
+        """The answer as a sentence, and as a value if it has one.
 
         Args:
-            question: in plain English.
-            facts: what was measured of the scene.
+            question: a question in plain English.
+            facts: measurements of the scene.
 
         Raises:
-            ValueError: it cannot be answered; the message says what can be asked.
+            ValueError: the question cannot be answered; the message says what can be asked.
         """
         ...
 
 
 @runtime_checkable
 class LanguageModel(Protocol):
-    """A text that goes on from another; gsjax has none, its user gives the function."""
+    """Text completion; gsjax has no default, the user provides the function."""
 
     def __call__(self, prompt: str) -> str:
-        """The model's text."""
+        """The completion of the prompt."""
         ...

@@ -1,8 +1,8 @@
-"""A scripted judge of edited videos: did the rest stay, did the part go where it was asked to, is its old
-place clean?
+"""A scripted judge of edited videos: is the rest unchanged, did the part move as requested, and is the place
+that it left clean?
 
-It looks at pixels alone, and at what the edit was told to do. It is no GPT-EE, which is GPT-4o's opinion
-(papers/001, section 4.1), and no figure of it bears that name. Each finding has a reason in words.
+It uses only the pixels and the requested edit. It is not GPT-EE, which is GPT-4o's opinion (MotionSplicer,
+section 4.1), and its scores never bear that name. Each finding comes with a reason in words.
 
 Videos are [T, H, W, 3], RGB, uint8 or floats 0 to 1; regions [T, H, W]. On the host.
 """
@@ -20,11 +20,11 @@ from gsjax.metrics.temporal import unit_frames
 
 
 class Finding(NamedTuple):
-    """What the judge says of one side of an edit.
+    """The verdict on one aspect of an edit.
 
     Attributes:
-        score: 0 to 1, the more the better; NaN where there was nothing to judge.
-        reason: why, in words.
+        score: 0 to 1, higher is better; NaN if there was nothing to judge.
+        reason: the reason for the score, in words.
     """
 
     score: float
@@ -37,56 +37,57 @@ def rest_stays(
     touched: Bool[np.ndarray, "..."],
     tolerance: float = 1 / 255,
 ) -> Finding:
-    """The share of the pixels outside `touched` that are as they were.
+    """The fraction of the pixels outside `touched` that are unchanged.
 
     Args:
-        before, after: the video, and the edited one.
-        touched: what may change: pixels that show an edited part before or after, its shadow if it has one.
-        tolerance: largest difference of a channel, colours from 0 to 1.
+        before, after: the video before and after the edit.
+        touched: pixels that may change: those that show an edited part, before or after, or its shadow.
+        tolerance: largest difference of a channel that counts as unchanged, colours from 0 to 1.
 
     Raises:
         ValueError: the shapes do not agree.
     """
     _check_shapes(before, after=after, touched=touched)
     changed = _differ(before, after, tolerance)[~touched]
-    return _finding(~changed, "pixels beside the edit are as they were")
+    return _finding(~changed, "pixels outside the edit are unchanged")
 
 
-def asked_motion_is_seen(
+def requested_motion_is_seen(
     before: Num[np.ndarray, "..."],
     after: Num[np.ndarray, "..."],
-    asked: Float[np.ndarray, "..."],
+    requested: Float[np.ndarray, "..."],
     tolerance: float = 0.1,
 ) -> Finding:
-    """The share of the part's pixels that are found again where they were asked to go.
+    """The fraction of the part's informative pixels that moved as requested.
 
-    A pixel tells only if the video before the edit has another colour where it should go, by more than twice
-    the tolerance: by the others, a part that was moved looks like one that was not. So the score is 0 for an
-    edit that did nothing, and 1 for one that did what was asked.
+    A pixel is informative only if the colour at its destination, in the video before the edit, differs from
+    its own by more than twice the tolerance; other pixels cannot tell a moved part from an unmoved one. So an
+    edit that did nothing scores 0, and one that did exactly what was requested scores 1.
 
     Args:
-        before, after: the video, and the edited one.
-        asked: [T, H, W, 2], pixels (x, y) by which the part seen at each pixel of `before` is to be displaced
-            in `after` (`asked_displacement`); NaN where no part is, and where it is not to be seen any more.
-        tolerance: largest difference of a channel, colours from 0 to 1. Edges that are drawn between pixels
-            and light that changes on the way need some.
+        before, after: the video before and after the edit.
+        requested: [T, H, W, 2], pixels (x, y) by which the part seen at each pixel of `before` should be
+            displaced in `after` (`requested_displacement`); NaN where there is no part, and where it should
+            no longer be visible.
+        tolerance: largest difference of a channel, colours from 0 to 1. It allows for antialiased edges and
+            for lighting that changes along the way.
 
     Raises:
         ValueError: the shapes do not agree.
     """
-    _check_shapes(before, after=after, asked=asked[..., 0])
+    _check_shapes(before, after=after, requested=requested[..., 0])
     hits, lengths = [], []
-    for now, edited, displaced in zip(unit_frames(before), unit_frames(after), asked, strict=True):
+    for now, edited, displaced in zip(unit_frames(before), unit_frames(after), requested, strict=True):
         found, unmoved = warp(edited, displaced), warp(now, displaced)
-        telling = np.abs(unmoved - now).max(-1) > 2 * tolerance  # NaN, outside the picture, is not
-        hits.append((np.abs(found - now).max(-1) <= tolerance)[telling])
-        lengths.append(np.linalg.norm(displaced[telling], axis=-1))
+        informative = np.abs(unmoved - now).max(-1) > 2 * tolerance  # False for NaN, outside the image
+        hits.append((np.abs(found - now).max(-1) <= tolerance)[informative])
+        lengths.append(np.linalg.norm(displaced[informative], axis=-1))
     far = np.concatenate(lengths)
     way = f" ({far.mean():.1f} pixels away on average)" if len(far) else ""
-    return _finding(np.concatenate(hits), f"pixels that tell are where they were asked to go{way}")
+    return _finding(np.concatenate(hits), f"informative pixels moved as requested{way}")
 
 
-def asked_displacement(
+def requested_displacement(
     depth: Float[np.ndarray, "H W"],
     depth_after: Float[np.ndarray, "H W"],
     part: Bool[np.ndarray, "H W"],
@@ -96,16 +97,16 @@ def asked_displacement(
     *,
     max_depth_gap: float = 0.015,
 ) -> Float[np.ndarray, "H W 2"]:
-    """Pixels (x, y) by which a rigid motion displaces what a camera sees of a part; NaN elsewhere, where
-    depth is unknown, and where it ends outside the picture or behind something.
+    """Displacement (x, y), in pixels, of the visible part under a rigid motion. NaN off the part, where depth
+    is unknown, and where a pixel ends outside the image or is occluded.
 
     Args:
-        depth, depth_after: before and after the edit, metres, 0 where unknown.
-        part: where the part is seen before.
-        motion: of the world, from where the part is to where it is asked to be.
+        depth, depth_after: depth before and after the edit, metres, 0 where unknown.
+        part: pixels that show the part before the edit.
+        motion: rigid motion in the world, from the part's pose to the requested one.
         viewmat, K: the camera; world to camera.
-        max_depth_gap: what ends further behind `depth_after` than this is hidden, metres. In front of it, it
-            should be seen: there nothing excuses that it is not.
+        max_depth_gap: a point farther than this behind `depth_after` counts as occluded, metres. A point in
+            front of it should be visible, and is scored.
     """
     camera = jnp.asarray(viewmat, float), jnp.asarray(K, float)
     pixels = np.asarray(pixel_grid(depth.shape[1], depth.shape[0]))
@@ -129,14 +130,14 @@ def place_is_clean(
     tolerance: float = 0.1,
     least_alpha: float = 0.5,
 ) -> Finding:
-    """The share of the pixels that a part has left which show what is behind it: no hole, and no ghost.
+    """The fraction of the pixels vacated by a part that show what is behind it, with no hole and no ghost.
 
     Args:
         after: the edited video.
-        alphas: [T, H, W], how opaque it was drawn. Below `least_alpha` there is a hole.
-        background: what should be there: the truth, or the scene drawn without the part. What differs by more
-            than `tolerance` in a channel, and is no hole, is a ghost.
-        vacated: where the part was before, and where none is to be after.
+        alphas: [T, H, W], opacity of the rendering. Below `least_alpha` a pixel is a hole.
+        background: what should be visible there: the truth, or the scene rendered without the part. A pixel
+            that differs by more than `tolerance` in a channel, and is not a hole, is a ghost.
+        vacated: pixels that showed the part before, and should show none after.
 
     Raises:
         ValueError: the shapes do not agree.
@@ -149,7 +150,7 @@ def place_is_clean(
 
 
 def worst(findings: Mapping[str, Finding]) -> Finding:
-    """An edit is as good as the worst that is found of it; what was not judged is left out."""
+    """The worst finding on an edit; findings without a score are ignored."""
     judged = {name: finding for name, finding in findings.items() if not np.isnan(finding.score)}
     if not judged:
         return Finding(float("nan"), "nothing was judged")
@@ -164,13 +165,13 @@ def _finding(good: Bool[np.ndarray, "judged"], words: str) -> Finding:
 
 
 def _differ(video: np.ndarray, other: np.ndarray, tolerance: float) -> Bool[np.ndarray, "T H W"]:
-    """Pixels of which some channel differs by more, rounding apart; NaN differs."""
+    """Pixels at which a channel differs by more than the tolerance, up to rounding; NaN always differs."""
     pairs = zip(unit_frames(video), unit_frames(other), strict=True)
     return np.stack([~(np.abs(a - b).max(-1) <= tolerance + 1e-9) for a, b in pairs])
 
 
 def _check_shapes(video: np.ndarray, **others: np.ndarray) -> None:
-    """Each is a video of that shape too, or has a number for each of its pixels."""
+    """Check that each has the shape of the video, or one value per pixel."""
     for name, other in others.items():
         wanted = video.shape if other.ndim == 4 else video.shape[:3]
         if other.shape != wanted:

@@ -1,4 +1,4 @@
-"""How near a rendered picture and its depth are to the recorded ones. All on the host, in float64."""
+"""Scores of rendered images and depths against recorded ones. On the host, in float64."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 
 _SSIM_WINDOW = 11  # 3.5 sigma on either side of a Gaussian of sigma 1.5, as Wang et al. (2004)
-_MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of scales, the finest first: Wang et al. (2003)
+_MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # per scale, finest first: Wang et al. (2003)
 MS_SSIM_LEAST_SIDE = (_SSIM_WINDOW - 1) * 2 ** (len(_MS_SSIM_WEIGHTS) - 1) + 1
-"""Pixels a side below which the coarsest of MS-SSIM's scales is smaller than its window."""
+"""Smallest side, in pixels, at which the coarsest scale of MS-SSIM still holds a window."""
 
 
 def psnr(
@@ -22,14 +22,14 @@ def psnr(
 
         -10 log10( sum over mask and channels of (image - reference)^2 / (channels * area of mask) )
 
-    It divides by the mask's own area: dividing by all pixels would credit those that nobody compared.
+    The divisor is the area of the mask: dividing by all pixels would credit those that were not compared.
 
     Args:
         image, reference: [H, W] or [H, W, channels], 0 to 1.
         mask: [H, W], True where to compare; None compares everywhere.
 
     Returns:
-        Infinity for equal pictures, NaN where the mask holds no pixel.
+        Infinity for equal images, NaN if the mask is empty.
 
     Raises:
         ValueError: the shapes do not agree.
@@ -51,21 +51,21 @@ def ssim(
 ) -> float:
     """Structural similarity (Wang et al. 2004): Gaussian window of sigma 1.5, data range 1, -1 to 1.
 
-    With a mask, the mean of the similarity map over its pixels; their windows do reach beyond it.
+    With a mask, the mean of the similarity map over its pixels; their windows still reach beyond it.
 
     Args:
         image, reference: [H, W] or [H, W, channels], 0 to 1, at least 11 pixels on each side.
         mask: [H, W], True where to compare.
 
     Returns:
-        NaN where the mask holds no pixel.
+        NaN if the mask is empty.
 
     Raises:
-        ValueError: the shapes do not agree, or the picture is smaller than the window.
+        ValueError: the shapes do not agree, or the image is smaller than the window.
     """
     image, reference = _same_shape(image, reference)
     if min(image.shape[:2]) < _SSIM_WINDOW:
-        raise ValueError(f"image: got {image.shape[:2]} pixels, want at least 11 on each side for SSIM")
+        raise ValueError(f"image: expected at least 11 pixels on each side for SSIM, found {image.shape[:2]}")
     mean, similarity = structural_similarity(
         image,
         reference,
@@ -87,13 +87,13 @@ def with_matched_colors(
     target: Float[np.ndarray, "height width 3"],
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width 3"]:
-    """The image under the affine map of its colours that brings it nearest to the target, by least squares:
-    what is left is no difference in exposure or white balance.
+    """The image after the affine map of its colours that fits the target best, by least squares; this removes
+    differences in exposure and white balance.
 
     Args:
         image: colours 0 to 1.
-        target: what it is brought near to.
-        mask: pixels by which the map is found; all unless given. It is applied to all.
+        target: the image to match.
+        mask: pixels used to fit the map, which is then applied to all; default: all.
     """
     counted = np.ones(image.shape[:2], bool) if mask is None else mask
     colors = np.concatenate([image[counted], np.ones((int(counted.sum()), 1))], axis=1)
@@ -106,33 +106,33 @@ def ms_ssim(
     reference: Num[np.ndarray, "..."],
     mask: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
-    """Multi-scale structural similarity (Wang, Simoncelli, Bovik 2003), of each channel, and then the mean.
+    """Multi-scale structural similarity (Wang, Simoncelli, Bovik 2003), per channel and then averaged.
 
         cs_1^0.0448 cs_2^0.2856 cs_3^0.3001 cs_4^0.2363 (l_5 cs_5)^0.1333
 
-    l compares luminance, cs contrast and structure, each in the window of `ssim`; every scale is the mean of
-    squares of 2x2 pixels of the one before, where a side is odd with its last row or column twice. A scale
-    on which the pictures are anticorrelated counts as 0, for a negative number has no such power.
+    l compares luminance, cs contrast and structure, each in the window of `ssim`. Each scale averages the one
+    before over blocks of 2x2 pixels, repeating the last row or column where a side is odd. A scale on which
+    the images are anticorrelated counts as 0, since a negative number has no such power.
 
-    With a mask, means over a scale's pixels, by the share of each that the mask covers; their windows do
-    reach beyond it.
+    With a mask, means over a scale's pixels are weighted by the fraction of each that the mask covers; their
+    windows still reach beyond it.
 
     Args:
         image, reference: [H, W] or [H, W, channels], 0 to 1, at least 161 pixels on each side.
         mask: [H, W], True where to compare.
 
     Returns:
-        NaN where the mask holds no pixel.
+        NaN if the mask is empty.
 
     Raises:
-        ValueError: the shapes do not agree, or the picture is too small for five scales.
+        ValueError: the shapes do not agree, or the image is too small for five scales.
     """
     image, reference = _same_shape(image, reference)
     weights = None if mask is None else _checked(mask, image).astype(np.float64)
     if min(image.shape[:2]) < MS_SSIM_LEAST_SIDE:
         raise ValueError(
-            f"image: got {image.shape[:2]} pixels, want at least {MS_SSIM_LEAST_SIDE} on each side for the "
-            "five scales of MS-SSIM"
+            f"image: expected at least {MS_SSIM_LEAST_SIDE} pixels on each side for the five scales of "
+            f"MS-SSIM, found {image.shape[:2]}"
         )
     if weights is not None and not weights.any():
         return float("nan")
@@ -148,7 +148,7 @@ def ms_ssim(
 
 
 def _similarity(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each pixel: how alike luminance is, and contrast with structure (Wang et al. 2004, eq. 6, 9, 10)."""
+    """Per pixel: similarity of luminance, and of contrast and structure (Wang et al. 2004, eq. 6, 9, 10)."""
     c1, c2 = 0.01**2, 0.03**2
 
     def blurred(a: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ def _similarity(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    """Of each channel: over the pixels whose window lies in the picture, or under weights over all."""
+    """Mean per channel: over the pixels whose window lies within the image, or weighted over all pixels."""
     if weights is not None:
         return np.tensordot(weights, values, axes=2) / weights.sum()
     half = _SSIM_WINDOW // 2
@@ -174,12 +174,12 @@ def _halved(a: np.ndarray) -> np.ndarray:
 
 
 class DepthError(NamedTuple):
-    """How far depth is off, over the pixels where both it and the truth are valid.
+    """Error of a depth image, over the pixels where both it and the reference are valid.
 
     Attributes:
-        mean_abs_mm: mean of |depth - reference|, millimetres; NaN without a valid pixel.
-        within_1cm: fraction of the pixels that are off by at most 10 mm; NaN without a valid pixel.
-        num_pixels: how many pixels were compared.
+        mean_abs_mm: mean of |depth - reference|, millimetres; NaN if no pixel is valid.
+        within_1cm: fraction of the pixels with an error of at most 10 mm; NaN if no pixel is valid.
+        num_pixels: number of pixels compared.
     """
 
     mean_abs_mm: float
@@ -212,14 +212,14 @@ def depth_error(
 
 
 def _same_shape(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both in float64, or a ValueError that says how they differ."""
+    """Both as float64; raises ValueError if their shapes differ."""
     if np.shape(image) != np.shape(reference):
-        raise ValueError(f"reference: got shape {np.shape(reference)}, want {np.shape(image)} like the other")
+        raise ValueError(f"reference: expected shape {np.shape(image)}, found {np.shape(reference)}")
     return np.asarray(image, np.float64), np.asarray(reference, np.float64)
 
 
 def _checked(mask: np.ndarray, picture: np.ndarray, name: str = "image") -> np.ndarray:
-    """A mask that has the picture's height and width, or a ValueError that says how they differ."""
+    """The mask; raises ValueError unless it has the image's height and width."""
     if np.shape(mask) != picture.shape[:2]:
-        raise ValueError(f"mask: got shape {np.shape(mask)}, want {picture.shape[:2]} to match {name}")
+        raise ValueError(f"mask: expected shape {picture.shape[:2]} to match {name}, found {np.shape(mask)}")
     return np.asarray(mask)

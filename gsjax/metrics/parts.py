@@ -1,6 +1,6 @@
-"""Parts that were found, and their joints, against the true ones. What they are called does not matter.
+"""Scores of parts and joints that were found, against the true ones. The values of labels are arbitrary.
 
-How far points are off that found motions moved is told by `gsjax.metrics.tracking`, as are true labels.
+For true labels, and for the error of points moved by the found motions, see `gsjax.metrics.tracking`.
 """
 
 from collections.abc import Iterable
@@ -16,25 +16,25 @@ from gsjax.metrics.segmentation import IGNORED_LABEL
 
 
 def adjusted_rand_index(predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray, "..."]) -> float:
-    """How well two divisions agree on which pairs belong together (Hubert and Arabie 1985): 1 if on all, 0 as
-    much as by chance, negative if less.
+    """The adjusted Rand index (Hubert and Arabie 1985): agreement of two labelings on which pairs belong
+    together. 1 is perfect agreement, 0 is chance, and negative values are below chance.
 
         (S - A B / C) / ((A + B) / 2 - A B / C)
 
-    with S the pairs that are together in both, A and B those in one each, and C all pairs.
+    with S the pairs together in both labelings, A and B those together in one labeling each, and C all pairs.
 
     Args:
-        predicted, true: labels of the same Gaussians or pixels. Where the true one is -1, it is not known and
+        predicted, true: labels of the same Gaussians or pixels. Entries whose true label is -1 (unknown) are
             not scored.
 
     Returns:
-        1 where neither tells anything apart, or both everything; NaN for fewer than two labels.
+        1 if both labelings put everything together or everything apart; NaN for fewer than two labels.
 
     Raises:
         ValueError: the two differ in shape.
     """
     _, _, counts = _contingency(predicted, true)
-    # In whole numbers, for pairs of pairs are too many for floats to tell apart.
+    # In integers, because counts of pairs of pairs exceed the precision of floats.
     together = sum(comb(int(n), 2) for n in counts.ravel())
     found, real = (sum(comb(int(n), 2) for n in counts.sum(axis)) for axis in (1, 0))
     pairs = comb(int(counts.sum()), 2)
@@ -45,12 +45,12 @@ def adjusted_rand_index(predicted: Integer[np.ndarray, "..."], true: Integer[np.
 
 
 class PartMatch(NamedTuple):
-    """Which found part is which true one.
+    """The assignment of found parts to true ones.
 
     Attributes:
-        found: of each true label that has one, the label of its found part.
-        ious: of each true label, its overlap with that part; 0 without one.
-        surplus: labels of found parts that are no true one.
+        found: the label of the found part for each true label that was matched.
+        ious: IoU of each true label with its found part; 0 if unmatched.
+        surplus: labels of found parts that match no true part.
     """
 
     found: dict[int, int]
@@ -58,8 +58,8 @@ class PartMatch(NamedTuple):
     surplus: tuple[int, ...]
 
     def mean_iou(self, labels: Iterable[int] | None = None) -> float:
-        """Over true `labels` (all unless told; a large background says little of the parts), those that do
-        not occur left out; NaN if none does."""
+        """Mean IoU over the true `labels`, by default all; a large background dilutes the score of the parts.
+        Labels that do not occur are ignored; NaN if none occurs."""
         values = [
             self.ious[label] for label in (self.ious if labels is None else labels) if label in self.ious
         ]
@@ -67,11 +67,11 @@ class PartMatch(NamedTuple):
 
 
 def match_parts(predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray, "..."]) -> PartMatch:
-    """The one-to-one matching of found parts and true ones whose IoUs sum up to the most (Kuhn's Hungarian
-    method); what does not overlap is not matched.
+    """The one-to-one matching of found to true parts with the largest sum of IoUs (the Hungarian method).
+    Parts that do not overlap are not matched.
 
     Args:
-        predicted, true: labels of the same Gaussians or pixels. Where the true one is -1, it is not scored.
+        predicted, true: labels of the same Gaussians or pixels. Where the true label is -1, it is not scored.
 
     Raises:
         ValueError: the two differ in shape.
@@ -92,7 +92,7 @@ def match_parts(predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray,
 def _contingency(
     predicted: np.ndarray, true: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Integer[np.ndarray, "found real"]]:
-    """The labels that occur, found and true, and how often each meets each."""
+    """The found and the true labels that occur, and the contingency table of the two."""
     if predicted.shape != true.shape:
         raise ValueError(f"predicted: expected shape {true.shape} to match true, found {predicted.shape}")
     scored = true != IGNORED_LABEL
@@ -103,14 +103,14 @@ def _contingency(
 
 
 class JointError(NamedTuple):
-    """How far a joint that was found is from the true one. NaN for what the two kinds do not share.
+    """Error of a found joint against the true one. NaN where a quantity does not apply to both joints.
 
     Attributes:
-        same_kind: both slide, or both turn.
-        axis_deg: angle between the axes' lines, 0 to 90 degrees.
-        line_mm: of two hinges, how far the found line is from the true one beside the part.
-        value_deg: of two hinges, mean over time of how far the angles since the anchor are apart.
-        value_mm: of two slides, the same.
+        same_kind: both are prismatic, or both revolute.
+        axis_deg: angle between the two axes as undirected lines, 0 to 90 degrees.
+        line_mm: for revolute joints, distance between the two axes next to the part, millimetres.
+        value_deg: for revolute joints, mean absolute error over time of the angle since the anchor, degrees.
+        value_mm: for prismatic joints, the same of the displacement, millimetres.
     """
 
     same_kind: bool
@@ -121,19 +121,19 @@ class JointError(NamedTuple):
 
 
 def joint_error(found: Joint, true: Joint, middle: Float[np.ndarray, "3"], anchor: int = 0) -> JointError:
-    """Compare two joints over the same moments.
+    """Compare two joints over the same frames.
 
-    An axis and its opposite, with values of the opposite sign, are one joint; the found one is taken with the
-    axis that is nearer to the true one. Values count from where the part stands in the canonical scene, which
-    for the true joint may be ajar: so only differences to the anchor's are compared.
+    An axis and its opposite, with values of opposite sign, describe the same joint; the found joint is taken
+    with the axis closer to the true one. Values are relative to the part's pose in the canonical scene, which
+    may be ajar for the true joint, so only differences from the anchor's value are compared.
 
-    Lines of hinges that are not quite parallel pass each other somewhere, be it far away, so the least
-    distance of the two would not see half of the error. It is measured from the point of the true line that
-    is nearest to the part.
+    The axes of two nearly parallel hinges approach each other somewhere, possibly far away, so their smallest
+    distance would miss half of the error. The distance is therefore measured from the point on the true axis
+    that is nearest to the part.
 
     Args:
-        middle: of the part, world, metres.
-        anchor: the frame at which values count as 0.
+        middle: centre of the part, world, metres.
+        anchor: the frame at which values are taken as 0.
 
     Raises:
         ValueError: the joints have different numbers of frames.

@@ -1,8 +1,8 @@
-"""How alike two pictures look to people: LPIPS (Zhang, Isola, Efros, Shechtman, Wang 2018), version 0.1.
+"""Perceptual similarity of images: LPIPS (Zhang, Isola, Efros, Shechtman, Wang 2018), version 0.1.
 
-The network runs here, in JAX; its weights are the user's own, in a file on this machine. They are arrays by
-the names that torchvision and the `lpips` package give them: `features.N.weight` and `features.N.bias` of
-AlexNet or VGG16, `linN.model.1.weight` of the heads. Formats that can run code when read are refused.
+The network runs in JAX; the user provides its weights as local files. These hold arrays under the names that
+torchvision and the `lpips` package use: `features.N.weight` and `features.N.bias` of AlexNet or VGG16, and
+`linN.model.1.weight` of the heads. Formats that can run code when read are refused.
 """
 
 import hashlib
@@ -20,40 +20,40 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 CONVERT = (
-    'In an environment of your own that has torch: python -c "import sys, numpy, torch; '
+    'In an environment with torch: python -c "import sys, numpy, torch; '
     "w = torch.load(sys.argv[1], map_location='cpu', weights_only=True); "
     'numpy.savez(sys.argv[2], **{k: v.numpy() for k, v in w.items()})" OLD.pth NEW.npz'
 )
-"""How a file of torch becomes one that is read here."""
+"""How to convert a file of torch into one that can be read."""
 _ADVICE = (
-    "It takes torchvision's features of AlexNet or VGG16 and the heads of lpips, under the names that they "
-    "have there, in one file or in a folder of files; docs/scores.md says how to make them"
+    "Provide torchvision's features of AlexNet or VGG16 and the heads of lpips, under their original names, "
+    "in one file or in a folder of files; docs/scores.md says how to make them"
 )
 _PICKLES = (".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle")
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2"}
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of channels from -1 to 1
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # per channel, for colours -1 to 1
 
 
 class _Layer(NamedTuple):
-    """A convolution with a ReLU behind it, and perhaps a maximum of stride 2 before it."""
+    """A convolution followed by a ReLU, and optionally preceded by max pooling of stride 2."""
 
     index: int  # in torchvision's `features`
     channels: int
     size: int = 3
     stride: int = 1
     padding: int = 1
-    pool: int = 0  # window of the maximum; 0 for none
+    pool: int = 0  # window of the max pooling; 0 for none
     compared: bool = False
 
 
 class _Network(NamedTuple):
     name: str
     layers: tuple[_Layer, ...]
-    least_side: int  # pixels; a smaller picture leaves nothing for the last layer
+    least_side: int  # pixels; the last layer of a smaller image would be empty
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the arrays of a file."""
+        """Expected shapes of the arrays in a file, by name."""
         shapes: dict[str, tuple[int, ...]] = {}
         before = 3
         for i, channels, size, *_ in self.layers:
@@ -90,12 +90,12 @@ _NETWORKS = {network.name: network for network in (_ALEXNET, _VGG16)}
 
 
 class LpipsWeights(NamedTuple):
-    """A network that looks at pictures, and what each channel of its features counts.
+    """Weights of the image network and of the heads that compare its features.
 
     Attributes:
         network: AlexNet or VGG16.
-        convolutions: (kernel [out, in, kh, kw], bias [out]) of each.
-        heads: weight of each channel of the five layers that are compared.
+        convolutions: (kernel [out, in, kh, kw], bias [out]) of each convolution.
+        heads: weight of each channel, for each of the five layers that are compared.
     """
 
     network: Literal["AlexNet", "VGG16"]
@@ -104,12 +104,12 @@ class LpipsWeights(NamedTuple):
 
     @property
     def least_side(self) -> int:
-        """Pixels a side that a picture must have."""
+        """Smallest side of an image, pixels."""
         return _NETWORKS[self.network].least_side
 
 
 def fingerprint(weights: LpipsWeights) -> str:
-    """Tells weights apart, for only scores of the same ones can be compared."""
+    """A hash that identifies the weights; only scores with the same weights are comparable."""
     found = hashlib.sha256(weights.network.encode())
     for array in jax.tree.leaves((weights.convolutions, weights.heads)):
         found.update(np.asarray(array).tobytes())
@@ -122,40 +122,40 @@ def lpips(
     reference: Num[np.ndarray, "..."],
     mask: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
-    """Learned perceptual image patch similarity; 0 for equal pictures, and the less the more alike.
+    """Learned perceptual image patch similarity; 0 for equal images, lower is more similar.
 
         sum over layers of mean over places of sum over channels of w (a / |a| - b / |b|)^2
 
-    where a and b are the features of the two pictures at a place, and w the weights of the head.
+    where a and b are the features of the two images at a place, and w the weights of the head.
 
-    With a mask, the mean over places is weighted by the share of each that the mask covers; the network sees
-    what is around.
+    With a mask, the mean over places is weighted by the fraction of each that the mask covers; the network
+    still sees the surroundings.
 
     Args:
-        weights: from `load_lpips`.
+        weights: network and heads, from `load_lpips`.
         image, reference: [H, W, 3], RGB, 0 to 1.
         mask: [H, W], True where to compare.
 
     Returns:
-        NaN where the mask holds no pixel.
+        NaN if the mask is empty.
 
     Raises:
-        ValueError: the shapes do not agree, or the picture is smaller than the network can look at.
+        ValueError: the shapes do not agree, or the image is too small for the network.
     """
     if np.shape(image) != np.shape(reference):
-        raise ValueError(f"reference: got shape {np.shape(reference)}, want {np.shape(image)} like the other")
+        raise ValueError(f"reference: expected shape {np.shape(image)}, found {np.shape(reference)}")
     if np.ndim(image) != 3 or np.shape(image)[2] != 3:
-        raise ValueError(f"image: got shape {np.shape(image)}, want [H, W, 3], RGB")
+        raise ValueError(f"image: expected shape [H, W, 3], RGB, found {np.shape(image)}")
     height, width = np.shape(image)[:2]
     if min(height, width) < weights.least_side:
         raise ValueError(
-            f"image: got {(height, width)} pixels, want at least {weights.least_side} on each side for LPIPS "
-            f"with {weights.network}"
+            f"image: expected at least {weights.least_side} pixels on each side for LPIPS with "
+            f"{weights.network}, found {(height, width)}"
         )
     if mask is not None:
         mask = np.asarray(mask)
         if mask.shape != (height, width):
-            raise ValueError(f"mask: got shape {mask.shape}, want {(height, width)} to match image")
+            raise ValueError(f"mask: expected shape {(height, width)} to match image, found {mask.shape}")
         if not mask.any():
             return float("nan")
     both = np.stack([image, reference]).astype(np.float32)
@@ -177,7 +177,7 @@ def _distances(
     heads: tuple[Array, ...],
     pictures: Float[Array, "two h w c"],
 ) -> list[Float[Array, "places_y places_x"]]:
-    """How far the two pictures are apart, at each place of each layer."""
+    """Distance between the two images at each place of each layer."""
     shift, scale = jnp.array(_SHIFT, pictures.dtype), jnp.array(_SCALE, pictures.dtype)
     x = jnp.moveaxis((2 * pictures - 1 - shift) / scale, -1, 1)
     maps = []
@@ -195,16 +195,16 @@ def _distances(
 
 
 def load_lpips(path: str | os.PathLike) -> LpipsWeights:
-    """Read the weights of LPIPS; which network they are of is told by their shapes.
+    """Read the weights of LPIPS; the network is recognised by their shapes.
 
     Args:
-        path: a .npz or .safetensors file, or a folder of such files that hold them together. What else they
-            hold (torchvision's classifier) is passed over.
+        path: a .npz or .safetensors file, or a folder of such files that together hold the weights. Other
+            arrays in them, such as torchvision's classifier, are ignored.
 
     Raises:
         FileNotFoundError: there is no such file or folder, or the folder holds none.
-        ValueError: the format is one that is not read (a pickle of torch), a file is damaged, or an array is
-            missing or has another shape.
+        ValueError: the format is not supported (a pickle of torch), a file is damaged, or an array is missing
+            or has a wrong shape.
     """
     path = Path(path)
     arrays: dict[str, np.ndarray] = {}
@@ -235,7 +235,7 @@ def load_lpips(path: str | os.PathLike) -> LpipsWeights:
 
 
 def _files(path: Path) -> list[Path]:
-    """Those that hold the weights, none of them a pickle."""
+    """The files that hold the weights; pickles are refused."""
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in _READERS)
         if files:
@@ -247,7 +247,7 @@ def _files(path: Path) -> list[Path]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected weights of LPIPS, found nothing there. {_ADVICE}")
     if path.suffix.lower() not in _READERS:
-        why = " A pickle of torch can run code when it is read, so none is read here."
+        why = " A pickle of torch can run code when it is read, so gsjax reads none."
         why = why if path.suffix.lower() in _PICKLES else ""
         raise ValueError(f"{path}: expected .npz or .safetensors, found {path.suffix!r}.{why} {CONVERT}")
     return [path]
@@ -259,7 +259,7 @@ def _read_npz(file: Path) -> dict[str, np.ndarray]:
 
 
 def _read_safetensors(file: Path) -> dict[str, np.ndarray]:
-    """Its header is JSON, its length before it as eight bytes; what follows are the arrays' own bytes."""
+    """The format: the length of the header (8 bytes), the header as JSON, and the bytes of the arrays."""
     data = file.read_bytes()
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start])
@@ -268,7 +268,7 @@ def _read_safetensors(file: Path) -> dict[str, np.ndarray]:
         if name == "__metadata__":
             continue
         if entry["dtype"] not in _DTYPES:
-            raise ValueError(f"{name} is of type {entry['dtype']}, which is none of {', '.join(_DTYPES)}")
+            raise ValueError(f"{name}: expected {' or '.join(_DTYPES)}, found {entry['dtype']}")
         begin, end = (start + offset for offset in entry["data_offsets"])
         arrays[name] = np.frombuffer(data[begin:end], _DTYPES[entry["dtype"]]).reshape(entry["shape"])
     return arrays

@@ -1,4 +1,4 @@
-"""Overlap of predicted and true label pictures, with pixels pooled over frames and cameras."""
+"""Overlap of predicted and true label images, with pixels pooled over frames and cameras."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -8,21 +8,21 @@ import numpy as np
 from jaxtyping import Bool, Integer
 
 IGNORED_LABEL = -1
-BOUNDARY_SHARE = 0.02  # of the diagonal: how far from its outline a mask's boundary reaches
+BOUNDARY_SHARE = 0.02  # width of a mask's boundary band, as a fraction of the image's diagonal
 
 
 @dataclass
 class LabelOverlap:
-    """Counts of pixels per label, added up picture by picture.
+    """Pixel counts per label, accumulated over images.
 
-    Pooling weighs each pixel alike; a mean of per-frame ratios would let a sliver in one frame weigh as much
-    as the whole object in the next.
+    Pooling gives every pixel the same weight; in a mean of per-frame ratios, a sliver in one frame would
+    count as much as the whole object in the next.
 
         IoU = sum |P and T| / sum |P or T|        Dice = 2 sum |P and T| / (sum |P| + sum |T|)
         precision = sum |P and T| / sum |P|       recall = sum |P and T| / sum |T|
 
     Attributes:
-        intersections, predicted, true: pixels per label.
+        intersections, predicted, true: number of pixels per label.
     """
 
     intersections: dict[int, int] = field(default_factory=dict)
@@ -30,14 +30,14 @@ class LabelOverlap:
     true: dict[int, int] = field(default_factory=dict)
 
     def add(self, predicted: Integer[np.ndarray, "..."], true: Integer[np.ndarray, "..."]) -> None:
-        """Count one picture [H, W]. Pixels whose true label is -1 are left out.
+        """Count one image [H, W]. Pixels whose true label is -1 are ignored.
 
         Raises:
             ValueError: the two differ in shape.
         """
         predicted, true = np.asarray(predicted), np.asarray(true)
         if predicted.shape != true.shape:
-            raise ValueError(f"predicted: got shape {predicted.shape}, want {true.shape} to match true")
+            raise ValueError(f"predicted: expected shape {true.shape} to match true, found {predicted.shape}")
         scored = true != IGNORED_LABEL
         predicted, true = predicted[scored], true[scored]
         _count(self.intersections, predicted[predicted == true])
@@ -46,7 +46,7 @@ class LabelOverlap:
 
     @property
     def labels(self) -> list[int]:
-        """All labels that occurred, predicted or true, in order."""
+        """All labels that occurred, predicted or true, in ascending order."""
         return sorted(self.predicted.keys() | self.true.keys())
 
     def iou(self, label: int) -> float:
@@ -70,16 +70,16 @@ class LabelOverlap:
 
     @property
     def accuracy(self) -> float:
-        """Share of the pixels that have their true label; NaN without pixels."""
+        """Fraction of the pixels whose label is correct; NaN without pixels."""
         return _ratio(sum(self.intersections.values()), sum(self.true.values()))
 
     def mean_iou(self, labels: Iterable[int] | None = None) -> float:
-        """Mean IoU over `labels` (all that occurred unless told), those that never occurred left out."""
+        """Mean IoU over `labels`, by default all that occurred; labels that never occurred are ignored."""
         return self.mean(self.iou, labels)
 
     def mean(self, score: Callable[[int], float], labels: Iterable[int] | None = None) -> float:
-        """The same of another score of one label: `dice`, `f1`. Dice of means is no mean of Dice: of classes
-        that differ, 2 mean IoU / (1 + mean IoU) is more."""
+        """Mean over `labels` of another score of one label, such as `dice` or `f1`. The mean Dice is not the
+        Dice of the mean: if classes differ, 2 mean IoU / (1 + mean IoU) is larger."""
         values = [score(label) for label in (self.labels if labels is None else labels)]
         values = [value for value in values if not np.isnan(value)]
         return float(np.mean(values)) if values else float("nan")
@@ -98,14 +98,14 @@ def iou_of_masks(predicted: np.ndarray, true: np.ndarray) -> float:
 
 @dataclass
 class MaskOverlap:
-    """Pixels of one thing's masks, and of their boundaries, added up picture by picture.
+    """Pixel counts of one object's masks and of their boundaries, accumulated over images.
 
-    Boundary IoU (Cheng et al., CVPR 2021) is the IoU of what lies within a mask and no further than 2 % of
-    the picture's diagonal from its outline: of large things too it sees whether the outline is right.
+    Boundary IoU (Cheng et al., CVPR 2021) is the IoU of the pixels that lie within a mask and no farther than
+    2 % of the image's diagonal from its outline. It is sensitive to the outline even of large objects.
 
     Attributes:
-        both, either: pixels in the predicted and the true mask, in one of them.
-        boundary_both, boundary_either: the same of the boundaries.
+        both, either: number of pixels in the intersection and in the union of predicted and true mask.
+        boundary_both, boundary_either: the same for the boundaries.
     """
 
     both: int = 0
@@ -114,13 +114,13 @@ class MaskOverlap:
     boundary_either: int = 0
 
     def add(self, predicted: Bool[np.ndarray, "h w"], true: Bool[np.ndarray, "h w"]) -> None:
-        """Count one picture.
+        """Count one image.
 
         Raises:
             ValueError: the two differ in shape.
         """
         if predicted.shape != true.shape:
-            raise ValueError(f"predicted: got shape {predicted.shape}, want {true.shape} to match true")
+            raise ValueError(f"predicted: expected shape {true.shape} to match true, found {predicted.shape}")
         self.both += int((predicted & true).sum())
         self.either += int((predicted | true).sum())
         ours, theirs = boundary(predicted), boundary(true)
@@ -129,18 +129,18 @@ class MaskOverlap:
 
     @property
     def iou(self) -> float:
-        """NaN where nothing was predicted or true."""
+        """Intersection over union; NaN if all masks were empty."""
         return _ratio(self.both, self.either)
 
     @property
     def boundary_iou(self) -> float:
-        """NaN where nothing was predicted or true."""
+        """Intersection over union; NaN if all masks were empty."""
         return _ratio(self.boundary_both, self.boundary_either)
 
 
 def boundary(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """What of a mask is no further from its outline than 2 % of the picture's diagonal; the picture's edge is
-    an outline too."""
+    """The pixels of a mask no farther from its outline than 2 % of the image's diagonal. The edge of the
+    image counts as outline."""
     reach = max(1, round(BOUNDARY_SHARE * float(np.hypot(*mask.shape))))
     bordered = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     inner = cv2.erode(bordered, np.ones((3, 3), np.uint8), iterations=reach)[1:-1, 1:-1] > 0

@@ -1,8 +1,8 @@
-"""How steady a video is: neighbouring frames against each other, as they are and along the optical flow.
+"""Temporal consistency of a video: scores between neighbouring frames, directly and along the optical flow.
 
-A video in which nothing moves is the steadiest of all, so no such score means much alone: beside it stands
-how far it is from the score of the true video, and for what goes along the flow, the share of the pixels that
-was compared. The check for occlusions can sort out just those pixels that move as nothing does.
+A video in which nothing moves is the most consistent of all, so such a score means little on its own: read it
+with its gap from the score of the true video and, for scores along the flow, with the fraction of the pixels
+compared. The occlusion check may discard exactly those pixels that move implausibly.
 
 Videos are [T, H, W, 3], RGB, uint8 or floats 0 to 1; masks [T, H, W], True where to compare. On the host.
 """
@@ -20,7 +20,7 @@ from gsjax.metrics.image import ssim
 from gsjax.metrics.perceptual import LpipsWeights, lpips
 
 Compare = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
-"""A score of two pictures [H, W, 3], 0 to 1, under a mask: `psnr`, `ssim`, `ms_ssim`, or `lpips` with its
+"""A score of two images [H, W, 3], 0 to 1, under a mask: `psnr`, `ssim`, `ms_ssim`, or `lpips` with its
 weights bound."""
 
 
@@ -41,17 +41,17 @@ def unit_frames(video: Num[np.ndarray, "..."]) -> Iterator[Float[np.ndarray, "H 
 def between_neighbors(
     compare: Compare, video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None
 ) -> float:
-    """The mean over t of compare(frame t + 1, frame t), where both masks are True.
+    """The mean over t of compare(frame t + 1, frame t) where both masks are True.
 
-    Pairs without a number (under an empty mask) are left out; NaN if none has one.
+    Pairs without a score (under an empty mask) are ignored; NaN if none has one.
 
     Args:
-        compare: a score of two pictures under a mask.
+        compare: a score of two images under a mask.
         video: [T, H, W, 3], at least two frames.
-        masks: [T, H, W], True where to compare; everywhere unless given.
+        masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
-        ValueError: shapes do not agree, there are fewer than two frames, or `compare` says so.
+        ValueError: shapes do not agree, there are fewer than two frames, or `compare` raises it.
     """
     frames = _checked(video, masks)
     inside = [None] * (len(video) - 1) if masks is None else masks[:-1] & masks[1:]
@@ -60,12 +60,12 @@ def between_neighbors(
 
 
 def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None) -> float:
-    """Mean SSIM of neighbouring frames (papers/003, section 4); 1 if nothing moves. What T-LPIPS asks a
-    network, 1 - t-SSIM asks windows of 11 pixels.
+    """Mean SSIM of neighbouring frames (SurstSplat, section 4); 1 if nothing moves. Like T-LPIPS, with
+    windows of 11 pixels instead of a network.
 
     Args:
         video: [T, H, W, 3], at least two frames.
-        masks: [T, H, W], True where to compare; everywhere unless given.
+        masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
         ValueError: as `between_neighbors`, or a side is below 11 pixels.
@@ -76,12 +76,12 @@ def t_ssim(video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None 
 def t_lpips(
     weights: LpipsWeights, video: Num[np.ndarray, "..."], masks: Bool[np.ndarray, "..."] | None = None
 ) -> float:
-    """Mean LPIPS of neighbouring frames (papers/001, section 4.1); 0 if nothing moves.
+    """Mean LPIPS of neighbouring frames (MotionSplicer, section 4.1); 0 if nothing moves.
 
     Args:
-        weights: of LPIPS.
+        weights: weights of LPIPS.
         video: [T, H, W, 3], at least two frames.
-        masks: [T, H, W], True where to compare; everywhere unless given.
+        masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
         ValueError: as `between_neighbors`, or the frames are too small for the network.
@@ -104,7 +104,7 @@ class Flows(NamedTuple):
 def video_flows(
     video: Num[np.ndarray, "T H W 3"], optical_flow: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> Flows:
-    """The flows that a method sees in a video (`gsjax.methods.protocols.OpticalFlow`).
+    """The flows of a video, as estimated by a method (`gsjax.methods.protocols.OpticalFlow`).
 
     Raises:
         ValueError: there are fewer than two frames.
@@ -117,12 +117,12 @@ def video_flows(
 
 
 class FlowWarpError(NamedTuple):
-    """How far frames are from the next ones, brought back along the flow.
+    """Difference between each frame and the next one warped back along the flow.
 
     Attributes:
-        error: mean absolute difference of colours from 0 to 1, over all pixels that were compared and their
-            channels; NaN if there were none.
-        share: which part of the pixels was compared; with masks, of the pixels that they hold.
+        error: mean absolute difference of colours from 0 to 1, over the compared pixels and their channels;
+            NaN if no pixel was compared.
+        share: fraction of the pixels that was compared; with masks, of the pixels in the masks.
     """
 
     error: float
@@ -132,15 +132,15 @@ class FlowWarpError(NamedTuple):
 def flow_warp_error(
     video: Num[np.ndarray, "..."], flows: Flows, masks: Bool[np.ndarray, "..."] | None = None
 ) -> FlowWarpError:
-    """Flow-Warp (papers/001, section 4.1): mean |frame t - frame t + 1 brought to t along the flow|.
+    """Flow-Warp (MotionSplicer, section 4.1): mean |frame t - frame t + 1 warped to t along the flow|.
 
-    Compared is what both frames show (`gsjax.geometry.flow.seen_in_both`) and both masks hold. Lai et al.
-    (2018) square the differences instead.
+    Pixels are compared if they are visible in both frames (`gsjax.geometry.flow.seen_in_both`) and in both
+    masks. Lai et al. (2018) square the differences instead.
 
     Args:
-        video: what is judged.
-        flows: how things moved in it: the true flows of a simulated scene, or `video_flows` of the video.
-        masks: where to compare.
+        video: the video to score.
+        flows: optical flow of the video: the true flow of a simulated scene, or `video_flows` of the video.
+        masks: where to compare; default: everywhere.
 
     Raises:
         ValueError: the shapes do not agree, or there are fewer than two frames.
@@ -161,19 +161,19 @@ def along_flow(
     flows: Flows,
     masks: Bool[np.ndarray, "..."] | None = None,
 ) -> float:
-    """The mean over t of compare(frame t + 1 brought to t along the flow, frame t), where `flow_warp_error`
-    compares: warped LPIPS and warped SSIM (papers/003, section 4), which discount motion that is explained.
+    """The mean over t of compare(frame t + 1 warped to t along the flow, frame t), over the pixels of
+    `flow_warp_error`: warped LPIPS and warped SSIM (SurstSplat, section 4), which discount explained motion.
 
-    Elsewhere both pictures show frame t, so that a window or network that reaches there finds no difference.
+    Elsewhere both images show frame t, so that a window or network that reaches there finds no difference.
 
     Args:
-        compare: a score of two pictures under a mask.
+        compare: a score of two images under a mask.
         video: [T, H, W, 3], at least two frames.
-        flows: how things moved in it.
-        masks: [T, H, W], True where to compare; everywhere unless given.
+        flows: optical flow of the video.
+        masks: [T, H, W], True where to compare; default: everywhere.
 
     Raises:
-        ValueError: the shapes do not agree, there are fewer than two frames, or `compare` says so.
+        ValueError: the shapes do not agree, there are fewer than two frames, or `compare` raises it.
     """
     scores = []
     for now, warped, inside in _along(video, flows, masks):
@@ -189,19 +189,19 @@ def temporal_scores(
     optical_flow: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     lpips_weights: LpipsWeights | None = None,
 ) -> dict[str, float | None]:
-    """All scores of this page by name, and under `NAME_gap` how far each is from that of the true video.
+    """All scores of this module by name, and under `NAME_gap` how far each is from that of the true video.
 
-    Each video is warped along the flow that is seen in itself.
+    Each video is warped along the flow estimated from itself.
 
     Args:
-        video: what is judged.
-        truth: the recording, of the same moments; None leaves the gaps out.
+        video: the video to score.
+        truth: the recording of the same frames; without it, the gaps are left out.
         masks: where to compare, in both.
-        optical_flow: without, there is nothing along the flow.
-        lpips_weights: without, there is no LPIPS.
+        optical_flow: estimates flow; without it, there are no scores along the flow.
+        lpips_weights: weights of LPIPS; without them, there is no LPIPS.
 
     Returns:
-        None for what is absent.
+        Scores by name; None for a score that was not computed.
 
     Raises:
         ValueError: shapes do not agree, there are fewer than two frames, or a side is below 11 pixels.
@@ -238,7 +238,7 @@ def _gap(found: float | None, true: float | None) -> float | None:
 def _along(
     video: np.ndarray, flows: Flows, masks: np.ndarray | None
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each pair: frame t, frame t + 1 as it looks from there, and where the two are compared."""
+    """For each pair: frame t, frame t + 1 warped to it, and where the two are compared."""
     frames = _checked(video, masks)
     wanted = (len(video) - 1, *video.shape[1:3], 2)
     for name, flow in flows._asdict().items():
@@ -248,13 +248,13 @@ def _along(
         warped = warp(after, flows.forward[t])
         inside = seen_in_both(flows.forward[t], flows.backward[t]) & np.isfinite(warped).all(-1)
         if masks is not None:
-            # The four pixels between which the flow ends must all be in the mask, up to rounding.
+            # All four pixels around the end of the flow must be in the mask, up to rounding.
             inside &= masks[t] & (warp(masks[t + 1], flows.forward[t]) > 1 - 1e-6)
         yield now, warped, inside
 
 
 def _checked(video: np.ndarray, masks: np.ndarray | None) -> Iterator[np.ndarray]:
-    """The frames, of which there are two at least, with a mask each if any has one."""
+    """The frames one by one; raises ValueError for fewer than two, or masks of another shape."""
     frames = unit_frames(video)
     if len(video) < 2:
         raise ValueError(f"video: expected at least two frames, found {len(video)}")

@@ -1,8 +1,8 @@
-"""How far tracked Gaussians are from where the true motion of their object would have carried them.
+"""Error of tracked Gaussians against the true motion of their object.
 
 With x_t the Gaussian's centre at frame t and T_t the object's true pose (object to world), a perfect tracker
-has x_t = T_t T_0^-1 x_0. The error sees rotation as well as translation. What a method began at another
-frame than 0 is counted from there, its anchor. In float64, on the host.
+has x_t = T_t T_0^-1 x_0. The error covers rotation as well as translation. If a method starts at a frame
+other than 0, motion is measured from that frame, its anchor. In float64, on the host.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,12 +23,12 @@ class ObjectScore(NamedTuple):
 
     Attributes:
         centroid_error_mm: mean over time of || mean_i x_t - T_t T_0^-1 mean_i x_0 ||.
-        centroid_errors_mm: the same, a value a frame.
+        centroid_errors_mm: the same per frame.
         point_error_mm: mean over Gaussians and time of || x_t - T_t T_0^-1 x_0 ||.
-        median_point_error_mm: the median of the same.
-        moved_mm: the largest distance over time of the true centroid from where it was at the anchor.
-        turned_deg: the largest true rotation from the anchor, degrees.
-        num_scored: how many Gaussians have this true label.
+        median_point_error_mm: median of the same distances.
+        moved_mm: largest distance over time of the true centroid from its position at the anchor.
+        turned_deg: largest true rotation from the anchor, degrees.
+        num_scored: number of Gaussians with this true label.
     """
 
     centroid_error_mm: float
@@ -51,29 +51,31 @@ def true_labels(
 ) -> Int[np.ndarray, "N"]:
     """The true label of each Gaussian, from the masks and depths of the first frame; -1 where unknown.
 
-    A camera sees a centre where it projects into the picture and its z is within `max_depth_gap` metres of
-    the depth there; the label is the mask's value. Where several cameras see it, the one whose depth agrees
-    best decides. What none sees is unknown, and not scored.
+    A camera sees a centre that projects into its image at a z within `max_depth_gap` metres of the depth
+    there; the label is the mask's value. If several cameras see it, the one whose depth agrees best decides.
+    A centre that no camera sees is unknown and not scored.
 
     Args:
         points: centres at frame 0, world, metres.
-        masks, depths: [H, W] of each camera; depth in metres, 0 invalid.
+        masks, depths: [H, W] for each camera; depth in metres, 0 where invalid.
         viewmats, Ks: world to camera (OpenCV), and intrinsics with pixel centres at +0.5, of each camera.
 
     Raises:
-        ValueError: there is not one of each for every camera, or a mask and its depth differ in size.
+        ValueError: the numbers of masks, depths and cameras differ, or a mask and its depth differ in size.
     """
     counts = {len(masks), len(depths), len(viewmats), len(Ks)}
     if len(counts) > 1:
         raise ValueError(
-            f"true_labels: got {len(masks)} masks, {len(depths)} depths, {len(viewmats)} viewmats and "
-            f"{len(Ks)} Ks, want one of each a camera"
+            f"true_labels: expected one mask, depth, viewmat and K per camera, found {len(masks)} masks, "
+            f"{len(depths)} depths, {len(viewmats)} viewmats and {len(Ks)} Ks"
         )
     labels = np.full(len(points), IGNORED_LABEL, np.int32)
     best = np.full(len(points), np.inf)
     for mask, depth, viewmat, K in zip(masks, depths, viewmats, Ks, strict=True):
         if np.shape(mask) != np.shape(depth):
-            raise ValueError(f"masks: got shape {np.shape(mask)}, want {np.shape(depth)} to match its depth")
+            raise ValueError(
+                f"masks: expected shape {np.shape(depth)} like its depth, found {np.shape(mask)}"
+            )
         value, gap = _seen_by(np.asarray(points), np.asarray(mask), np.asarray(depth), viewmat, K)
         better = (gap <= max_depth_gap) & (gap < best)
         labels[better], best[better] = value[better], gap[better]
@@ -83,7 +85,7 @@ def true_labels(
 def _seen_by(
     points: np.ndarray, mask: np.ndarray, depth: np.ndarray, viewmat: np.ndarray, K: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mask's value at each point, and the gap to the depth there (infinite outside or without depth)."""
+    """The mask's value at each point, and the gap to the depth there; infinite outside or without depth."""
     height, width = depth.shape
     columns, rows, z, inside = pixels_of(points, viewmat, K, width, height)
     there = depth[rows, columns]
@@ -92,42 +94,44 @@ def _seen_by(
 
 
 def relative_motion(poses: Float[np.ndarray, "T 4 4"], anchor: int = 0) -> Float[np.ndarray, "T 4 4"]:
-    """T_t T_0^-1: what carries a point of the object from frame 0 (or `anchor`) to frame t, in the world.
+    """T_t T_0^-1: the motion, in the world, of the object from frame 0 (or `anchor`) to frame t.
 
     Raises:
-        ValueError: a pose is no rigid motion.
+        ValueError: a pose is not a rigid motion.
     """
     poses = np.asarray(poses, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
-        raise ValueError(f"poses: got shape {poses.shape}, want [T, 4, 4]")
+        raise ValueError(f"poses: expected shape [T, 4, 4], found {poses.shape}")
     if not np.isfinite(poses).all():
         frame = int(np.argmin(np.isfinite(poses).all(axis=(1, 2))))
-        raise ValueError(f"poses: frame {frame} holds NaN or infinity")
+        raise ValueError(f"poses: expected finite numbers, found NaN or infinity at frame {frame}")
     rotations = poses[:, :3, :3]
     gap = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     rigid = (gap < _ORTHONORMALITY) & (np.linalg.det(rotations) > 0)
     if not rigid.all():
         frame = int(np.argmin(rigid))
-        raise ValueError(f"poses: frame {frame} holds no rotation (R R^T is off by {gap[frame]:.3g})")
+        raise ValueError(
+            f"poses: expected rotations, found none at frame {frame} (R R^T is off by {gap[frame]:.3g})"
+        )
     return poses @ np.linalg.inv(poses[anchor])
 
 
 def score_object(
     means: Float[np.ndarray, "T N 3"], poses: Float[np.ndarray, "poses 4 4"], anchor: int = 0
 ) -> ObjectScore:
-    """Score the Gaussians of one object; without any, the errors are NaN.
+    """Score the Gaussians of one object; without Gaussians, the errors are NaN.
 
     Args:
         means: centres of the object's Gaussians over time, world, metres.
         poses: the object's true poses, object to world.
-        anchor: the frame from which motion is counted, and in which there is no error.
+        anchor: the frame from which motion is measured, and at which the error is zero.
 
     Raises:
-        ValueError: the frame counts differ, or a pose is no rigid motion.
+        ValueError: the frame counts differ, or a pose is not a rigid motion.
     """
     means, motion = np.asarray(means, np.float64), relative_motion(poses, anchor)
     if len(means) != len(motion):
-        raise ValueError(f"means: got {len(means)} frames, want {len(motion)} like poses")
+        raise ValueError(f"means: expected {len(motion)} frames like poses, found {len(means)}")
     cosine = (np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     turned = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
     if means.shape[1] == 0:
@@ -159,28 +163,28 @@ def score_tracks(
     Args:
         means: centres over time, world, metres.
         labels: the TRUE label of each Gaussian (see `true_labels`), not the tracker's own.
-        poses: of each label, its true poses over the same frames.
-        anchor: the frame from which motion is counted.
+        poses: true poses of each label over the same frames.
+        anchor: the frame from which motion is measured.
 
     Raises:
-        ValueError: the shapes do not agree, or a pose is no rigid motion.
+        ValueError: the shapes do not agree, or a pose is not a rigid motion.
     """
     means, labels = np.asarray(means), np.asarray(labels)
     if labels.shape != (means.shape[1],):
-        raise ValueError(f"labels: got shape {labels.shape}, want [{means.shape[1]}] to match means")
+        raise ValueError(f"labels: expected shape [{means.shape[1]}] to match means, found {labels.shape}")
     return {label: score_object(means[:, labels == label], poses[label], anchor) for label in sorted(poses)}
 
 
 def carried_points(
     points: Float[np.ndarray, "V 3"], means: Float[np.ndarray, "T N 3"], carriers: int = 4
 ) -> Float[np.ndarray, "T V 3"]:
-    """Points of frame 0 where Gaussians carry them: each moves by the mean displacement of those nearest to
-    it in frame 0.
+    """Positions over time of points carried by Gaussians: each point moves by the mean displacement of the
+    Gaussians nearest to it at frame 0.
 
     Args:
-        points: world, metres.
-        means: of Gaussians over time, metres.
-        carriers: how many carry a point.
+        points: points at frame 0, world, metres.
+        means: centres of the Gaussians over time, world, metres.
+        carriers: number of Gaussians that carry a point.
     """
     _, nearest = cKDTree(means[0]).query(points, k=[*range(1, min(carriers, means.shape[1]) + 1)])
     return points + (means[:, nearest] - means[0][nearest]).mean(axis=2)

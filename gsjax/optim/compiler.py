@@ -1,4 +1,4 @@
-"""What makes the same program faster on the host: compiler options, and what is kept: memory, programs."""
+"""Faster programs on the host: compiler options, memory reuse, and a cache of compiled programs."""
 
 import ctypes
 import hashlib
@@ -18,26 +18,26 @@ from platformdirs import user_cache_dir
 
 @cache
 def host_options() -> dict[str, Any]:
-    """What makes compositing fast on this machine: the full vector width where the CPU has AVX-512.
+    """Compiler options that make compositing fast on this machine: the full vector width with AVX-512.
 
     Use it as `jax.jit(f, compiler_options=host_options())`, or with `.lower(...).compile(host_options())`,
-    and for the outermost jit of a host loop only: inside another trace, options raise.
+    and only for the outermost jit of a host loop: inside another trace, compiler options raise an error.
     """
     wide = jax.default_backend() == "cpu" and has_avx512()
     return {"xla_cpu_prefer_vector_width": 512} if wide else {}
 
 
 def in_memory(arrays: Any, finite: Float[Array, "*n"]) -> Any:
-    """`arrays`, worked out before anything reads them. It is for what is read more than once.
+    """`arrays`, computed and stored before anything reads them. Use it for arrays that are read repeatedly.
 
-    XLA:CPU fuses what is worked out with the reading, and works it out again for every number read: the place
-    of a pixel for each of its channels, and of those of its three neighbours. It drops
-    `jax.lax.optimization_barrier` before it fuses; a branch is a barrier that it keeps.
+    XLA:CPU fuses a computation into its consumers and repeats it for every number they read: the position of
+    a pixel for each of its channels, and again for those of its three neighbours. It drops
+    `jax.lax.optimization_barrier` before fusion; a branch is a barrier that it keeps.
 
     Args:
         arrays: a pytree.
-        finite: numbers that are, which the compiler cannot know; of no axis that is mapped over. Where the
-            first is not, nor is what comes back, as far as it can be.
+        finite: numbers that are finite, which the compiler cannot know; they must not depend on an axis that
+            is mapped over. If the first is not finite, floating arrays are returned as NaN, others as 0.
     """
     if jax.default_backend() != "cpu":
         return arrays
@@ -69,16 +69,16 @@ def _listen() -> None:
 
 
 def has_avx512() -> bool:
-    """Whether this machine's processor has registers of 512 bits; False where that is not known."""
+    """Whether this machine's processor has 512-bit registers; False if unknown."""
     cpuinfo = Path("/proc/cpuinfo")
     return cpuinfo.exists() and "avx512f" in cpuinfo.read_text()
 
 
 def forget_programs(most_maps: int = 30_000) -> bool:
-    """Drop all compiled programs if this process has more memory maps than that; whether it did.
+    """Drop all compiled programs if this process has more than `most_maps` memory maps; returns whether so.
 
-    Each program takes some. Linux allows a process 65,530, and then compiling fails ("Cannot allocate
-    memory") with all memory free: for who runs one job after the other for hours in one process.
+    Each program takes some. Linux allows 65,530 per process, beyond which compiling fails ("Cannot allocate
+    memory") even with free memory. Call this when one process runs many jobs for hours.
     """
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") <= most_maps:
@@ -87,50 +87,53 @@ def forget_programs(most_maps: int = 30_000) -> bool:
     return True
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-_KEPT = 2**30  # bytes: the largest array, and how much freed memory
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # from glibc's malloc.h
+_KEPT = 2**30  # bytes: the largest reusable array, and the most freed memory that is kept
 
 
 def keep_freed_memory() -> bool:
-    """Have this process keep up to 1 GiB of memory that it has freed, which saves a fifth of a forward call.
+    """Make this process keep up to 1 GiB of freed memory for reuse, which saves a fifth of a forward call.
 
-    XLA:CPU allocates a program's temporary arrays anew in every call. glibc takes large ones from the kernel
-    and hands them back each time, so every page of them is zeroed and faulted in again: 9,500 faults, 10 ms,
-    for 110,000 Gaussians at 648x420. This raises its thresholds. Threads keep heaps of their own: in one for
-    all, what a compiler leaves behind makes every later allocation longer (a third of a tracker's update).
-    It holds for the whole process, but for threads that are there already: call it once, before JAX computes
-    anything. The command line does. MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ in the environment do
-    the same.
+    XLA:CPU allocates a program's temporary arrays in every call. glibc requests large ones from the kernel
+    and returns them each time, so all their pages are zeroed and faulted in again: 9,500 faults, 10 ms, for
+    110,000 Gaussians at 648x420. This function raises glibc's thresholds. Threads keep separate heaps: with a
+    single heap, fragments left by the compiler slow down every later allocation (by a third of a tracker's
+    update). The setting applies to the whole process except to threads that already exist: call it once,
+    before JAX computes anything. The command line does. MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ in
+    the environment have the same effect.
 
     Returns:
-        whether it could: False where the C library is not glibc of 2.35 or later, and nothing is changed.
+        Whether the thresholds were set: False if the C library is not glibc 2.35 or later; nothing is changed
+        then.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return False
-    if not mallopt(_MMAP_THRESHOLD, _KEPT):  # older ones refuse that, and the rest alone would do harm
+    if not mallopt(_MMAP_THRESHOLD, _KEPT):  # older versions refuse it, and the other alone would do harm
         return False
     return bool(mallopt(_TRIM_THRESHOLD, _KEPT))
 
 
-_MOST_BYTES, _WORTH_S = 2**30, 0.3  # of programs on disk; what compiles faster is not kept
+_MOST_BYTES, _WORTH_S = 2**30, 0.3  # size of the cache on disk; faster compilations are not cached
 
 
 def keep_programs(folder: str | Path | None = None) -> Path | None:
-    """Have JAX keep compiled programs on disk, up to 1 GiB, so that the next process finds them. The command
-    line does: what would compile for a minute starts in seconds. Call it before JAX computes anything.
+    """Make JAX cache compiled programs on disk, up to 1 GiB, so that the next process can reuse them. The
+    command line does: what would compile for a minute starts in seconds. Call it before JAX computes
+    anything.
 
-    Programs hold instructions that another processor may lack, and are split among as many cores as there
-    were, so each kind has a folder of its own. What a full disk or a kill left of one is removed.
+    Programs contain instructions that another processor may lack, and are partitioned for the number of cores
+    at hand, so each kind of machine has its own folder. Incomplete files left by a full disk or a kill are
+    removed.
 
     Args:
-        folder: where; the user's cache folder unless given.
+        folder: where to cache (default: the user's cache folder).
 
     Returns:
-        where they are kept; None, and nothing is changed, where JAX was told already
-        (`JAX_COMPILATION_CACHE_DIR`, or `JAX_ENABLE_COMPILATION_CACHE=0` for none), or nothing can be
-        written there.
+        The folder of the cache; None, with nothing changed, if JAX is already configured
+        (`JAX_COMPILATION_CACHE_DIR`, or `JAX_ENABLE_COMPILATION_CACHE=0` for no cache) or the folder is not
+        writable.
     """
     if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
         return None
@@ -141,10 +144,10 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
         place.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=place):
             pass
-        for program in place.glob("*-cache"):  # JAX writes when it was last used after it, and needs both
+        for program in place.glob("*-cache"):  # JAX writes the access time afterwards, and needs both files
             if not program.with_name(program.name.removesuffix("cache") + "atime").exists():
                 program.unlink(missing_ok=True)
-    except (OSError, RuntimeError):  # the latter: a user without a home
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home directory
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
@@ -153,7 +156,7 @@ def keep_programs(folder: str | Path | None = None) -> Path | None:
 
 
 def _processor() -> str:
-    """What tells processors with different instructions apart, and how many cores of it may be used."""
+    """A text that identifies the processor's instruction set and the number of usable cores."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     marks = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})

@@ -1,8 +1,8 @@
-"""Weights whose rows stay on the probability simplex: no entry below 0, and 1 in sum.
+"""Weights whose rows stay on the probability simplex: no entry below 0, and a sum of 1.
 
-The projection is jaxopt's, which is no longer developed: only this module imports it, and should it go, optax
-has the same. jaxopt's `ProjectedGradient` is not used: it searches along lines and so asks for one loss again
-and again, where ours looks at another view each time. `simplex_descent` is an optimizer like those of optax:
+The projection is jaxopt's, which is no longer developed: only this module imports it, and optax has an
+equivalent should it disappear. jaxopt's `ProjectedGradient` is not used: its line search evaluates one loss
+repeatedly, while ours sees a different view in each step. `simplex_descent` is an optimizer like optax's:
 
     gradient_step(loss, simplex_descent(0.01))                                                weights alone
     gradient_step(loss, per_field_adam(rates, others={"weights": simplex_descent(0.01)}))     and other fields
@@ -17,17 +17,17 @@ import optax
 from jaxopt.projection import projection_simplex
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-_DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as of Adam elsewhere
+_DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as for Adam elsewhere
 
 
 @partial(jax.jit, inline=True)
 def project_simplex(values: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
-    """The nearest point on the simplex of each row: max(v - tau, 0), with tau such that it sums to 1.
+    """The nearest point on the simplex for each row: max(v - tau, 0), with tau such that it sums to 1.
 
-    Its derivative is that of the entries above 0, less their mean, and 0 for the others, also at kinks. An
-    entry of -inf becomes 0; a row with a NaN or +inf becomes NaN, and no other row does.
+    The derivative passes the tangents of the entries above 0, less their mean, and 0 for the others, also at
+    kinks. An entry of -inf becomes 0; a row with a NaN or +inf becomes NaN and affects no other row.
     """
-    # A constant added to a row changes nothing, and without one the sum is exact for large values too.
+    # A constant added to a row changes nothing; without the largest entry, sums of large values stay exact.
     offsets = jax.lax.stop_gradient(values.max(axis=-1, keepdims=True))
     rows = (values - offsets).reshape(-1, values.shape[-1])
     return jax.vmap(projection_simplex)(rows).reshape(values.shape)
@@ -42,18 +42,18 @@ class _Moments(NamedTuple):
 def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
     """Projected gradient descent with Adam's moments, for arrays [..., P] whose rows lie on the simplex.
 
-    For each row w with gradient g, less its mean, of which the projection takes no notice:
+    For each row w with gradient g, centred to mean 0 because the projection ignores the mean:
 
         m <- 0.9 m + 0.1 g,    v <- 0.999 v + 0.001 mean(g^2),    w <- project_simplex(w - rate m / sqrt(v))
 
-    with m and v corrected for their start at 0, as in Adam. Adam itself, with a v for each entry, stops at
-    wrong places: where all entries of a row are pulled the same way, however unequally, it moves them alike,
-    and the projection undoes that. With one v a row, it stops where plain projected descent does.
+    with m and v bias-corrected as in Adam. Adam itself, with one v per entry, converges to wrong points: if
+    all gradients of a row have the same sign, however unequal, it moves all entries alike, and the projection
+    undoes that. With one v per row, it stops where plain projected descent does.
 
-    Its `update` takes `allowed` [P] too: where that is False, entries are 0 and stay 0.
+    Its `update` also accepts `allowed` [P]: where it is False, entries are 0 and stay 0.
 
     Args:
-        rate: about how far entries move in a step, of 1; or a schedule of it.
+        rate: learning rate, roughly the change of an entry per step; or a schedule of it.
     """
     scale = optax.scale_by_learning_rate(rate)
 
@@ -71,9 +71,9 @@ def simplex_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformatio
         count = state.count + 1
         m = optax.tree_utils.tree_bias_correction(mean, _DECAY, count)
         v = optax.tree_utils.tree_bias_correction(square, _SQUARE_DECAY, count)
-        ways = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + _EPS), m, v)
-        ways, scaling = scale.update(ways, scaling)
-        moved = jax.tree.map(lambda u, w: jnp.where(allowed, w + u, -jnp.inf), ways, weights)
+        moves = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + _EPS), m, v)
+        moves, scaling = scale.update(moves, scaling)
+        moved = jax.tree.map(lambda u, w: jnp.where(allowed, w + u, -jnp.inf), moves, weights)
         updates = jax.tree.map(lambda m, w: project_simplex(m) - w, moved, weights)
         return updates, (_Moments(count, mean, square), scaling)
 

@@ -1,7 +1,7 @@
-"""Where Gaussians are needed: relocation with a fixed number of slots (3DGS-MCMC, Kheradmand et al. 2024).
+"""Densification by relocation with a fixed number of slots (3DGS-MCMC, Kheradmand et al. 2024).
 
 All slots exist from the start, so shapes never change and nothing recompiles. A slot whose opacity is at most
-`DEAD` holds no Gaussian: it is drawn as nothing, and is what others are copied to.
+`DEAD` holds no Gaussian: it is not drawn, and other Gaussians can be copied to it.
 """
 
 from functools import cache
@@ -18,13 +18,13 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.scene.gaussians import Gaussians
 
 DEAD = 0.005
-"""Opacity up to which a Gaussian counts as dead (3DGS-MCMC; 3DGS prunes there)."""
+"""Opacity up to which a Gaussian counts as dead (3DGS-MCMC; 3DGS prunes below it)."""
 
 EMPTY_LOGIT = -20.0
-"""Logit of the opacity of a slot that has never held a Gaussian: below 1/255, so that it is not drawn."""
+"""Opacity logit of a slot that has never held a Gaussian: the opacity is below 1/255, so it is not drawn."""
 
-_MOST_COPIES = 51  # of one Gaussian at once, as in the reference implementation
-_SHARPNESS, _FAINT = 100.0, 0.005  # of the sigmoid that spares opaque Gaussians the noise
+_MOST_COPIES = 51  # most copies of one Gaussian at once, as in the reference implementation
+_SHARPNESS, _FAINT = 100.0, 0.005  # of the sigmoid that exempts opaque Gaussians from the noise
 
 
 def is_alive(gaussians: Gaussians) -> Bool[Array, "n"]:
@@ -35,19 +35,19 @@ def is_alive(gaussians: Gaussians) -> Bool[Array, "n"]:
 def relocate(
     gaussians: Gaussians, key: PRNGKeyArray, slots: Int[Array, ""]
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
-    """Dead slots become copies of living Gaussians, drawn in proportion to opacity; the picture stays.
+    """Turn dead slots into copies of living Gaussians, sampled in proportion to opacity; the picture stays.
 
-    Of n copies at one place each has the opacity o' = 1 - (1 - o)^(1/n) and the covariance (eq. 9)
+    Each of n copies at one place has the opacity o' = 1 - (1 - o)^(1/n) and the covariance (eq. 9)
 
         S' = o^2 ( sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) )^-2 S
 
     Args:
-        gaussians: of all slots.
-        key: says who is copied.
-        slots: only the first so many may be filled.
+        gaussians: Gaussians in all slots.
+        key: random key that selects the Gaussians to copy.
+        slots: only the first `slots` slots may be filled.
 
     Returns:
-        The Gaussians, and which of them are new or were copied: their optimizer should forget what it knew.
+        The Gaussians, and which of them are new or were copied: their optimizer state should be reset.
     """
     alive = is_alive(gaussians)
     count = gaussians.num
@@ -55,23 +55,23 @@ def relocate(
     share = jnp.cumsum(jnp.where(alive, gaussians.opacities, 0.0))
     drawn = jax.random.uniform(key, (count,), share.dtype) * share[-1]
     source = jnp.clip(jnp.searchsorted(share, drawn, side="right"), 0, count - 1)
-    source = jnp.where(alive[source], source, jnp.argmax(alive))  # rounding may point at a dead one
+    source = jnp.where(alive[source], source, jnp.argmax(alive))  # rounding may select a dead one
     source = jnp.where(vacant, source, jnp.arange(count))
     copies = jnp.zeros(count, jnp.int32).at[source].add(vacant.astype(jnp.int32))
     copied = copies > 0
-    opacities, shrink = divided(gaussians.opacities, jnp.clip(copies + 1, 1, _MOST_COPIES))
+    opacities, shrink = split_into_copies(gaussians.opacities, jnp.clip(copies + 1, 1, _MOST_COPIES))
     logits = jnp.where(copied, jnp.log(opacities) - jnp.log1p(-opacities), gaussians.logit_opacities)
     log_scales = gaussians.log_scales + jnp.where(copied, jnp.log(shrink), 0.0)[:, None]
     shared = eqx.tree_at(lambda g: (g.logit_opacities, g.log_scales), gaussians, (logits, log_scales))
     return jax.tree.map(lambda leaf: leaf[source], shared), vacant | copied
 
 
-def divided(
+def split_into_copies(
     opacities: Float[Array, "n"], copies: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """The opacity of each of `copies` Gaussians that look like one, and the factor on its scales.
+    """The opacity of each of `copies` Gaussians that together look like one, and the factor on its scales.
 
-    Opacities are kept from DEAD to 1 - 1e-6, so that logits are finite and no copy is born dead.
+    Opacities are clipped to between DEAD and 1 - 1e-6, so that logits are finite and no copy starts dead.
     """
     opaque = jnp.clip(opacities, DEAD, 1 - 1e-6)
     each = -jnp.expm1(jnp.log1p(-opaque) / copies)
@@ -94,13 +94,13 @@ def _signed_sums() -> Float[np.ndarray, "copies copies"]:
 def exploration(
     gaussians: Gaussians, key: PRNGKeyArray, amount: Float[Array, ""] | float
 ) -> Float[Array, "n 3"]:
-    """Noise for the means (eq. 7), S eta times `amount`, of those that are almost transparent: so they find a
-    place where they are needed, and what is opaque keeps its own.
+    """Noise for the means (eq. 7): S eta times `amount` for almost transparent Gaussians, which thereby find
+    places where they are needed; opaque ones stay in place.
 
     Args:
-        gaussians: of all slots.
-        key: for eta.
-        amount: the learning rate of the means, times how strong the noise is to be.
+        gaussians: Gaussians in all slots.
+        key: random key for eta.
+        amount: learning rate of the means times the strength of the noise.
     """
     spread = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype)
     rotations = quats_to_matrices(gaussians.quats)
@@ -112,12 +112,17 @@ def exploration(
 State = TypeVar("State")
 
 
-def forgotten(state: State, rows: Bool[Array, "n"]) -> State:
-    """An optimizer's state with zeros in these rows of every array that has one a Gaussian."""
+def reset_rows(state: State, rows: Bool[Array, "n"]) -> State:
+    """An optimizer state with these rows set to zero in every array that has one row per Gaussian.
 
-    def of(leaf):
+    Args:
+        state: the optimizer state.
+        rows: the rows to reset.
+    """
+
+    def reset(leaf):
         if not hasattr(leaf, "shape") or leaf.ndim == 0 or leaf.shape[0] != len(rows):
             return leaf
         return jnp.where(rows.reshape(-1, *[1] * (leaf.ndim - 1)), 0, leaf)
 
-    return jax.tree.map(of, state)
+    return jax.tree.map(reset, state)

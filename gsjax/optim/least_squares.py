@@ -1,20 +1,22 @@
 """Gauss-Newton and Levenberg-Marquardt through optimistix: few parameters, many residuals.
 
-Where a loss is one number, a residual has all that are squared in it:
+A residual returns all the terms that a scalar loss would square and sum:
 
     residual(params, batch, *, step, key) -> (pytree of arrays, aux)        loss = 1/2 sum of squares
 
 `solve` runs optimistix until it converges; `least_squares_step` is one iteration, as a Step that composes
-with others. The default is `LevenbergMarquardt`; optimistix's GaussNewton and Dogleg serve, and what else
-is put together from its descents and searches.
+with others. The default solver is `LevenbergMarquardt`; optimistix's GaussNewton and Dogleg work too, as do
+other combinations of its descents and searches.
 
-Both stay on the manifold: a leaf of `params` that is a jaxlie group T moves by T exp(xi), six numbers for an
-SE3. Hold a camera's pose as camera to world and an object's as object to world: then xi is in its own frame.
+Both functions stay on the manifold: a leaf of `params` that is a jaxlie group T moves by T exp(xi), six
+numbers for an SE3. Store a camera's pose as camera to world and an object's as object to world: then xi is in
+its own frame.
 
-The Jacobian is dense, [residuals, parameters] in memory. jac="fwd" makes it by columns (poses, intrinsics; a
+The Jacobian is dense, [residuals, parameters] in memory. jac="fwd" builds it by columns (poses, intrinsics; a
 plan with derivative="forward"), jac="bwd" by rows (Gaussians; a plan with the reverse derivative).
 
-Damping is Levenberg's, (J^T J + lambda I) move = -J^T r: a unit of each parameter should matter as much.
+Damping is Levenberg's, (J^T J + lambda I) move = -J^T r: scale the parameters so that a unit of each matters
+about equally.
 
 Source: Nocedal, Wright, Numerical Optimization (2nd ed.), chapter 10; optimistix (Rader, Lyons, Kidger 2024).
 """
@@ -38,14 +40,14 @@ Residual = Callable[..., tuple[PyTree, dict[str, Any]]]
 
 
 class LevenbergMarquardt(optx.LevenbergMarquardt):
-    """optimistix's, which here also ends where a move was rejected and the next is below its tolerances.
+    """optimistix's solver, which here also stops after a rejected move once the next is below its tolerances.
 
-    At an optimum rounding decides whether a move is accepted, and optimistix looks at accepted ones alone: it
-    goes on for some thirty images until its damping has shrunk the moves to nothing.
+    At an optimum, rounding decides whether a move is accepted, and optimistix only tests accepted ones: it
+    would render some thirty more images until its damping has shrunk the moves to nothing.
     """
 
     def terminate(self, fn, y, args, options, state, tags):
-        """As optimistix's, and also where the move that was rejected last is below the tolerances.
+        """As in optimistix, and also true if a move was just rejected and the next is below the tolerances.
 
         Arguments as for `optimistix.AbstractLeastSquaresSolver.terminate`.
         """
@@ -59,7 +61,7 @@ class LevenbergMarquardt(optx.LevenbergMarquardt):
 
 
 LEVENBERG_MARQUARDT = LevenbergMarquardt(rtol=1e-4, atol=1e-5)
-"""The default solver. Tighter tolerances than these lie in the rounding of float32 images."""
+"""The default solver. Tighter tolerances would be below the rounding of float32 images."""
 
 
 def solve(
@@ -76,30 +78,30 @@ def solve(
 ) -> tuple[PyTree, dict[str, Any]]:
     """The parameters that minimise half the sum of squared residuals.
 
-    Compiled once for a residual function (the same object), shapes, `jac` and `max_steps`; goes through jit,
+    Compiled once per residual function (the same object), shapes, `jac` and `max_steps`; works under jit,
     vmap and scan. It has no derivative.
 
     Args:
-        residual: as above; aux is a dict, which may be empty. Where `aux["overflow"]` is True its values
-            count as infinite (`reject_overflow`).
-        params: where to start: floating arrays and jaxlie groups.
-        batch: what is given: observations, frozen scene, plan.
-        solver: of optimistix, with its rtol and atol.
-        jac: "fwd" or "bwd", how the Jacobian is made.
-        damping: lambda at the start, for LevenbergMarquardt. It weighs against J^T J, which grows with the
-            number of pixels: as large as that is cautious, far below is Gauss-Newton.
-        max_steps: iterations at most, rejected ones included.
-        step, key: handed on to the residual.
+        residual: as above; aux is a dict, which may be empty. If `aux["overflow"]` is True, the values count
+            as infinite (`reject_overflow`).
+        params: initial parameters: floating arrays and jaxlie groups.
+        batch: fixed inputs: observations, frozen scene, plan.
+        solver: an optimistix solver, with its rtol and atol.
+        jac: "fwd" or "bwd", the mode in which the Jacobian is computed.
+        damping: initial lambda of LevenbergMarquardt. It is added to J^T J, which grows with the number of
+            pixels: a value of that size is cautious, a far smaller one gives Gauss-Newton.
+        max_steps: most iterations, including rejected ones.
+        step, key: passed to the residual.
 
     Returns:
         (params, info). `info` is aux at the solution with `loss`, `steps`, `result` (optimistix.RESULTS),
-        `converged`, and `skipped`: the outcome was not finite or had overflowed, and params are the start's.
-        `overflow` and `needed`, where aux has them, tell of the next move too: where that overflows, the plan
-        is what ended the search, and `converged` is False. What nothing depends on (an object that no camera
-        sees) converges where it starts.
+        `converged`, and `skipped`: the outcome was not finite or had overflowed, and params are the initial
+        ones. `overflow` and `needed`, if aux has them, also cover the next move: if that overflows, the plan
+        is what ended the search, and `converged` is False. Parameters that do not affect the residual (an
+        object that no camera sees) converge where they start.
 
     Raises:
-        ValueError: `jac` or `damping` is none of these, or `params` has leaves that are not floating.
+        ValueError: `jac` is not one of these, `damping` is not positive, or `params` has a non-floating leaf.
     """
     _check(jac, damping)
     params, batch, step, damping = jax.tree.map(_traced, (params, batch, step, damping))
@@ -117,15 +119,15 @@ def _solve(residual, params, batch, solver, jac, damping, max_steps, step, key):
     def narrow(y):
         return jax.tree.map(lambda a, like: a.astype(like.dtype), y, start)
 
-    def widen(tree):  # what optimistix makes by itself is of the default type, and has to meet the same
+    def widen(tree):  # arrays created by optimistix have the default type, and ours must match
         return jax.tree.map(lambda a: a.astype(float), tree)
 
     def fn(y):
         values, aux = inner(narrow(y))
         return widen(values), aux
 
-    # Wherever optimistix multiplies by the Jacobian it would push a tangent through the renderer anew, and it
-    # could not transpose that. With a rule of its own the Jacobian is made once a step, as a matrix.
+    # For every product with the Jacobian, optimistix would push a tangent through the renderer again, which
+    # it could not transpose. With a custom rule the Jacobian is built once per step, as a matrix.
     @jax.custom_jvp
     def dense(y):
         return fn(y)
@@ -142,10 +144,10 @@ def _solve(residual, params, batch, solver, jac, damping, max_steps, step, key):
     loss = damping * _half_sum_of_squares(values)
     found = from_coordinates(params, narrow(solution.value))
     sound = all_finite((found, loss))
-    # Where trials overflowed the solver stops short of them, and calls that an end. The next move would tell.
+    # If trials overflowed, the solver stops short of them and reports success. The next move reveals that.
     ahead = _move(solution.state.f_info, solution.value)
-    told = _joined(aux, fn(jax.tree.map(jnp.add, solution.value, ahead))[1])
-    stuck = jnp.asarray(told.get("overflow", False)).any()
+    capacity = _joined(aux, fn(jax.tree.map(jnp.add, solution.value, ahead))[1])
+    stuck = jnp.asarray(capacity.get("overflow", False)).any()
     info = {
         "loss": loss,
         "steps": solution.stats["num_steps"],
@@ -153,18 +155,18 @@ def _solve(residual, params, batch, solver, jac, damping, max_steps, step, key):
         "converged": (solution.result == optx.RESULTS.successful) & sound & ~stuck,
         "skipped": ~sound,
     }
-    return keep_if(sound, found, params), {**aux, **told, **info}
+    return keep_if(sound, found, params), {**aux, **capacity, **info}
 
 
 def _move(there, y: PyTree) -> PyTree:
-    """What Levenberg-Marquardt would try first from y."""
+    """The move that Levenberg-Marquardt would try first from y."""
     descent = optx.DampedNewtonDescent()
     move, _ = descent.step(jnp.array(1.0), descent.query(y, there, descent.init(y, there)))
     return jax.tree.map(lambda a: jnp.where(jnp.isfinite(a), a, 0.0), move)
 
 
 def _joined(aux: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
-    """What two evaluations say of the plan, where they say it: did any overflow, and what did they need."""
+    """`overflow` and `needed` of two evaluations, if present: whether either overflowed, the larger need."""
     joins = (("overflow", jnp.logical_or), ("needed", jnp.maximum))
     return {name: join(aux[name], other[name]) for name, join in joins if name in aux}
 
@@ -176,18 +178,18 @@ def least_squares_step(
     jac: str = "fwd",
     damping: float = 1.0,
 ) -> Step:
-    """One iteration of `solver` on `residual`: a Jacobian, a move, and one more evaluation to judge it.
+    """One iteration of `solver` on `residual`: a Jacobian, a move, and one more evaluation to test it.
 
-    Arguments as for `solve`; the solver's tolerances are not used. The state is what its search carries (for
-    LevenbergMarquardt 1/lambda), so the batch may change from update to update. Begin a new frame with a new
-    `init`: rejections at the optimum of the last one leave the damping high.
+    Arguments as for `solve`; the solver's tolerances are not used. The state is that of its search (1/lambda
+    for LevenbergMarquardt), so the batch may change from update to update. Start each frame with a new
+    `init`: rejections at the optimum of the previous one leave the damping high.
 
-    `info` is aux at the params returned with `loss`, `accepted`, and `skipped`: already before the move the
-    residual was not finite or had overflowed, and params and state are unchanged. `overflow` and `needed`
-    tell of a rejected move too, so that the host re-plans.
+    `info` is aux at the returned params with `loss`, `accepted`, and `skipped`: the residual was not finite
+    or had overflowed before the move, and params and state are unchanged. `overflow` and `needed` also cover
+    a rejected move, so that the host re-plans.
 
     Raises:
-        ValueError: as `solve`; what `params` are is looked at by `init`.
+        ValueError: as `solve`; `params` are checked by `init`.
     """
     _check(jac, damping)
 
@@ -201,7 +203,7 @@ def least_squares_step(
         y = to_coordinates(params)
         values, operator, aux = _linearise(fn, y, jac)
         here = optx.FunctionInfo.ResidualJac(values, operator)
-        # As in optimistix's own loop: the first step of a search says only how long a move to try.
+        # As in optimistix's own loop: the first step of a search only determines how long a move to try.
         length, _, _, search = solver.search.step(jnp.array(True), y, y, here, here, state)
         descent = solver.descent.query(y, here, solver.descent.init(y, here))
         move, _ = solver.descent.step(length, descent)
@@ -212,15 +214,15 @@ def least_squares_step(
 
         sound = all_finite((params, here.as_min()))
         accepted &= sound & all_finite((moved, there.as_min()))
-        # Factors of 3.5 and 1/4 over many frames must not end where no factor leads back from (0, infinity).
+        # Factors of 3.5 and 1/4 over many frames must not reach 0 or infinity: no factor leads back.
         search = jax.tree.map(lambda new, old: jnp.clip(new, 1e-6, 1e6).astype(old.dtype), search, state)
-        told = _joined(aux, moved_aux)
+        capacity = _joined(aux, moved_aux)
         info = {
             "loss": damping * jnp.where(accepted, there.as_min(), here.as_min()),
             "accepted": accepted,
             "skipped": ~sound,
         }
-        aux = {**keep_if(accepted, moved_aux, aux), **told, **info}
+        aux = {**keep_if(accepted, moved_aux, aux), **capacity, **info}
         params = keep_if(accepted, from_coordinates(params, moved), params)
         return params, keep_if(sound, search, state), aux
 
@@ -228,11 +230,11 @@ def least_squares_step(
 
 
 def reject_overflow(residual: PyTree, overflow: Bool[Array, "..."]) -> PyTree:
-    """Infinity in every value where any camera overflowed its plan, so that a solver rejects the step.
+    """The residual, or infinity everywhere if any camera overflowed its plan, so that a solver rejects it.
 
     Args:
         residual: arrays of any shape.
-        overflow: of the cameras, [..., C].
+        overflow: whether each camera overflowed, [..., C].
     """
     overflow = jnp.asarray(overflow).any()
     return jax.tree.map(lambda a: jnp.where(overflow, jnp.inf, a), residual)
@@ -241,12 +243,12 @@ def reject_overflow(residual: PyTree, overflow: Bool[Array, "..."]) -> PyTree:
 def difference(
     rendered: Float[Array, "*shape"], observed: Float[Array, "*shape"]
 ) -> tuple[Float[Array, "*shape"], Int[Array, ""]]:
-    """`rendered - observed` where the observation is finite, else 0; and how many were left out.
+    """`rendered - observed` where the observation is finite, else 0; and the number of values left out.
 
-    Mark what was not measured (depth 0, a mask) by NaN in `observed`.
+    Mark missing measurements (depth 0, masked pixels) by NaN in `observed`.
 
     Raises:
-        ValueError: they differ in shape, or are not floating.
+        ValueError: the shapes differ, or an array is not floating.
     """
     if jnp.shape(rendered) != jnp.shape(observed):
         raise ValueError(
@@ -255,17 +257,18 @@ def difference(
     for name, array in (("rendered", rendered), ("observed", observed)):
         if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
             raise ValueError(
-                f"{name} must hold floats, colours from 0 to 1; got {jnp.result_type(array)}: of 8 bits, "
-                "divide by 255"
+                f"{name} must hold floats, colours from 0 to 1; got {jnp.result_type(array)}: divide 8-bit "
+                "colours by 255"
             )
     known = jnp.isfinite(observed)
     return jnp.where(known, rendered - jnp.where(known, observed, 0.0), 0.0), jnp.sum(~known)
 
 
 def huber(residual: PyTree, delta: float) -> PyTree:
-    """Residuals with half squares of Huber's loss: r to `delta`, sign(r) sqrt(2 delta |r| - delta^2) beyond.
+    """Residuals whose half squares are Huber's loss: r to `delta`, sign(r) sqrt(2 delta |r| - delta^2) above.
 
-    Still a least-squares problem, once differentiable (Hartley, Zisserman, Multiple View Geometry, A6.8).
+    This is still a least-squares problem, once differentiable (Hartley, Zisserman, Multiple View Geometry,
+    A6.8).
     """
 
     def one(r):
@@ -277,7 +280,7 @@ def huber(residual: PyTree, delta: float) -> PyTree:
 
 
 def to_coordinates(params: PyTree) -> PyTree:
-    """What is solved for: arrays themselves, and for each jaxlie group a zero tangent vector.
+    """The coordinates that are optimized: arrays themselves, and a zero tangent vector for each jaxlie group.
 
     Raises:
         ValueError: a leaf is not floating.
@@ -288,7 +291,8 @@ def to_coordinates(params: PyTree) -> PyTree:
             return jnp.zeros((*leaf.get_batch_axes(), leaf.tangent_dim), leaf.parameters().dtype)
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise ValueError(
-                f"params: a leaf is of {jnp.result_type(leaf)}; only floating ones can be solved for"
+                f"params: expected floating leaves, found {jnp.result_type(leaf)}; only floating ones can be "
+                "optimized"
             )
         return leaf
 
@@ -296,7 +300,7 @@ def to_coordinates(params: PyTree) -> PyTree:
 
 
 def from_coordinates(params: PyTree, coordinates: PyTree) -> PyTree:
-    """Parameters at `coordinates` around `params`: the arrays given, T exp(xi) for each jaxlie group T."""
+    """Parameters at `coordinates` around `params`: arrays as given, T exp(xi) for each jaxlie group T."""
 
     def one(leaf, at):
         return (leaf @ type(leaf).exp(at)).normalize() if _is_group(leaf) else at
@@ -309,19 +313,19 @@ def _is_group(node: Any) -> bool:
 
 
 def _traced(leaf: Any) -> Any:
-    """Python numbers as arrays: `filter_jit` would compile anew for each value."""
+    """Python numbers as arrays: `filter_jit` would recompile for each value."""
     return jnp.asarray(leaf) if isinstance(leaf, int | float) else leaf
 
 
 def _check(jac: str, damping: float) -> None:
     if jac not in ("fwd", "bwd"):
-        raise ValueError(f'jac is "fwd" or "bwd", not {jac!r}')
+        raise ValueError(f'jac must be "fwd" or "bwd", not {jac!r}')
     if not damping > 0:
         raise ValueError(f"damping must be above 0, not {damping}")
 
 
 def _scaled(residual: Residual, params, batch, damping, step, key):
-    """y -> (residual / sqrt(damping), aux): optimistix starts at lambda = 1, this makes it `damping`."""
+    """y -> (residual / sqrt(damping), aux): turns optimistix's initial lambda of 1 into `damping`."""
 
     def fn(y):
         returned = residual(from_coordinates(params, y), batch, step=step, key=key)

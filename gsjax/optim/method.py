@@ -10,7 +10,7 @@ A method is a frozen dataclass that holds its configuration. `gsjax.engine.drive
 """
 
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 from jaxtyping import PyTree
@@ -54,9 +54,10 @@ class Run(eqx.Module):
         return self.having(plans=plans)
 
 
-Problem = TypeVar("Problem")
+Problem = TypeVar("Problem", contravariant=True)
 
 
+@runtime_checkable
 class Method(Protocol[Problem]):
     """A method; see the module. Everything but `step` runs on the host."""
 

@@ -1,4 +1,4 @@
-"""Differences of pictures as residuals for `gsjax.optim.least_squares`."""
+"""Image differences as residuals for `gsjax.optim.least_squares`."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,18 +13,18 @@ def block_residual(
     block: int,
     softness: float,
 ) -> Float[Array, "c rows columns d"]:
-    """Residuals whose half squares sum up to the weighted sum of min(|difference|, limit), over blocks of
-    one pixel and above `softness` times the limit; what is below is rounded off (Huber), for an absolute
-    value has no curvature that Gauss-Newton could use.
+    """Residuals whose half squares sum to the weighted sum of min(|difference|, limit), for blocks of one
+    pixel and differences above `softness` times the limit. Smaller differences are rounded off (Huber),
+    because an absolute value has no curvature that Gauss-Newton could use.
 
     Args:
         difference: rendered minus observed.
-        weights: what each counts.
-        limit: a difference beyond it is that of another thing.
-        block: differences are means over blocks so many pixels wide. How one rendered pixel changes depends
-            on the Gaussian whose edge it lies at; that is no part of a motion, and in J^T J it counts like
-            gradients of the picture, which makes steps short. Pixels that fill no block are left out.
-        softness: share of the limit.
+        weights: weights of the differences.
+        limit: larger differences are truncated: they belong to a different object.
+        block: width in pixels of the blocks over which differences are averaged. How a single rendered pixel
+            changes depends on the Gaussian whose edge it lies on; this is unrelated to the motion, but counts
+            in J^T J like image gradients, which makes steps short. Pixels outside full blocks are left out.
+        softness: share of the limit below which differences are rounded off.
     """
     total = _summed(weights, block)
     mean = _summed(difference * weights, block) / jnp.maximum(total, 1e-6)

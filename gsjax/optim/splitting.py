@@ -1,7 +1,7 @@
-"""Adaptive density control (Kerbl et al. 2023, section 5.2): where the projected means are pulled hard, small
-Gaussians are cloned and large ones split; what is transparent or too large is pruned.
+"""Adaptive density control (Kerbl et al. 2023, section 5.2): where the gradients of the projected means (the
+"pull") are large, small Gaussians are cloned and large ones split; transparent and oversized ones are pruned.
 
-Copies go to slots that hold none, so shapes stay until the slots run out: then the host takes more.
+Copies go to vacant slots, so shapes stay the same until the slots run out; then the host allocates more.
 """
 
 from typing import NamedTuple
@@ -17,17 +17,17 @@ from gsjax.optim.densification import EMPTY_LOGIT, is_alive
 from gsjax.scene.gaussians import Gaussians
 
 SHRINK = 1.6
-"""How many times smaller the two halves of a split Gaussian are."""
+"""Factor by which the two halves of a split Gaussian are smaller."""
 RESET_OPACITY = 0.01
-"""Opacity above which a reset leaves none: what is needed soon comes back, the rest is pruned."""
+"""Upper bound on opacities after a reset: Gaussians that are needed soon recover, the rest are pruned."""
 
 
 class Pull(NamedTuple):
-    """How hard the projected means were pulled, as far as it is known.
+    """Accumulated gradients of the projected means.
 
     Attributes:
-        total: sum over steps of the norms of their gradients, by half the picture's width and height.
-        seen: in how many steps there was one.
+        total: sum over steps of the gradient norms, in units of half the picture's width and height.
+        seen: number of steps with a non-zero gradient.
     """
 
     total: Float[Array, "n"]
@@ -35,13 +35,13 @@ class Pull(NamedTuple):
 
     @property
     def mean(self) -> Float[Array, "n"]:
-        """Of the steps that pulled."""
+        """Mean gradient norm over the steps with a non-zero gradient."""
         return self.total / jnp.maximum(self.seen, 1.0)
 
 
 def watch_pull() -> optax.GradientTransformation:
-    """What the optimizer does with zeros [1,n,2] that were added to the projected means: it leaves them, and
-    keeps a `Pull` of their gradients, which must be by half a picture and not by pixels."""
+    """An optimizer for the zeros [1,n,2] that are added to the projected means: it leaves them unchanged and
+    accumulates their gradients in a `Pull`. Gradients must be per half picture, not per pixel."""
 
     def init(params) -> Pull:
         zeros = jnp.zeros((2, _only(params).shape[1]), _only(params).dtype)
@@ -60,8 +60,8 @@ def _only(tree) -> Array:
     return leaf
 
 
-def wanted(gaussians: Gaussians, pull: Pull, threshold: float) -> Bool[Array, "n"]:
-    """Which Gaussians are pulled harder than the threshold."""
+def strongly_pulled(gaussians: Gaussians, pull: Pull, threshold: float) -> Bool[Array, "n"]:
+    """Which living Gaussians have a mean pull above the threshold."""
     return is_alive(gaussians) & (pull.mean > threshold)
 
 
@@ -75,33 +75,33 @@ def divide(
     large: float,
     too_large: Float[Array, ""] | float,
 ) -> tuple[Gaussians, Bool[Array, "n"]]:
-    """Clone, split and prune. Where vacant slots are too few, those that are pulled hardest come first.
+    """Clone, split and prune. If vacant slots are too few, the Gaussians with the strongest pull go first.
 
     Args:
-        gaussians: of all slots.
-        pull: since the last time.
-        key: says where the halves of a split Gaussian go: drawn from itself.
-        slots: only the first so many may be filled.
-        threshold: of the mean pull.
-        large: largest scale up to which one is cloned, and above which it is split, metres.
-        too_large: largest scale above which one is pruned, metres.
+        gaussians: Gaussians in all slots.
+        pull: gradients accumulated since the last call.
+        key: random key; the halves of a split Gaussian are sampled from it.
+        slots: only the first `slots` slots may be filled.
+        threshold: mean pull above which a Gaussian is cloned or split.
+        large: a Gaussian is cloned if its largest scale is at most this, else split, metres.
+        too_large: a Gaussian whose largest scale exceeds this is pruned, metres.
 
     Returns:
-        The Gaussians, and which of them are new or were split: their optimizer should forget what it knew.
+        The Gaussians, and which of them are new or were split: their optimizer state should be reset.
     """
     count = gaussians.num
     largest = gaussians.scales.max(-1)
     fits = is_alive(gaussians) & (largest <= too_large)
-    asks = wanted(gaussians, pull, threshold) & fits
+    candidate = strongly_pulled(gaussians, pull, threshold) & fits
     vacant = ~fits & (jnp.arange(count) < slots)
-    # The k-th that asks, hardest pulled first, takes the k-th vacant slot.
-    askers = jnp.argsort(jnp.where(asks, -pull.mean, jnp.inf))
+    # The k-th candidate, strongest pull first, takes the k-th vacant slot.
+    parents = jnp.argsort(jnp.where(candidate, -pull.mean, jnp.inf))
     places = jnp.argsort(~vacant, stable=True)
-    served = jnp.arange(count) < jnp.minimum(asks.sum(), vacant.sum())
-    source = jnp.arange(count).at[jnp.where(served, places, count)].set(askers, mode="drop")
+    served = jnp.arange(count) < jnp.minimum(candidate.sum(), vacant.sum())
+    source = jnp.arange(count).at[jnp.where(served, places, count)].set(parents, mode="drop")
     new = source != jnp.arange(count)
-    got = jnp.zeros(count, bool).at[jnp.where(served, askers, count)].set(True, mode="drop")
-    halved = got & (largest > large)
+    copied_from = jnp.zeros(count, bool).at[jnp.where(served, parents, count)].set(True, mode="drop")
+    halved = copied_from & (largest > large)
 
     pruned = eqx.tree_at(
         lambda g: g.logit_opacities, gaussians, jnp.where(fits, gaussians.logit_opacities, EMPTY_LOGIT)
@@ -109,13 +109,13 @@ def divide(
     copied = jax.tree.map(lambda leaf: leaf[source], pruned)
     split = halved[source]
     local = jax.random.normal(key, copied.means.shape, copied.means.dtype) * copied.scales
-    away = jnp.einsum("nij,nj->ni", quats_to_matrices(copied.quats), local)
-    means = copied.means + jnp.where(split[:, None], away, 0.0)
+    shift = jnp.einsum("nij,nj->ni", quats_to_matrices(copied.quats), local)
+    means = copied.means + jnp.where(split[:, None], shift, 0.0)
     log_scales = copied.log_scales - jnp.where(split, jnp.log(SHRINK), 0.0)[:, None]
     return eqx.tree_at(lambda g: (g.means, g.log_scales), copied, (means, log_scales)), new | split
 
 
-def with_low_opacities(gaussians: Gaussians) -> Gaussians:
-    """None more opaque than `RESET_OPACITY`."""
+def reset_opacities(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians with opacities limited to `RESET_OPACITY`."""
     most = jnp.log(RESET_OPACITY) - jnp.log1p(-RESET_OPACITY)
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, jnp.minimum(gaussians.logit_opacities, most))

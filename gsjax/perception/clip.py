@@ -1,4 +1,4 @@
-"""CLIP (Radford et al., 2021) through transformers: objects and words in one space. Weights are local files.
+"""CLIP (Radford et al., 2021) through transformers: images and text in one space. Weights are local files.
 
 Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
 """
@@ -16,14 +16,14 @@ from gsjax.perception.pictures import square_crop, to_bytes
 
 @dataclass(frozen=True)
 class ClipEncoder:
-    """Unit vectors of object crops and of texts; from `load_clip`.
+    """Unit vectors of object crops and of text; from `load_clip`.
 
     Attributes:
-        model, processor, tokenizer: of transformers.
+        model, processor, tokenizer: objects of transformers.
         torch: the module.
-        device: where the model is.
-        min_score: a query whose best cosine is less means none of the objects. CLIP's cosines between
-            pictures and texts that fit lie around 0.25 to 0.3, and those that do not around 0.15 to 0.2.
+        device: the device that holds the model.
+        min_score: a query whose best cosine is lower matches none of the objects. CLIP's cosines lie around
+            0.25 to 0.3 for an image and a matching text, and around 0.15 to 0.2 for one that does not match.
     """
 
     model: Any
@@ -34,7 +34,7 @@ class ClipEncoder:
     min_score: float = 0.2
 
     def embed_images(self, images: list[np.ndarray]) -> Float[np.ndarray, "n D"]:
-        """Unit vectors of RGB pictures [h,w,3], uint8 or floats 0 to 1."""
+        """Unit vectors of RGB images [h,w,3], uint8 or floats 0 to 1."""
         pixels = self.processor([to_bytes(image) for image in images], return_tensors="pt")["pixel_values"]
         with self.torch.inference_mode():
             seen = self.model.vision_model(pixel_values=pixels.to(self.device)).pooler_output
@@ -47,7 +47,7 @@ class ClipEncoder:
             ValueError: the text is empty.
         """
         if not text.strip():
-            raise ValueError("text: got nothing, want words that say which object")
+            raise ValueError("text: expected words that describe an object, found an empty text")
         tokens = self.tokenizer([text], truncation=True, return_tensors="pt").to(self.device)
         with self.torch.inference_mode():
             read = self.model.text_model(**tokens).pooler_output
@@ -56,14 +56,14 @@ class ClipEncoder:
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """The vector of a square crop around each of the labels 1 to `count`; zeros for one without pixels.
+        """The vector of a square crop around each of the labels 1 to `count`; zeros for absent labels.
 
-        What surrounds an object stays in its crop: CLIP was trained on pictures, not on cut-outs.
+        A crop keeps the object's surroundings, because CLIP was trained on whole images, not on cut-outs.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
-            labels: of its pixels, 0 the background.
-            count: the largest label that is asked for.
+            labels: label of each pixel, 0 for background.
+            count: the largest label to embed.
         """
         vectors = np.zeros((count, self.model.config.projection_dim), np.float32)
         there = [label for label in range(1, count + 1) if (labels == label).any()]
@@ -78,7 +78,7 @@ def load_clip(path: str | os.PathLike, device: str = "cpu") -> ClipEncoder:
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
+        ValueError: the folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
     files = (weights.PROCESSOR, "tokenizer.json|vocab.json")

@@ -1,7 +1,7 @@
-"""Objects by words without a model of language: colour, outline, size, and names that somebody gave.
+"""Text queries for objects without a language model: by colour, outline, size, and names given by the user.
 
-A closed vocabulary and no more: it knows the words listed here and the names it is given, and says so of
-every other word. Where words are to mean what they mean to people, CLIP is the one to ask.
+The vocabulary is closed: it holds the words listed here and the given names, and any other word is an error.
+For free-form language use CLIP.
 """
 
 import re
@@ -27,7 +27,7 @@ _SYNONYMS = {
     **{"biggest": "largest", "big": "largest", "large": "largest"},
     **{"tiniest": "smallest", "tiny": "smallest", "small": "smallest", "little": "smallest"},
 }
-_NUMBERED = re.compile(r"object \d+")  # what is called so has no name
+_NUMBERED = re.compile(r"object \d+")  # a placeholder, not a name
 _SILENT = frozenset(
     [
         *("a", "an", "the", "this", "that", "it", "one", "object", "thing", "item", "of", "my", "me"),
@@ -35,37 +35,37 @@ _SILENT = frozenset(
     ]
 )
 
-_FULL_ROUND, _NOT_ROUND = 0.93, 0.80  # share of the smallest enclosing circle that an outline fills
-_FULL_LONG, _NOT_LONG = 2.5, 1.5  # long over short side of the smallest enclosing rectangle
+_FULL_ROUND, _NOT_ROUND = 0.93, 0.80  # fraction of the smallest enclosing circle that an outline fills
+_FULL_LONG, _NOT_LONG = 2.5, 1.5  # aspect ratio of the smallest enclosing rectangle
 
 
 class ClosedVocabulary:
-    """Vectors of objects and of texts, made of aspects: colour, outline, size, and name if there are names.
+    """Vectors of objects and of text, composed of aspects: colour, outline, size, and, if given, name.
 
-    Each aspect is a unit vector with one axis a word, one for "none of these", and one that stands for
-    "any". An object has both its own description d and "any" in each aspect, (d, 1); a text has the words
-    that it names, or "any" where it names none. So a text that describes an object fully has cosine
-    1 / sqrt(2) with it, whichever aspects it names, and each aspect that is wrong takes its equal share away.
+    Each aspect is a unit vector with one axis per word, one for "none of these", and one for "any". An object
+    has both its own description d and "any" in each aspect, (d, 1); a text has the words that it names, or
+    "any" in an aspect in which it names none. So a text that fully describes an object has a cosine of
+    1/sqrt(2) with it, whichever aspects it names, and each wrong aspect reduces the cosine by an equal share.
 
-    Outlines cannot tell a box from a can (from above both are four- to six-cornered); only a name can.
+    Outlines cannot distinguish a box from a can (from above both have four to six corners); only names can.
 
     Attributes:
-        min_score: three quarters of one aspect may be missing, but not all of it.
+        min_score: lowest cosine of a match; up to three quarters of one aspect may be missing.
     """
 
     def __init__(self, names: Mapping[int, str] | None = None, sizes: bool = True):
         """
         Args:
-            names: the name of each label, as far as it has one: "can", "milk carton".
-            sizes: whether objects are told apart by size. Who compares those of several pictures leaves it
-                out: how large something is among the others depends on who else is in the picture.
+            names: the name of each label that has one, such as "can" or "milk carton".
+            sizes: whether size is one of the aspects. Disable it to compare objects of several images,
+                because relative size depends on the other objects in the image.
 
         Raises:
             ValueError: two labels have the same name.
         """
         self._names = {label: " ".join(_words(name)) for label, name in sorted((names or {}).items())}
         if len(set(self._names.values())) < len(self._names):
-            raise ValueError(f"names: got {list(self._names.values())}, want each of them once")
+            raise ValueError(f"names: expected distinct names, found {list(self._names.values())}")
         self._aspects = {name: words for name, words in ASPECTS.items() if sizes or name != "size"}
         if self._names:
             self._aspects["name"] = tuple(self._names.values())
@@ -73,18 +73,18 @@ class ClosedVocabulary:
 
     @property
     def words(self) -> dict[str, tuple[str, ...]]:
-        """The words of each aspect; synonyms left out."""
+        """The words of each aspect, without synonyms."""
         return dict(self._aspects)
 
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """A unit vector for each of the labels 1 to `count`; zeros for one that no pixel has.
+        """A unit vector for each of the labels 1 to `count`; zeros for a label without pixels.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
-            labels: of its pixels, 0 the background.
-            count: the largest label that is asked for.
+            labels: label of each pixel, 0 for background.
+            count: the largest label to embed.
         """
         areas = np.bincount(labels[labels >= 0].ravel(), minlength=count + 1)[1 : count + 1]
         colors = color_words(image)
@@ -106,10 +106,10 @@ class ClosedVocabulary:
         return np.stack(rows) if rows else np.zeros((0, 0))
 
     def embed_text(self, text: str) -> Float[np.ndarray, "D"]:
-        """The unit vector of a query: the words that it names, and "any" where it names none.
+        """The unit vector of a query: the words that it names, and "any" in aspects in which it names none.
 
         Raises:
-            ValueError: a word is none of the vocabulary, or no word says which object.
+            ValueError: a word is not in the vocabulary, or no word distinguishes objects.
         """
         named, unknown = self._parse(text)
         if unknown or not named:
@@ -118,7 +118,10 @@ class ClosedVocabulary:
             )
             listed = "; ".join(f"{aspect}s: {', '.join(words)}" for aspect, words in self._aspects.items())
             named_by_number = all(_NUMBERED.fullmatch(name) for name in self._names.values())
-            advice = '. Nothing has a name here: ask by colour or outline, "the blue one"' * named_by_number
+            advice = (
+                '. No object has a name here: ask by colour or outline, as in "the blue one"'
+                * named_by_number
+            )
             raise ValueError(f"the closed vocabulary has {problem}. It has {listed}{advice}")
         parts = []
         for aspect, words in self._aspects.items():
@@ -128,10 +131,10 @@ class ClosedVocabulary:
         return np.concatenate(parts) / np.sqrt(len(parts))
 
     def _parse(self, text: str) -> tuple[set[tuple[str, str]], list[str]]:
-        """The (aspect, word) pairs that a text names, and the words that mean nothing here."""
+        """The (aspect, word) pairs named in a text, and its words that are not in the vocabulary."""
         rest = f" {' '.join(_words(text))} "
         named = set()
-        # Names first and the longest before the others: a "red bull" is no colour, "object 12" no "object 1".
+        # Names first, longest first: "red bull" must not match a colour, nor "object 12" match "object 1".
         for name in sorted(self._names.values(), key=len, reverse=True):
             if f" {name} " in rest:
                 named.add(("name", name))
@@ -150,7 +153,7 @@ class ClosedVocabulary:
 def color_words(image: Num[np.ndarray, "H W 3"]) -> Int[np.ndarray, "H W"]:
     """The index in `COLORS` of each pixel's colour, by lightness, saturation and hue in CIELAB.
 
-    Saturation is chroma over the length of (lightness, chroma), which shade changes little.
+    Saturation is chroma over the length of (lightness, chroma), which shading changes little.
     """
     lightness, a, b = np.moveaxis(rgb2lab(unit_floats(image)), -1, 0)
     chroma = np.hypot(a, b)
@@ -169,10 +172,10 @@ def color_words(image: Num[np.ndarray, "H W 3"]) -> Int[np.ndarray, "H W"]:
 
 
 def _outline(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "2"]:
-    """How round and how long a mask's outline is, each 0 to 1."""
+    """How round and how elongated a mask's outline is, each 0 to 1."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = max(contours, key=len)[:, 0]
-    # Corners of pixels, not centres: of a small mask half a pixel is much.
+    # Corners of pixels rather than centres: half a pixel matters for a small mask.
     corners = np.concatenate([contour + offset for offset in ((0, 0), (1, 0), (0, 1), (1, 1))])
     corners = corners.astype(np.float32)
     _, radius = cv2.minEnclosingCircle(corners)
@@ -190,7 +193,7 @@ def _outline(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "2"]:
 
 
 def _filled(parts: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n+1"]:
-    """A unit vector: the parts, and behind them what is missing to length 1; longer ones are shortened."""
+    """A unit vector: the parts, followed by the remainder to length 1; longer vectors are shortened first."""
     length = np.linalg.norm(parts)
     parts = parts / max(length, 1.0)
     return np.append(parts, np.sqrt(max(0.0, 1 - np.sum(parts**2))))

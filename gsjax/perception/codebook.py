@@ -1,7 +1,7 @@
-"""A vector for each name: what words and things have in common where nobody reads or sees.
+"""A random vector per class name: a stand-in for a language model where true labels are known.
 
-The stand-in for a model of language where the labels of things are known, as in simulation: it tells how far
-a method carries meaning, and nothing about how well meaning was read.
+In simulation, for example, it measures how well a method carries semantics, without measuring how well a
+model recognised them.
 """
 
 import hashlib
@@ -11,16 +11,16 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-DIMENSION = 512  # as CLIP's
+DIMENSION = 512  # that of CLIP
 
 
 class ClassCodebook:
-    """Unit vectors of names, the same wherever a name occurs, and nearly at right angles to each other.
+    """Unit vectors of names, identical wherever a name occurs, and nearly orthogonal to each other.
 
-    A name's vector is drawn at random, seeded by the name. Of two, the cosine is 0 +- 1 / sqrt(dimension).
+    A name's vector is drawn at random, seeded by the name. The cosine of two is 0 +- 1 / sqrt(dimension).
 
     Attributes:
-        min_score: a query whose best cosine is less means none of the objects.
+        min_score: a query whose best cosine is lower matches none of the objects.
     """
 
     min_score = 0.5
@@ -28,33 +28,33 @@ class ClassCodebook:
     def __init__(self, names: Mapping[int, str], dimension: int = DIMENSION):
         """
         Args:
-            names: of the labels that masks may hold; other labels are nothing that has a name.
-            dimension: of the vectors.
+            names: name of each label that masks may hold; other labels are unnamed.
+            dimension: length of the vectors.
 
         Raises:
             ValueError: there are no names, or two labels have the same one.
         """
         if not names:
-            raise ValueError("names: expected those of labels, found none")
+            raise ValueError("names: expected a name for at least one label, found none")
         self._names = {label: _plain(name) for label, name in sorted(names.items())}
         if len(set(self._names.values())) < len(self._names):
-            raise ValueError(f"names: got {list(self._names.values())}, want each of them once")
+            raise ValueError(f"names: expected distinct names, found {list(self._names.values())}")
         self._dimension = dimension
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names that it knows."""
+        """All names in the codebook."""
         return tuple(self._names.values())
 
     def embed_objects(
         self, image: Num[np.ndarray, "H W 3"], labels: Int[np.ndarray, "H W"], count: int
     ) -> Float[np.ndarray, "count D"]:
-        """The vector of the name of each label, 1 to `count`; zeros for one without a name or a pixel.
+        """The vector of the name of each label, 1 to `count`; zeros for a label without a name or pixels.
 
         Args:
-            image: RGB, uint8 or floats 0 to 1. It is not looked at: labels alone say which names.
-            labels: of its pixels, 0 the background.
-            count: the largest label that is asked for.
+            image: RGB, uint8 or floats 0 to 1. Not used: the labels alone determine the names.
+            labels: label of each pixel, 0 for background.
+            count: the largest label to embed.
         """
         there = set(np.unique(labels).tolist())
         vectors = np.zeros((count, self._dimension), np.float32)
@@ -67,14 +67,14 @@ class ClassCodebook:
         """The vector of a name.
 
         Raises:
-            ValueError: it is none of the names.
+            ValueError: it is not one of the names.
         """
         name = _plain(text)
         if name not in self.names:
             raise ValueError(
-                f"no class {text!r}; these features know names alone, and there are: "
-                f"{', '.join(self.names)}. For colours: gsjax distill RUN --features closed --out NEW, then "
-                "gsjax query NEW; or gsjax query RUN, where RUN is of gsjax track"
+                f"no class {text!r}; these features know only names: {', '.join(self.names)}. For "
+                "colours: gsjax distill RUN --features closed --out NEW, then gsjax query NEW; or "
+                "gsjax query RUN, with a run of gsjax track"
             )
         return self._vector(name)
 
@@ -89,5 +89,5 @@ class ClassCodebook:
 
 
 def _plain(name: str) -> str:
-    """Words in lower case, one space between them."""
+    """The words in lower case, separated by single spaces."""
     return " ".join(re.findall(r"[^\W_]+", name.lower()))

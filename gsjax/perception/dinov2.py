@@ -19,10 +19,10 @@ class Dinov2Encoder:
     """Features of the last layer's patches, interpolated to pixels; from `load_dinov2`.
 
     Attributes:
-        model, processor: of transformers.
+        model, processor: objects of transformers.
         torch: the module.
-        device: where the model is.
-        resolution: pixels of the shorter side that the model sees, rounded to whole patches. More see more.
+        device: the device that holds the model.
+        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger resolves more.
     """
 
     model: Any
@@ -32,13 +32,13 @@ class Dinov2Encoder:
     resolution: int = 518
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C H W D"]:
-        """Features of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen, nothing is cropped."""
+        """Features of RGB images, uint8 or floats 0 to 1. Images are used whole, without cropping."""
         height, width = images.shape[1:3]
         patch = self.model.config.patch_size
         pixels, rows, columns = in_patches(images, self.processor, patch, self.resolution)
         with self.torch.inference_mode():
             tokens = self.model(pixel_values=pixels.to(self.device)).last_hidden_state
-            # Before the patches stand the class token and, in some models, registers.
+            # The class token and, in some models, registers precede the patches.
             grid = tokens[:, -rows * columns :].float().unflatten(1, (rows, columns)).permute(0, 3, 1, 2)
             maps = self.torch.nn.functional.interpolate(
                 grid, (height, width), mode="bilinear", align_corners=False
@@ -51,12 +51,12 @@ def load_dinov2(path: str | os.PathLike, device: str = "cpu", resolution: int = 
 
     Args:
         path: the folder.
-        device: of torch, "cpu" or "cuda".
-        resolution: pixels of the shorter side that the model is to see.
+        device: device of torch, "cpu" or "cuda".
+        resolution: shorter side of the model's input, pixels.
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
+        ValueError: the folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "DINOv2's weights", (weights.PROCESSOR,), "facebook/dinov2-base")

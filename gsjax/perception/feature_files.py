@@ -1,15 +1,15 @@
-"""Features that others have computed, as their tools leave them: one picture's, or those of a folder.
+"""Features computed by other tools, read in the layouts that these write.
 
-layout          files of a picture NAME                       what they hold
+layout          files of an image NAME                        contents
 langsplat       NAME_s.npy, NAME_f.npy                        [4,H,W] rows (-1: none), at four sizes of
                                                               objects, of [n,512]
 feature-3dgs    NAME_fmap_CxHxW.npy, or .pt                   [C,H,W]: LSeg's, SAM's
-lerf            level_0.npy, level_1.npy, ... (CLIP), or      [pictures,h,w,C], in the order of the pictures
+lerf            level_0.npy, level_1.npy, ... (CLIP), or      [images,h,w,C], in the order of the images
                 the folder's only .npy (DINO)
 plain           NAME.npy, or .npz with `features`             [h,w,C]
 plain           NAME.npz with `ids` and `codebook`            [H,W] rows (-1: none) of [n,C]
 
-Pickles are never loaded; of .pt files only the one tensor is read (`gsjax.perception.torch_arrays`).
+Pickles are never loaded: a .pt file must hold a single tensor (`gsjax.perception.torch_arrays`).
 """
 
 import zipfile
@@ -29,21 +29,21 @@ from gsjax.perception.torch_arrays import read_torch_array
 LANGSPLAT_LEVELS = ("default", "small", "medium", "large")
 _LAYOUTS = (
     "NAME_s.npy with NAME_f.npy (LangSplat), NAME_fmap_CxHxW.npy or .pt (Feature-3DGS), level_0.npy or "
-    "one .npy of all pictures (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
+    "one .npy of all images (LERF), NAME.npy, or NAME.npz with features, or with ids and codebook"
 )
-# Masks are packed a thousand times, but are small; features are large, but are not packed so.
-_LARGE, _MOST_PACKED = 2**30, 100  # bytes; times
+# Masks compress a thousandfold but are small; features are large but compress far less.
+_LARGE, _MOST_PACKED = 2**30, 100  # bytes; largest compression ratio
 
 
 @dataclass(frozen=True, eq=False)
 class PictureFeatures:
-    """What a file says of a picture: masks with an embedding each, or a feature a pixel.
+    """The features of one image: masks with one embedding each, or a feature per pixel.
 
     Attributes:
         path: the file.
-        ids: rows of the codebook, [H,W]; -1 where it says nothing. None for maps.
-        codebook: [n,C]. None for maps.
-        map: [h,w,C]. None for masks.
+        ids: row of the codebook for each pixel, [H,W]; -1 where there is none. None for maps.
+        codebook: embeddings of the masks, [n,C]. None for maps.
+        map: features of the pixels, [h,w,C]. None for masks.
     """
 
     path: Path
@@ -53,7 +53,7 @@ class PictureFeatures:
 
     @property
     def dimension(self) -> int:
-        """C, numbers of a feature."""
+        """C, the length of a feature."""
         numbers = self.codebook if self.map is None else self.map
         assert numbers is not None
         return numbers.shape[-1]
@@ -62,19 +62,18 @@ class PictureFeatures:
 def read_feature_folder(
     folder: Path, names: Sequence[str], *, which: Sequence[int] | None = None, level: str = "default"
 ) -> list[PictureFeatures]:
-    """The features of pictures by their names, whatever the layout.
+    """Read the features of images by name, in any of the layouts.
 
     Args:
-        folder: has the files.
-        names: of all pictures. What follows the last dot does not count, nor do folders before them where
-            only one picture has that name.
-        which: of them are wanted, and need to be there where each has its file; all unless given.
-        level: of LangSplat's files, which size of objects: default, small, medium, large.
+        folder: the folder of the files.
+        names: names of all images. Suffixes are ignored, and leading folders too where that is unambiguous.
+        which: indices of the images to read; with one file per image, only these have to exist. Default: all.
+        level: size of objects to read from LangSplat's files: default, small, medium or large.
 
     Raises:
-        FileNotFoundError: there is no such folder, or nothing in it for a picture.
-        ValueError: a file is not what its name says, is not finite, has another dimension than the others, or
-            would be that of several pictures.
+        FileNotFoundError: the folder does not exist, or has no features for an image.
+        ValueError: the content of a file does not match its name, is not finite, or has another dimension
+            than the others, or a file matches several images.
     """
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
@@ -82,13 +81,13 @@ def read_feature_folder(
     if level not in LANGSPLAT_LEVELS:
         raise ValueError(f"level: expected one of {', '.join(LANGSPLAT_LEVELS)}, found {level!r}")
     read: list[PictureFeatures] = []
-    for one in _pictures(folder, names, range(len(names)) if which is None else which, level):
-        _check(one)
-        read.append(one)
-        if one.dimension != read[0].dimension:
+    for features in _pictures(folder, names, range(len(names)) if which is None else which, level):
+        _check(features)
+        read.append(features)
+        if features.dimension != read[0].dimension:
             raise ValueError(
-                f"{one.path}: expected features of {read[0].dimension} numbers as in {read[0].path.name}, "
-                f"found {one.dimension}; take files of one encoder"
+                f"{features.path}: expected features of {read[0].dimension} numbers as in "
+                f"{read[0].path.name}, found {features.dimension}; use files of a single encoder"
             )
     return read
 
@@ -96,8 +95,8 @@ def read_feature_folder(
 def _pictures(
     folder: Path, names: Sequence[str], which: Sequence[int], level: str
 ) -> Iterator[PictureFeatures]:
-    """One after the other, each as its file has it."""
-    stack = folder / "level_0.npy"  # LERF's finest, whose crops are the smallest
+    """The features one by one, as stored in the files."""
+    stack = folder / "level_0.npy"  # LERF's finest level, with the smallest crops
     files = [] if stack.is_file() else [_file(folder, PurePosixPath(name), level) for name in names]
     alone = list(folder.glob("*.npy"))
     if stack.is_file():
@@ -113,14 +112,14 @@ def _pictures(
                 listed = ", ".join(there[:6]) or "nothing"
                 listed += f", ... ({len(there)} files)" if len(there) > 6 else ""
                 raise FileNotFoundError(
-                    f"{folder}: expected features of the picture {name}, as {PurePosixPath(name).stem}.npy, "
-                    f"say ({_LAYOUTS}), found {listed}"
+                    f"{folder}: expected features of the image {name}, for example in "
+                    f"{PurePosixPath(name).stem}.npy ({_LAYOUTS}), found {listed}"
                 )
             yield file.read(file.path)
 
 
 class _File(NamedTuple):
-    """A picture's file, and what reads it."""
+    """The file of an image, and its reader."""
 
     path: Path
     read: Callable[[Path], PictureFeatures]
@@ -138,13 +137,13 @@ def _file(folder: Path, name: PurePosixPath, level: str) -> _File | None:
 
 
 def _check_apart(files: Sequence[_File | None], names: Sequence[str]) -> None:
-    """Folders before a name do not count, so one file might pass for those of several cameras."""
+    """Leading folders of a name are ignored, so one file could match the images of several cameras."""
     pictures: dict[Path, str] = {}
     for file, name in zip(files, names, strict=True):
         if file is not None and (other := pictures.setdefault(file.path, name)) != name:
             raise ValueError(
-                f"{file.path}: expected features of one picture, found that {other} and {name} would both "
-                "have these; give each its own file, under its whole name: a folder per camera"
+                f"{file.path}: expected features of one image, found one that {other} and {name} both "
+                "match; give each its own file under its full name, with a folder per camera"
             )
 
 
@@ -155,7 +154,7 @@ def _langsplat(rows: Path, level: str) -> PictureFeatures:
     _expect(table, codebook, 2, "[n,C]")
     place = LANGSPLAT_LEVELS.index(level)
     if len(ids) <= place:
-        raise ValueError(f"{rows}: expected {len(LANGSPLAT_LEVELS)} sizes of objects, found {len(ids)}")
+        raise ValueError(f"{rows}: expected {len(LANGSPLAT_LEVELS)} levels, found {len(ids)}")
     return PictureFeatures(rows, _rows(rows, ids[place], len(codebook)), codebook.astype(np.float32))
 
 
@@ -177,7 +176,7 @@ def _archive(path: Path) -> PictureFeatures:
         wanted = [entries[name] for name in ("features", "ids", "codebook") if name in entries]
         size = sum(entry.file_size for entry in wanted)
         if size > max(_LARGE, _MOST_PACKED * path.stat().st_size):
-            raise ValueError(f"it would unpack to {size} bytes, of {path.stat().st_size}")
+            raise ValueError(f"{path.stat().st_size} bytes that would unpack to {size}")
         arrays = {}
         for entry in wanted:
             with archive.open(entry) as part:
@@ -205,20 +204,20 @@ _READERS = {
 
 
 def _stacked(path: Path, maps: np.ndarray, count: int, which: Sequence[int]) -> Iterator[PictureFeatures]:
-    """LERF's: all pictures in one file, or all that are wanted, as it has those alone that it learns from."""
-    _expect(path, maps, 4, "[pictures,h,w,C]")
+    """LERF's layout: one file of all images, or only of those wanted, since LERF stores training images."""
+    _expect(path, maps, 4, "[images,h,w,C]")
     if len(maps) not in (count, len(which)):
-        some = f", or of the {len(which)} that are wanted" if len(which) < count else ""
+        some = f", or of the {len(which)} that are selected" if len(which) < count else ""
         raise ValueError(
-            f"{path}: expected features of {count} pictures{some}, found {len(maps)}; it goes by order, so "
-            "it is to have those alone that are taken"
+            f"{path}: expected features of {count} images{some}, found {len(maps)}; images are matched by "
+            "order, so the file must hold exactly those that are used"
         )
     for i in which if len(maps) == count else range(len(which)):
         yield PictureFeatures(path, map=np.array(maps[i], np.float32))
 
 
 def _mapped(path: Path) -> np.ndarray:
-    """A stack, of which only those pictures are read that are wanted."""
+    """A memory-mapped stack, so that only the wanted images are read."""
     with _refusing(path, "a plain array"):
         return npy.open_memmap(path, mode="r")
 
@@ -234,13 +233,13 @@ def _load(path: Path) -> np.ndarray:
 
 @contextmanager
 def _refusing(path: Path, expected: str) -> Iterator[None]:
-    """Of a damaged file numpy, zipfile and the unpackers raise what they like."""
+    """Turn every error into a ValueError; numpy, zipfile and the unpackers raise all kinds of them."""
     try:
         yield
     except Exception as error:
-        told = str(error) or type(error).__name__
+        reason = str(error) or type(error).__name__
         raise ValueError(
-            f"{path}: expected {expected}, found a file that cannot be read ({told}); make it again, with "
+            f"{path}: expected {expected}, found a file that cannot be read ({reason}); make it again, with "
             f"{'numpy.savez' if path.suffix == '.npz' else 'numpy.save'}"
         ) from error
 
@@ -251,9 +250,9 @@ def _expect(path: Path, array: np.ndarray, axes: int, shape: str) -> None:
 
 
 def _rows(path: Path, ids: np.ndarray, count: int) -> Int[np.ndarray, "H W"]:
-    """Rows of a codebook of so many, checked before they become int32, where large ones would wrap."""
+    """Rows of a codebook of `count` rows, checked before the cast to int32, which would wrap large ones."""
     if not np.array_equal(ids, np.rint(ids)):
-        raise ValueError(f"{path}: expected rows of the codebook, whole numbers, found others")
+        raise ValueError(f"{path}: expected rows of the codebook as whole numbers, found fractions")
     if not -1 <= ids.min() <= ids.max() < count:
         found = f"{ids.min():.0f} to {ids.max():.0f}"
         raise ValueError(f"{path}: expected rows -1 to {count - 1}, found {found}")
@@ -264,4 +263,4 @@ def _check(features: PictureFeatures) -> None:
     numbers = features.codebook if features.map is None else features.map
     if not np.isfinite(numbers).all():
         wrong = int((~np.isfinite(numbers)).sum())
-        raise ValueError(f"{features.path}: expected numbers, found {wrong} that are NaN or infinite")
+        raise ValueError(f"{features.path}: expected finite numbers, found {wrong} that are NaN or infinite")

@@ -1,7 +1,7 @@
-"""Dense features without weights: what texture and colour there is around each pixel.
+"""Dense features without weights: texture and colour around each pixel.
 
-They tell materials apart, not things, and are named for that. Where the same part of another object is to
-have the same feature, DINOv2 is the one to ask.
+They distinguish materials, not objects, and are named accordingly. For features that agree between the same
+parts of different objects use DINOv2.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from gsjax.perception.pictures import unit_floats
 
 @dataclass(frozen=True)
 class GaborEncoder:
-    """Gabor energies of lightness, their mean and spread over orientations at each frequency, and smoothed
-    CIELAB colour, reduced by PCA over all pixels given together.
+    """Gabor energies of lightness (mean and standard deviation over orientations, for each frequency) and
+    smoothed CIELAB colour, reduced by PCA over all pixels of the given images.
 
-    Each channel is divided by its own standard deviation before, so that colour and texture count alike, and
-    the signs of the axes are fixed: the same pictures always give the same features.
+    Each channel is first divided by its standard deviation, so that colour and texture have equal weight, and
+    the signs of the axes are fixed: the same images always give the same features.
 
     Attributes:
-        num_features: D; fewer where there are no more channels.
-        frequencies: of the waves, cycles a pixel.
-        orientations: how many directions of each.
+        num_features: D; at most the number of channels.
+        frequencies: frequencies of the filters, cycles per pixel.
+        orientations: number of orientations per frequency.
         smoothing: standard deviation of the blur of colours, pixels.
     """
 
@@ -37,13 +37,13 @@ class GaborEncoder:
     smoothing: float = 1.5
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C H W D"]:
-        """Features of pictures that are to be comparable with each other: PCA is taken over all of them.
+        """Features of images that should be comparable with each other: PCA is taken over all of them.
 
         Raises:
-            ValueError: there is no picture.
+            ValueError: there is no image.
         """
         if len(images) == 0:
-            raise ValueError("images: got none, want at least one")
+            raise ValueError("images: expected at least one, found none")
         channels = np.stack([self._channels(image) for image in images])
         flat = channels.reshape(-1, channels.shape[-1])
         flat = (flat - flat.mean(0)) / np.maximum(flat.std(0), 1e-6)
@@ -60,10 +60,10 @@ class GaborEncoder:
             waves = []
             for i in range(self.orientations):
                 kernel = gabor_kernel(frequency, np.pi * i / self.orientations)
-                kernel -= kernel.mean()  # else brightness itself would count as a wave
+                kernel -= kernel.mean()  # removes the response to constant brightness
                 pad = [(size // 2, size // 2) for size in kernel.shape]
                 wave = fftconvolve(np.pad(lab[..., 0], pad, mode="symmetric"), kernel, mode="valid")
                 waves.append(ndimage.gaussian_filter(np.abs(wave), 0.5 / frequency))
-            # Which way stripes run depends on the view; how strong and how directed they are does less.
+            # The direction of stripes depends on the view; their strength and anisotropy depend on it less.
             energies += [np.mean(waves, axis=0), np.std(waves, axis=0)]
         return np.concatenate([smooth, np.stack(energies, axis=-1)], axis=-1)

@@ -12,24 +12,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from gsjax.perception import weights
-from gsjax.perception.masks import Found, labels_of_masks, name_by_size
+from gsjax.perception.masks import Detections, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
 
 
 @dataclass(frozen=True)
 class GroundedSam:
-    """A segmenter by words; from `load_grounded_sam`.
+    """A segmenter prompted by text; from `load_grounded_sam`.
 
     Attributes:
-        detector, detector_processor, segmenter, segmenter_processor: of transformers.
+        detector, detector_processor, segmenter, segmenter_processor: objects of transformers.
         torch: the module.
-        device: where the models are.
-        prompt: what to look for; several things are separated by full stops. The paper of the object-aware
-            tracker asks for "object".
-        min_box_score, min_text_score: weaker boxes, and weaker words for a box, are dropped.
-        max_fraction: a mask with more of the picture is no object (a table, a wall).
-        max_overlap: of two masks with a larger intersection over union the weaker one is dropped.
-        min_pixels: smaller objects are dropped.
+        device: the device that holds the models.
+        prompt: what to look for; separate several things by full stops. "object" is the prompt in
+            Object-Aware Gaussian Splatting for Robotic Manipulation.
+        min_box_score, min_text_score: boxes, and words for a box, with lower scores are dropped.
+        max_fraction: a mask that covers more of the image is not an object (a table, a wall).
+        max_overlap: of two masks with a larger IoU, the one with the lower score is dropped.
+        min_pixels: objects with fewer pixels are dropped.
     """
 
     detector: Any
@@ -51,19 +51,19 @@ class GroundedSam:
         depth: Num[np.ndarray, "..."] | None = None,
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "H W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... from the largest object to the smallest.
+        """Labels of an image: 0 for background, then 1, 2, ... from the largest object to the smallest.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
-            depth, K: not used; they stand here so that all segmenters are called alike.
+            depth, K: not used; present so that all segmenters have the same signature.
         """
         found = self.find(image)
         return name_by_size(
             labels_of_masks(found.masks, found.scores, self.max_fraction, self.max_overlap), self.min_pixels
         )
 
-    def find(self, image: Num[np.ndarray, "H W 3"]) -> Found:
-        """Boxes that fit the prompt, and their masks."""
+    def find(self, image: Num[np.ndarray, "H W 3"]) -> Detections:
+        """Boxes that match the prompt, and their masks."""
         image, size = to_bytes(image), image.shape[:2]
         text = self.prompt.strip().lower().rstrip(".") + "."
         inputs = self.detector_processor(images=image, text=text, return_tensors="pt").to(self.device)
@@ -78,13 +78,13 @@ class GroundedSam:
         )[0]
         boxes, scores = found["boxes"].cpu().numpy(), found["scores"].cpu().numpy()
         if len(boxes) == 0:
-            return Found(boxes, scores, np.zeros((0, *size), bool))
-        return Found(boxes, scores, self._masks(image, boxes))
+            return Detections(boxes, scores, np.zeros((0, *size), bool))
+        return Detections(boxes, scores, self._masks(image, boxes))
 
     def _masks(
         self, image: Num[np.ndarray, "H W 3"], boxes: Float[np.ndarray, "n 4"]
     ) -> Bool[np.ndarray, "n H W"]:
-        """One mask a box; the box says enough, so SAM is asked for its single best answer."""
+        """One mask per box; a box is unambiguous, so SAM is asked for a single mask."""
         inputs = self.segmenter_processor(image, input_boxes=[boxes.tolist()], return_tensors="pt")
         with self.torch.inference_mode():
             outputs = self.segmenter(
@@ -106,12 +106,12 @@ def load_grounded_sam(
     Args:
         detector: the folder of Grounding DINO.
         segmenter: the folder of SAM.
-        device: of torch, "cpu" or "cuda".
+        device: device of torch, "cpu" or "cuda".
         prompt: what to look for.
 
     Raises:
         FileNotFoundError: a folder or a file of it is missing.
-        ValueError: a folder leads to weights that are a pickle.
+        ValueError: a folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
     files = (weights.PROCESSOR, "tokenizer.json|vocab.txt")

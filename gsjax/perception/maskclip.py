@@ -1,9 +1,9 @@
-"""MaskCLIP (Zhou et al., "Extract Free Dense Labels from CLIP", ECCV 2022): CLIP's vector of each patch, in
-the space of its texts, without training.
+"""MaskCLIP (Zhou et al., "Extract Free Dense Labels from CLIP", ECCV 2022): a CLIP vector for each patch, in
+the space of its text, without training.
 
-CLIP's last layer attends from all patches to one; what it would mix, the values, say what each patch is. So
-they take the place of the layer's output, as in the code of F3RM and FeatUp: values, through the layer's own
-projection, the last norm and the projection to the texts' space, with no residual and no MLP.
+CLIP's last layer pools the values of all patches into one token; these values describe the patches. So they
+replace the output of the layer, as in the code of F3RM and FeatUp: the values pass through the layer's own
+output projection, the final norm and the projection to the text space, with no residual and no MLP.
 
 Needs the extra `foundation`; weights are those of CLIP, local files.
 """
@@ -20,12 +20,12 @@ from gsjax.perception.pictures import in_patches
 
 @dataclass(frozen=True)
 class MaskClipEncoder:
-    """Unit vectors of patches and of texts; from `load_maskclip`.
+    """Unit vectors of patches and of text; from `load_maskclip`.
 
     Attributes:
-        clip: the model, for texts too.
-        resolution: pixels of the shorter side that the model sees, rounded to whole patches. More see more,
-            as far as position embeddings can be stretched.
+        clip: the model, also used for text.
+        resolution: shorter side of the model's input, pixels, rounded to whole patches. Larger resolves more,
+            as far as the interpolated position embeddings allow.
     """
 
     clip: ClipEncoder
@@ -33,11 +33,11 @@ class MaskClipEncoder:
 
     @property
     def min_score(self) -> float:
-        """A query whose best cosine is less means nothing that is seen; as of `ClipEncoder`."""
+        """A query whose best cosine is lower matches nothing in view; that of `ClipEncoder`."""
         return self.clip.min_score
 
     def __call__(self, images: Num[np.ndarray, "C H W 3"]) -> Float[np.ndarray, "C h w D"]:
-        """A vector a patch of RGB pictures, uint8 or floats 0 to 1. The whole picture is seen."""
+        """A vector per patch of RGB images, uint8 or floats 0 to 1. Images are not cropped."""
         vision, torch = self.clip.model.vision_model, self.clip.torch
         patch = self.clip.model.config.vision_config.patch_size
         pixels, rows, columns = in_patches(images, self.clip.processor, patch, self.resolution)
@@ -68,6 +68,6 @@ def load_maskclip(path: str | os.PathLike, device: str = "cpu", resolution: int 
 
     Args:
         path, device: as for `gsjax.perception.clip.load_clip`, with its errors.
-        resolution: pixels of the shorter side that the model is to see.
+        resolution: shorter side of the model's input, pixels.
     """
     return MaskClipEncoder(load_clip(path, device), resolution)

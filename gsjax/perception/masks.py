@@ -1,4 +1,4 @@
-"""Masks that may overlap become one label picture, whose labels count objects from the largest on."""
+"""Combine overlapping masks into one label image, with labels ordered by size."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 
-class Found(NamedTuple):
-    """What a model found, before it becomes labels."""
+class Detections(NamedTuple):
+    """Output of a detector or segmenter, before it is combined into labels."""
 
     boxes: Float[np.ndarray, "n 4"]  # x0, y0, x1, y1 in pixels
-    scores: Float[np.ndarray, "n"]  # of the boxes, 0 to 1
+    scores: Float[np.ndarray, "n"]  # confidence of each box, 0 to 1
     masks: Bool[np.ndarray, "n H W"]
 
 
@@ -20,11 +20,11 @@ def labels_of_masks(
     max_fraction: float = 1.0,
     max_overlap: float = 1.0,
 ) -> Int[np.ndarray, "H W"]:
-    """One label image from masks that may overlap: 0 background, 1 + the row of the mask elsewhere.
+    """One label image from masks that may overlap: 0 for background, 1 + the row of the mask elsewhere.
 
-    A mask with more than `max_fraction` of the picture is left out, and so is one that overlaps a mask of a
-    higher score by more than `max_overlap` (intersection over union). Where masks overlap the smaller is on
-    top: a thing lies on its tray.
+    A mask that covers more than `max_fraction` of the image is left out, and so is one that overlaps a mask
+    of higher score by more than `max_overlap` (intersection over union). Where masks overlap, the smaller one
+    is on top, as an object is on its tray.
     """
     kept: list[int] = []
     for row in np.argsort(-scores, kind="stable"):
@@ -41,16 +41,17 @@ def labels_of_masks(
 def name_by_size(
     labels: Int[np.ndarray, "H W"], min_pixels: int = 1, background: int = 0
 ) -> Int[np.ndarray, "H W"]:
-    """Labels renamed 1, 2, ... from the largest to the smallest; those under `min_pixels` become 0.
+    """Renumber labels 1, 2, ... from the largest to the smallest; those with fewer than `min_pixels` become
+    0.
 
     Args:
         labels: any integers.
-        min_pixels: of what keeps a name.
-        background: the label that becomes 0, however large it is.
+        min_pixels: smallest area of a label that is kept, pixels.
+        background: the label that becomes 0, whatever its size.
     """
     names, inverse, counts = np.unique(labels, return_inverse=True, return_counts=True)
     kept = np.flatnonzero((names != background) & (counts >= min_pixels))
     renamed = np.zeros(len(names), np.int32)
-    # A stable order, so that components of equal size keep the order in which the picture has them.
+    # A stable sort, so that components of equal size keep their order in the image.
     renamed[kept[np.argsort(-counts[kept], kind="stable")]] = np.arange(1, len(kept) + 1)
     return renamed[inverse].reshape(labels.shape)

@@ -1,7 +1,8 @@
-"""Points of a scene from posed photographs alone: features that photographs share, triangulated.
+"""Points of a scene from posed photographs alone, by triangulating matched features.
 
-SIFT (Lowe 2004, OpenCV's) in each photograph; each is matched with those that look at the scene from nearest;
-what lies off the epipolar line that the poses tell, or does not come back to its pixels, is no match.
+SIFT features (Lowe 2004, OpenCV's implementation) are extracted from each photograph and matched with those
+of the nearest views. Matches that lie off the epipolar line of the known poses, or do not reproject to their
+pixels, are rejected.
 """
 
 from collections.abc import Sequence
@@ -13,24 +14,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-_FEATURES = 4_000  # of a photograph
-_LARGEST = 1_000  # pixels, the longer side of what is matched; larger photographs are shrunk for it
-_CONTRAST = 0.01  # of a feature; OpenCV's 0.04 leaves out what is plain
-_NEIGHBORS = 6  # photographs that one is matched with
-_RATIO = 0.85  # of the distances of the best match and the next (Lowe 2004, section 7.1)
+_FEATURES = 4_000  # per photograph
+_LARGEST = 1_000  # longer side for matching, pixels; larger photographs are downscaled
+_CONTRAST = 0.01  # threshold of a feature; OpenCV's 0.04 rejects weakly textured surfaces
+_NEIGHBORS = 6  # photographs with which each is matched
+_RATIO = 0.85  # of the distances of the best and the second-best match (Lowe 2004, section 7.1)
 _LEAST_PARALLAX = np.deg2rad(1.0)
-_MOST_TURNED = np.deg2rad(60.0)  # between two photographs; SIFT finds little again beyond
-_MOST_OFF = 1.5  # pixels, from the epipolar line and from where a point is seen again
-_NEAREST = 4  # points by which a pixel between them is placed
+_MOST_TURNED = np.deg2rad(60.0)  # between two photographs; SIFT matches little beyond
+_MOST_OFF = 1.5  # pixels, from the epipolar line and of the reprojection
+_NEAREST = 4  # points from which the depth of a pixel is interpolated
 
 
 class Matched(NamedTuple):
     """Points that at least two photographs show.
 
     Attributes:
-        points: metres, or what the poses are in.
+        points: positions in the unit of the poses.
         colors: RGB, 0 to 1.
-        shown: of each photograph, rows of the points that were found in it.
+        shown: for each photograph, the rows of the points found in it.
     """
 
     points: Float[np.ndarray, "m 3"]
@@ -49,14 +50,13 @@ def match_points(
     Ks: Float[np.ndarray, "n 3 3"],
     masks: Sequence[Bool[np.ndarray, "..."] | None] | None = None,
 ) -> Matched:
-    """Points on what photographs of a scene that stands still share. On the host; a fifth of a second for a
-    photograph of 270x480.
+    """Triangulated points of a static scene. On the host; takes 0.2 s per photograph of 270x480 pixels.
 
     Args:
         pictures: RGB, [H,W,3] each, without lens distortion.
         viewmats: world to camera, OpenCV axes.
-        Ks: intrinsics in pixels, centres at +0.5.
-        masks: which pixels count, [H,W] each; all unless given.
+        Ks: intrinsics in pixels, pixel centres at +0.5.
+        masks: pixels to use, [H,W] each; default: all.
     """
     counted = masks or [None] * len(pictures)
     small = [_shrunk(*each) for each in zip(pictures, Ks, counted, strict=True)]
@@ -87,15 +87,14 @@ def filled_up(
     count: int,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-    """`count` points, and their colours: some of those that were matched where these are more, else all of
-    them and others between them, pixels drawn at random, as far away as the points that the photograph shows
-    near them.
+    """`count` points with their colours: a random subset of the matched points if there are more, else all of
+    them plus random pixels, at a depth interpolated from the matched points nearby in the photograph.
 
     Args:
-        matched: the points between which others lie.
-        pictures, viewmats, Ks: of the photographs, [H,W,3] each, as for `match_points`.
-        count: how many points are wanted.
-        seed: of what is drawn at random.
+        matched: the matched points.
+        pictures, viewmats, Ks: the photographs, [H,W,3] each, and their cameras, as for `match_points`.
+        count: number of points to return; fewer only if no photograph shows enough matched points.
+        seed: seed of the random draws.
     """
     rng = np.random.default_rng(seed)
     if len(matched.points) > count:
@@ -112,7 +111,7 @@ def filled_up(
         places = rng.uniform(0, 1, (number, 2)) * (picture.shape[1], picture.shape[0])
         far, near = cKDTree(seen).query(places, k=_NEAREST)
         share = 1 / np.maximum(far, 1.0) ** 2
-        depths = share.sum(1) / np.sum(share / local[near, 2], axis=1)  # a plane is one in disparity
+        depths = share.sum(1) / np.sum(share / local[near, 2], axis=1)  # linear in disparity, as a plane is
         rays = np.concatenate([places, np.ones((number, 1))], axis=1) @ np.linalg.inv(K).T
         points.append((rays * depths[:, None] - shift) @ rotation)
         column, row = places.astype(int).T
@@ -123,7 +122,7 @@ def filled_up(
 def _shrunk(
     picture: UInt8[np.ndarray, "H W 3"], K: Float[np.ndarray, "3 3"], mask: Bool[np.ndarray, "H W"] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """A photograph as it is matched, its intrinsics, and which pixels count."""
+    """The photograph, its intrinsics and its mask at the resolution for matching."""
     height, width = picture.shape[:2]
     scale = min(1.0, _LARGEST / max(height, width))
     size = max(1, round(scale * width)), max(1, round(scale * height))
@@ -136,20 +135,21 @@ def _shrunk(
 
 
 def _features(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> _Features:
-    # Without `enable_precise_upscale`, OpenCV finds everything a quarter of a pixel to the lower right.
+    # Without `enable_precise_upscale`, OpenCV's positions are a quarter of a pixel too far to the lower
+    # right.
     sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     where = None if mask is None else mask.astype(np.uint8)
     keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), where)
     if descriptors is None:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     places = np.array([keypoint.pt for keypoint in keypoints]) + 0.5
-    # Their roots compare better (RootSIFT, Arandjelovic and Zisserman 2012).
+    # Square roots of descriptors match better (RootSIFT, Arandjelovic and Zisserman 2012).
     shares = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
     return _Features(places, np.sqrt(shares).astype(np.float32))
 
 
 def _pairs(viewmats: Float[np.ndarray, "n 4 4"]) -> list[tuple[int, int]]:
-    """Each view with those that are least turned against it, of those that stand elsewhere."""
+    """Pairs of each view with its neighbours: those at other places with the smallest relative rotation."""
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
@@ -164,7 +164,7 @@ def _pairs(viewmats: Float[np.ndarray, "n 4 4"]) -> list[tuple[int, int]]:
 
 
 def _matches(one: _Features, other: _Features) -> Int[np.ndarray, "p 2"]:
-    """Rows of features that are each other's best match, clearly."""
+    """Rows of features that are mutual best matches and pass the ratio test."""
     if min(len(one.places), len(other.places)) < 2:
         return np.zeros((0, 2), int)
     alike = one.descriptors @ other.descriptors.T
@@ -183,8 +183,8 @@ def _triangulated(
     viewmats: Float[np.ndarray, "2 4 4"],
     Ks: Float[np.ndarray, "2 3 3"],
 ) -> tuple[Float[np.ndarray, "p 3"], np.ndarray]:
-    """Where pairs of pixels meet, and which of them do: before both cameras, under an angle that tells, and
-    seen again where they were found."""
+    """Triangulated points of pairs of pixels, and which are sound: in front of both cameras, with enough
+    parallax, and with a small reprojection error."""
     if not len(here):
         return np.zeros((0, 3)), np.zeros(0, bool)
     projections = Ks @ viewmats[:, :3]

@@ -9,7 +9,7 @@ from jaxtyping import Float, Num
 
 from gsjax.perception.pictures import to_bytes
 
-_LEAST_SIDES = (8, 12)  # pixels of the shorter and the longer side; a patch has 8 by 8
+_LEAST_SIDES = (8, 12)  # shorter and longer side, pixels; a patch has 8 by 8
 _PRESETS = {
     "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
@@ -19,13 +19,13 @@ _PRESETS = {
 
 @dataclass(frozen=True)
 class DisFlow:
-    """DIS, as OpenCV has it: patches searched from coarse to fine, then a variational refinement.
+    """DIS, OpenCV's implementation: a coarse-to-fine patch search, then variational refinement.
 
-    It follows what is textured and moves by no more than about a tenth of the picture's width. Every pixel
-    has a flow, also what the other picture does not show: `gsjax.geometry.flow.seen_in_both` tells which.
+    It handles textured surfaces that move by up to about a tenth of the image's width. Every pixel has a
+    flow, even if it is not visible in the other image: see `gsjax.geometry.flow.seen_in_both`.
 
     Attributes:
-        preset: how finely it searches; "medium" is the slowest.
+        preset: quality of the search; "medium" is the slowest.
     """
 
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
@@ -33,13 +33,13 @@ class DisFlow:
     def __call__(
         self, image: Num[np.ndarray, "..."], other: Num[np.ndarray, "..."]
     ) -> Float[np.ndarray, "H W 2"]:
-        """Pixels (x, y) that each pixel of a picture moves until another one.
+        """Displacement (x, y) of each pixel of `image` to `other`, pixels.
 
         Args:
             image, other: [H, W, 3], RGB, uint8 or floats 0 to 1.
 
         Raises:
-            ValueError: the pictures differ in size, are not RGB, or are too small.
+            ValueError: the images differ in size, are not RGB, or are too small.
         """
         if image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"image: expected shape [H, W, 3], RGB, found {image.shape}")

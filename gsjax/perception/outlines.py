@@ -1,5 +1,5 @@
-"""Outlines of masks put where a picture has an edge: a segmenter's are off by pixels, and each view's by
-others."""
+"""Snap the outlines of masks to edges of the image. A segmenter's outlines are off by a few pixels,
+differently in each view."""
 
 import cv2
 import numpy as np
@@ -12,17 +12,16 @@ from skimage.segmentation import watershed
 def snap_outlines(
     labels: Integer[np.ndarray, "h w"], image: UInt8[np.ndarray, "height width 3"], reach: int = 2
 ) -> Int[np.ndarray, "h w"]:
-    """Labels whose outlines lie on the picture's edges, where there are any within reach.
+    """Labels whose outlines lie on edges of the image, where there are any within reach.
 
-    What of a label is further than `reach` from its outline stays. What is nearer goes to the label whose
-    water reaches it first, rising over the picture's gradient (CIELAB, Sobel): a watershed from markers
-    (Meyer 1994, "Topographic distance and watershed lines"). A piece that is too thin to keep a core at this
-    distance is eroded by less.
+    Pixels farther than `reach` from the outline of their label keep it. The others are assigned by a
+    watershed of the image's gradient (CIELAB, Sobel), with these cores as markers (Meyer 1994, "Topographic
+    distance and watershed lines"). A piece too thin to keep a core at this distance is eroded by less.
 
     Args:
-        labels: negative ones, of what nobody knows, are labels like others.
+        labels: integer labels; a negative label (unknown) is treated like any other.
         image: RGB.
-        reach: pixels; 0 gives the labels back.
+        reach: largest shift of an outline, pixels; 0 returns the labels unchanged.
 
     Raises:
         ValueError: shapes differ, or the reach is negative.
@@ -34,7 +33,7 @@ def snap_outlines(
     if reach == 0:
         return labels.astype(np.int64)
     known, places = np.unique(labels, return_inverse=True)
-    places = places.reshape(labels.shape).astype(np.int32) + 1  # 0 is where there is no marker
+    places = places.reshape(labels.shape).astype(np.int32) + 1  # 0 marks pixels without a marker
     markers = np.zeros(labels.shape, np.int32)
     for place in range(1, len(known) + 1):
         markers[_cores(places == place, reach)] = place
@@ -42,7 +41,7 @@ def snap_outlines(
 
 
 def _cores(mask: np.ndarray, reach: int) -> np.ndarray:
-    """A mask eroded piece by piece, each by as much of `reach` as leaves something of it."""
+    """A mask eroded piece by piece, each by the largest radius up to `reach` that leaves a core."""
     cores, left = np.zeros_like(mask), mask
     for radius in range(reach, 0, -1):
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)

@@ -1,4 +1,4 @@
-"""Small things that all who look at pictures need."""
+"""Helpers for images, shared by the perception modules."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, Num, UInt8
 
 
 def unit_floats(image: Num[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Colours as floats 0 to 1; integers are taken as bytes, NaN as black."""
+    """Colours as floats 0 to 1; integers are taken as bytes, and NaN becomes black."""
     image = np.asarray(image)
     scale = 255.0 if np.issubdtype(image.dtype, np.integer) else 1.0
     return np.clip(np.nan_to_num(image / scale), 0.0, 1.0)
@@ -22,20 +22,19 @@ def to_bytes(image: Num[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
 def square_crop(
     image: Num[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], margin: float = 0.15
 ) -> Num[np.ndarray, "side side 3"]:
-    """The smallest square around a mask, `margin` of its side wider on all sides; what sticks out of the
-    picture repeats its border.
+    """The smallest square crop around a mask, plus a margin; outside the image, its border is repeated.
 
     Args:
-        image: which the mask is of.
-        mask: True on what is cut out.
-        margin: share of the square's side.
+        image: the image to crop.
+        mask: True on the object.
+        margin: margin on each side, as a fraction of the square's side.
 
     Raises:
         ValueError: the mask is empty.
     """
     rows, columns = np.nonzero(mask)
     if len(rows) == 0:
-        raise ValueError("mask: no pixel is set, so there is nothing to crop")
+        raise ValueError("mask: expected at least one pixel that is set, found none")
     low = np.array([rows.min(), columns.min()])
     high = np.array([rows.max(), columns.max()]) + 1
     side = int(np.ceil((high - low).max() * (1 + 2 * margin)))
@@ -50,17 +49,17 @@ def square_crop(
 def in_patches(
     images: Num[np.ndarray, "C H W 3"], processor: Any, patch: int, resolution: int
 ) -> tuple[Any, int, int]:
-    """Pictures as a transformer that cuts them into patches takes them, whole: nothing is cropped.
+    """Input of a vision transformer for whole images, resized to a whole number of patches without cropping.
 
     Args:
         images: RGB, uint8 or floats 0 to 1.
-        processor: of transformers, which resizes and normalises.
-        patch: pixels a side.
-        resolution: pixels of the shorter side, rounded to whole patches.
+        processor: image processor of transformers, which resizes and normalises.
+        patch: side of a patch, pixels.
+        resolution: shorter side after resizing, pixels, rounded to whole patches.
 
     Returns:
-        The torch tensor of pixels [C,3,rows * patch,columns * patch], and how many rows and columns of
-        patches each picture has.
+        The torch tensor of pixels [C,3,rows * patch,columns * patch], and the numbers of rows and columns of
+        patches per image.
     """
     scale = resolution / min(images.shape[1:3])
     rows, columns = (max(1, round(side * scale / patch)) for side in images.shape[1:3])

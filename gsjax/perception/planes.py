@@ -1,7 +1,7 @@
-"""Planes in a depth picture, one after the other by RANSAC (Fischler and Bolles 1981).
+"""Planes in a depth image, found one after the other by RANSAC (Fischler and Bolles 1981).
 
-A hypothesis is one pixel and the normal there, and a vote needs the normal to agree too: an infinite plane
-slices whatever stands across it, and by distance alone those slices would count as plane.
+A hypothesis is a pixel and its normal, and the normal of an inlier has to agree too: an infinite plane cuts
+through any object that crosses it, and by distance alone those cuts would count as plane.
 """
 
 from dataclasses import dataclass
@@ -11,10 +11,12 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from skimage.measure import label
 
-_SAMPLES = 6000  # pixels that vote on hypotheses; enough to rank planes of a few per cent
+_SAMPLES = (
+    6000  # pixels that vote on hypotheses; enough to rank planes that cover a few per cent of the image
+)
 _HYPOTHESES = 400
 _MIN_COSINE = np.cos(np.radians(25))  # between a pixel's normal, which is noisy, and its plane's
-_EDGE = 4  # pixels: so near to an edge a normal mixes two surfaces and cannot vote
+_EDGE = 4  # pixels; closer to an edge, a normal mixes two surfaces and cannot vote
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +24,9 @@ class Plane:
     """The plane normal . x = offset in the camera's frame, and the pixels that lie on it.
 
     Attributes:
-        normal: unit, towards the camera.
+        normal: unit normal, towards the camera.
         offset: metres; at most 0, as the camera is at the origin on the side of the normal.
-        pixels: those of the plane.
+        pixels: the pixels of the plane.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -37,12 +39,12 @@ class Plane:
         valid: Bool[np.ndarray, "H W"],
         tolerance: Float[np.ndarray, "H W"],
     ) -> float:
-        """The part of the valid points that lies clearly (three tolerances) beyond the plane.
+        """The fraction of the valid points that lies clearly (by three tolerances) behind the plane.
 
         Args:
-            points: of all pixels, in the camera's frame, metres.
-            valid: where there is depth.
-            tolerance: how far from a plane its own pixels may lie, metres.
+            points: points of all pixels, in the camera's frame, metres.
+            valid: pixels with depth.
+            tolerance: largest distance of a plane's own pixels from it, metres.
         """
         return float(np.mean((points @ self.normal - self.offset < -3 * tolerance)[valid]))
 
@@ -52,13 +54,13 @@ class Plane:
         valid: Bool[np.ndarray, "H W"],
         tolerance: Float[np.ndarray, "H W"],
     ) -> float:
-        """The part of the pixels' rim at which the picture goes up from the plane: high on the ground that
-        things stand on or in, low on the top of a thing.
+        """The fraction of the rim around the plane's pixels that rises above the plane: high for a surface on
+        which or in which objects stand, low for the top of an object.
 
         Args:
-            points: of all pixels, in the camera's frame, metres.
-            valid: where there is depth.
-            tolerance: above which a pixel rises, metres.
+            points: points of all pixels, in the camera's frame, metres.
+            valid: pixels with depth.
+            tolerance: height above the plane at which a pixel counts as rising, metres.
         """
         rim = ndimage.binary_dilation(self.pixels, iterations=3) & ~self.pixels & valid
         rising = points @ self.normal - self.offset > tolerance
@@ -66,7 +68,7 @@ class Plane:
 
 
 def surface_normals(points: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Unit normals towards the camera, from differences of blurred points; zero where there is no surface."""
+    """Unit normals towards the camera, from differences of blurred points; zero where they are degenerate."""
     blurred = ndimage.uniform_filter(points, (5, 5, 1), mode="nearest")
     across, down = np.gradient(blurred, axis=1), np.gradient(blurred, axis=0)
     normals = np.cross(down, across)
@@ -85,21 +87,21 @@ def find_planes(
     max_planes: int,
     rng: np.random.Generator,
 ) -> list[Plane]:
-    """Planes from the largest on, each among the pixels that the ones before left over.
+    """Planes in descending order of size, each found among the pixels left over by the ones before.
 
     Args:
-        points: in the camera's frame, metres.
-        normals: of their surfaces (`surface_normals`).
-        valid: where there is depth.
-        tolerance: how far from a plane a pixel may lie, metres.
-        min_pixels: of a plane; the search ends at the first that has fewer.
-        max_planes: the most planes that are looked for.
+        points: points of all pixels, in the camera's frame, metres.
+        normals: normals of the points (`surface_normals`).
+        valid: pixels with depth.
+        tolerance: largest distance of a pixel from its plane, metres.
+        min_pixels: smallest size of a plane; the search ends at the first smaller one.
+        max_planes: largest number of planes.
         rng: draws the hypotheses.
     """
     planes, free = [], valid.copy()
     while len(planes) < max_planes and free.sum() >= max(min_pixels, 3):
         normal, offset = _best_hypothesis(points[free], normals[free], tolerance[free], rng)
-        for _ in range(3):  # fitted to all its pixels, it takes in some more
+        for _ in range(3):  # each fit to all inliers adds some more
             near = free & (np.abs(points @ normal - offset) <= tolerance)
             agreeing = near & (normals @ normal > _MIN_COSINE)
             if agreeing.sum() < 3:
@@ -123,16 +125,16 @@ def find_levels(
     min_pixels: int,
     max_levels: int = 20,
 ) -> list[Plane]:
-    """Connected flat patches whose normal is `up`, by the peaks of a histogram of heights.
+    """Connected flat patches whose normal is `up`, found as peaks of a histogram of heights.
 
-    Knowing the direction makes much smaller planes certain than RANSAC could find.
+    Because the direction is known, patches can be much smaller than the planes that RANSAC finds reliably.
 
     Args:
         points, normals, tolerance: as in `find_planes`.
-        free: the pixels to look at.
-        up: unit.
-        min_pixels: of a patch.
-        max_levels: the most heights that are looked at.
+        free: the pixels to search.
+        up: unit vector.
+        min_pixels: smallest size of a patch.
+        max_levels: largest number of heights to examine.
     """
     heights, free, patches = points @ up, free.copy(), []
     agreeing = free & (normals @ up > _MIN_COSINE)
@@ -156,10 +158,10 @@ def find_levels(
 def _best_hypothesis(
     points: np.ndarray, normals: np.ndarray, tolerance: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, float]:
-    """The tangent plane of the pixel for which most others vote."""
+    """The tangent plane with the most votes."""
     chosen = rng.choice(len(points), min(_SAMPLES, len(points)), replace=False)
     points, normals, tolerance = points[chosen], normals[chosen], tolerance[chosen]
-    tried = slice(0, _HYPOTHESES)  # `chosen` is in random order already
+    tried = slice(0, _HYPOTHESES)  # `chosen` is already in random order
     offsets = np.sum(points[tried] * normals[tried], axis=1)
     near = np.abs(normals[tried] @ points.T - offsets[:, None]) <= tolerance
     votes = np.sum(near & (normals[tried] @ normals.T > _MIN_COSINE), axis=1)

@@ -1,4 +1,4 @@
-"""Labels of one picture carried to those beside it, without weights: by optical flow and edges of colour."""
+"""Propagation of labels between neighbouring images, without weights: by optical flow and colour edges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,23 +19,23 @@ _UNKNOWN = -1
 
 @dataclass(frozen=True)
 class FlowPropagator:
-    """Labels go from each picture to the next with the optical flow, and end where colour does.
+    """Propagates labels from each image to the next along the optical flow, up to edges of colour.
 
-    1. A pixel takes the label of the place it came from, if the way there and back ends where it began, the
-       flow has no edge there, and the colour is about the same.
-    2. The others, along the outlines of what moves, and what was hidden or outside before, are flooded from
-       those that took one, over the weakest edges of colour first (watershed). So outlines do not fray, and
-       regions of like colour are filled.
-    3. What is too far from all that took one is background.
+    1. A pixel takes the label of its origin if forward and backward flow agree, the flow has no edge there,
+       and the colour is about the same.
+    2. The remaining pixels, along outlines of moving objects and in regions that were hidden or outside
+       before, are filled by a watershed from the labelled ones, across the weakest colour edges first. This
+       keeps outlines clean, and fills regions of similar colour.
+    3. Pixels too far from any labelled pixel become background.
 
-    So what is not seen for one picture is lost from there on, and neighbours must be alike: frames of a
-    video, or cameras a few degrees apart. It remembers nothing of what an object looked like.
+    An object that is hidden in one image is lost from then on, and neighbours have to be similar: frames of a
+    video, or cameras a few degrees apart. There is no memory of an object's appearance.
 
     Attributes:
         flow: any `gsjax.methods.protocols.OpticalFlow`.
-        max_color_change: up to this difference of CIELAB, both blurred by a pixel, a colour is the same.
-        smoothing: standard deviation of the blur before edges of colour are measured, pixels.
-        reach: how far labels flood, pixels.
+        max_color_change: largest CIELAB distance of equal colours, after a blur by one pixel.
+        smoothing: standard deviation of the blur before colour edges are measured, pixels.
+        reach: largest distance to which labels are filled, pixels.
     """
 
     flow: Callable[[np.ndarray, np.ndarray], np.ndarray] = field(default_factory=DisFlow)
@@ -46,38 +46,39 @@ class FlowPropagator:
     def __call__(
         self, images: Num[np.ndarray, "V H W 3"], labels: Int[np.ndarray, "rows columns"]
     ) -> Int[np.ndarray, "V H W"]:
-        """Labels of all pictures; those of the first are as given.
+        """Labels of all images; those of the first are returned unchanged.
 
         Args:
-            images: RGB, uint8 or floats 0 to 1; neighbours are alike.
-            labels: of the first; 0 background.
+            images: RGB, uint8 or floats 0 to 1; neighbours should be similar.
+            labels: labels of the first image, 0 for background.
 
         Raises:
-            ValueError: the labels are not of the pictures' size, or the pictures are too small for the flow.
+            ValueError: labels and images differ in size, or the images are too small for the flow.
         """
         if labels.shape != images.shape[1:3]:
-            raise ValueError(f"labels: expected shape {images.shape[1:3]} as images, found {labels.shape}")
+            raise ValueError(f"labels: expected shape {images.shape[1:3]} like images, found {labels.shape}")
         found, lab = [labels], rgb2lab(unit_floats(images[0]))
         for before, image in pairwise(images):
             lab_before, lab = lab, rgb2lab(unit_floats(image))
-            came = self.flow(image, before)
-            certain = seen_in_both(came, self.flow(before, image))
-            found.append(self._flooded(self._carried(found[-1], came, certain, lab_before, lab), lab))
+            backward = self.flow(image, before)
+            certain = seen_in_both(backward, self.flow(before, image))
+            carried = self._carried(found[-1], backward, certain, lab_before, lab)
+            found.append(self._flooded(carried, lab))
         return np.stack(found)
 
     def _carried(
         self,
         labels: Int[np.ndarray, "H W"],
-        came: Float[np.ndarray, "H W 2"],
+        backward: Float[np.ndarray, "H W 2"],
         certain: Bool[np.ndarray, "H W"],
         lab_before: Float[np.ndarray, "H W 3"],
         lab: Float[np.ndarray, "H W 3"],
     ) -> Int[np.ndarray, "H W"]:
-        """The label of the place where each pixel was before, _UNKNOWN where that is not certain."""
+        """The label of each pixel's origin in the image before, _UNKNOWN where that is uncertain."""
         rows, columns = np.nonzero(certain)
-        steps = np.rint(came[certain]).astype(int)
+        steps = np.rint(backward[certain]).astype(int)
         origins = rows + steps[:, 1], columns + steps[:, 0]
-        # Where flow fails, it often says that nothing moved, and the way back says so too.
+        # Where flow fails, it is often zero in both directions, and therefore consistent.
         was, now = (ndimage.gaussian_filter(colors, (1, 1, 0)) for colors in (lab_before, lab))
         alike = np.linalg.norm(now[certain] - was[origins], axis=-1) <= self.max_color_change
         carried = np.full_like(labels, _UNKNOWN)
@@ -87,11 +88,11 @@ class FlowPropagator:
     def _flooded(
         self, carried: Int[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
     ) -> Int[np.ndarray, "H W"]:
-        """Labels of all pixels."""
+        """Labels of all pixels, the unknown ones filled from the others."""
         if (carried == _UNKNOWN).all():
             return np.zeros_like(carried)
         edges = [ndimage.gaussian_gradient_magnitude(lab[..., i], self.smoothing) for i in range(3)]
-        # The watershed takes 0 for what is to be flooded.
+        # The watershed fills pixels whose marker is 0.
         flooded = watershed(np.linalg.norm(edges, axis=0), carried - _UNKNOWN) + _UNKNOWN
         distance = ndimage.distance_transform_edt(carried == _UNKNOWN)
         return np.where(distance > self.reach, 0, flooded).astype(carried.dtype)

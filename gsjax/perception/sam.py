@@ -1,5 +1,5 @@
-"""SAM (Kirillov et al., 2023) through transformers: masks of everything in a picture, or of what was clicked
-on. Weights are local files.
+"""SAM (Kirillov et al., 2023) through transformers: masks of everything in an image, or of clicked objects.
+Weights are local files.
 
 Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
 """
@@ -14,35 +14,36 @@ from jaxtyping import Bool, Float, Int, Num, UInt8
 from PIL import Image
 
 from gsjax.perception import weights
-from gsjax.perception.masks import Found, labels_of_masks, name_by_size
+from gsjax.perception.masks import Detections, labels_of_masks, name_by_size
 from gsjax.perception.pictures import to_bytes
 
 
 @dataclass(frozen=True)
 class SamSegmenter:
-    """A segmenter that knows no words; from `load_sam`.
+    """A segmenter without a text prompt; from `load_sam`.
 
-    It segments everything: SAM is asked at a grid of points, and what it is sure of is kept. Any picture will
-    do. On the difference of two frames, as in MotionSplicer, it finds what moved between them.
+    By default it segments everything: SAM is prompted with a grid of points, and confident masks are kept.
+    The input can be any image; on the difference of two frames, as in MotionSplicer, it finds what moved
+    between them.
 
-    With clicks it finds what they are on instead, one mask for each of their labels:
+    With clicks it segments the clicked objects instead, one mask for each label of the clicks:
 
         dataclasses.replace(segmenter, clicks=((120, 80, 1), (310, 95, 2), (330, 240, 2)))(image)
 
     Attributes:
-        pipeline: "mask-generation" of transformers, with the model and its image processor.
-        processor: of transformers, for clicks.
+        pipeline: the "mask-generation" pipeline of transformers, with the model and its image processor.
+        processor: processor of transformers, for clicks.
         torch: the module.
-        clicks: column and row of a pixel, and the label of what is there; a click with label 0 is on nothing
-            of what is wanted.
-        points_per_side: of the grid.
-        points_per_batch: of the grid, at a time. Fewer take less memory.
-        min_score: weaker masks are dropped; SAM's own guess of its intersection over union with the truth.
-        min_stability: so are masks that change more when their threshold does; intersection over union of
-            the mask at a logit of 1 with that at -1.
-        max_box_overlap: of two masks whose boxes have a larger intersection over union the weaker is dropped.
-        max_fraction: a mask with more of the picture is no object.
-        min_pixels: smaller objects are dropped. This and the six before do not concern clicks.
+        clicks: column and row of a pixel, and the label of the object there; a click with label 0 marks a
+            place outside all objects.
+        points_per_side: grid points per side.
+        points_per_batch: grid points processed at a time; fewer need less memory.
+        min_score: masks with a lower score are dropped; the score is SAM's own estimate of the mask's IoU.
+        min_stability: masks with a lower stability are dropped; the stability is the IoU of the mask at a
+            logit of 1 with the mask at -1.
+        max_box_overlap: of two masks whose boxes have a larger IoU, the one with the lower score is dropped.
+        max_fraction: a mask that covers more of the image is not an object.
+        min_pixels: objects with fewer pixels are dropped. This and the six before do not apply to clicks.
     """
 
     pipeline: Any
@@ -63,26 +64,26 @@ class SamSegmenter:
         depth: Num[np.ndarray, "..."] | None = None,
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "H W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... from the largest object to the smallest; with
+        """Labels of an image: 0 for background, then 1, 2, ... from the largest object to the smallest; with
         clicks, their labels.
 
-        Where masks overlap the smaller is on top.
+        Where masks overlap, the smaller one is on top.
 
         Args:
             image: RGB, uint8 or floats 0 to 1.
-            depth, K: not used; they stand here so that all segmenters are called alike.
+            depth, K: not used; present so that all segmenters have the same signature.
 
         Raises:
-            ValueError: a click is outside the picture or has a negative label, or all have label 0.
+            ValueError: a click is outside the image or has a negative label, or all have label 0.
         """
         if self.clicks:
             return self._clicked(to_bytes(image))
         found = self.find(image)
         return name_by_size(labels_of_masks(found.masks, found.scores, self.max_fraction), self.min_pixels)
 
-    def find(self, image: Num[np.ndarray, "H W 3"]) -> Found:
-        """Masks of everything, the best first, with their boxes."""
-        # The last step of the pipeline's own call is the same as what follows here, but needs torchvision.
+    def find(self, image: Num[np.ndarray, "H W 3"]) -> Detections:
+        """Masks of everything with their boxes, in descending order of score."""
+        # The last step of the pipeline's own call is equivalent to what follows, but needs torchvision.
         chunks = self.pipeline.preprocess(
             Image.fromarray(to_bytes(image)),
             points_per_batch=self.points_per_batch,
@@ -98,10 +99,10 @@ class SamSegmenter:
         masks = np.zeros((len(kept), *image.shape[:2]), bool)
         for i, row in enumerate(kept):
             masks[i] = _mask_of_runs(runs[row], image.shape[:2])
-        return Found(boxes[kept], scores[kept], masks)
+        return Detections(boxes[kept], scores[kept], masks)
 
     def _clicked(self, image: UInt8[np.ndarray, "H W 3"]) -> Int[np.ndarray, "H W"]:
-        """The label of the clicks whose mask a pixel is in, 0 where it is in none."""
+        """For each pixel, the label of the clicks whose mask covers it; 0 where none does."""
         _check_clicks(self.clicks, image.shape[:2])
         names = np.unique([0, *(label for *_, label in self.clicks)]).astype(np.int32)
         model, device = self.pipeline.model, self.pipeline.device
@@ -115,7 +116,7 @@ class SamSegmenter:
                 inputs = self.processor(
                     image, input_points=[[points]], input_labels=[[on_it]], return_tensors="pt"
                 )
-                # One click may mean a part or the whole: then SAM gives three answers, with scores.
+                # A single click may mean a part or the whole, so SAM returns three masks with scores.
                 outputs = model(
                     image_embeddings=seen,
                     input_points=inputs["input_points"].to(device, self.torch.float32),
@@ -134,7 +135,7 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
+        ValueError: the folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "SAM's weights", (weights.PROCESSOR,), "facebook/sam-vit-base")
@@ -146,7 +147,7 @@ def load_sam(path: str | os.PathLike, device: str = "cpu") -> SamSegmenter:
 
 
 def _mask_of_runs(counts: list[int], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """A mask from the lengths of its runs, by turns outside and inside, column after column."""
+    """A mask from its run lengths, alternating between outside and inside, column by column."""
     inside = np.arange(len(counts)) % 2 == 1
     return np.repeat(inside, counts).reshape(size[::-1]).T
 
@@ -162,5 +163,5 @@ def _check_clicks(clicks: tuple[tuple[float, float, int], ...], size: tuple[int,
             raise ValueError(f"clicks: expected labels of 0 or more, found {(x, y, label)}")
     if all(label == 0 for *_, label in clicks):
         raise ValueError(
-            "clicks: all have label 0, on nothing of what is wanted; give some a label of 1 or more"
+            "clicks: expected at least one label of 1 or more, found only label 0, which is background"
         )

@@ -1,4 +1,4 @@
-"""SAM2 (Ravi et al., 2025) through transformers: masks of the first picture followed through the others.
+"""SAM2 (Ravi et al., 2025) through transformers: masks of the first image, propagated to the others.
 Weights are local files.
 
 Needs the extra `foundation`; torch and transformers are imported when a model is loaded.
@@ -18,16 +18,16 @@ from gsjax.perception.pictures import to_bytes
 
 @dataclass(frozen=True)
 class Sam2Propagator:
-    """A propagator that remembers what each object looked like; from `load_sam2`.
+    """A propagator with a memory of each object's appearance; from `load_sam2`.
 
-    It was trained on videos, but does not ask what makes a picture differ from the one before: time, or a
-    camera that stands beside it, as in MotionSplicer.
+    It was trained on videos, but consecutive images may differ by viewpoint as well as by time, as in
+    MotionSplicer.
 
     Attributes:
-        model, processor: of transformers.
-        session: the class of transformers that holds the pictures and what was found in them.
+        model, processor: objects of transformers.
+        session: the class of transformers that holds the images and the state of the inference.
         torch: the module.
-        device: where the model is.
+        device: the device that holds the model.
     """
 
     model: Any
@@ -39,19 +39,19 @@ class Sam2Propagator:
     def __call__(
         self, images: Num[np.ndarray, "V H W 3"], labels: Int[np.ndarray, "rows columns"]
     ) -> Int[np.ndarray, "V H W"]:
-        """Labels of all pictures: those of the first are as given, and elsewhere a pixel has the label whose
-        logit is largest, 0 where none is positive.
+        """Labels of all images: those of the first are returned unchanged; in the others, a pixel has the
+        label with the largest logit, or 0 if no logit is positive.
 
         Args:
-            images: RGB, uint8 or floats 0 to 1; neighbours are alike. Each takes 12 MB of memory, and 4 MB
-                more for each label.
-            labels: of the first; 0 background.
+            images: RGB, uint8 or floats 0 to 1; neighbours should be similar. Each takes 12 MB of memory, and
+                4 MB more per label.
+            labels: labels of the first image, 0 for background.
 
         Raises:
-            ValueError: the labels are not of the pictures' size.
+            ValueError: labels and images differ in size.
         """
         if labels.shape != images.shape[1:3]:
-            raise ValueError(f"labels: expected shape {images.shape[1:3]} as images, found {labels.shape}")
+            raise ValueError(f"labels: expected shape {images.shape[1:3]} like images, found {labels.shape}")
         names = np.append(0, _objects(labels))
         found = np.zeros(images.shape[:3], labels.dtype)
         found[0] = labels
@@ -64,7 +64,7 @@ class Sam2Propagator:
     def logits(
         self, images: Num[np.ndarray, "V H W 3"], labels: Int[np.ndarray, "H W"]
     ) -> Iterator[Float[np.ndarray, "P H W"]]:
-        """For each picture in turn SAM2's logits of the labels, in their order; positive is inside."""
+        """SAM2's logits for each image in turn, one map per label in ascending order; positive is inside."""
         names = _objects(labels).tolist()
         if not names:
             return
@@ -94,18 +94,18 @@ def load_sam2(path: str | os.PathLike, device: str = "cpu") -> Sam2Propagator:
 
     Raises:
         FileNotFoundError: the folder or a file of it is missing.
-        ValueError: the folder leads to weights that are a pickle.
+        ValueError: the folder points to pickled weights.
         MissingExtra: torch or transformers is not installed.
     """
     folder = weights.model_folder(path, "SAM2's weights", (weights.PROCESSOR,), "facebook/sam2.1-hiera-tiny")
     torch, transformers = weights.foundation_modules("SAM2")
     model = transformers.Sam2VideoModel.from_pretrained(folder, **weights.LOCAL_WEIGHTS).eval().to(device)
-    # SAM2's own processor needs torchvision. ViT's does the same to a picture: resize, rescale, normalise.
+    # SAM2's own processor needs torchvision. ViT's does the same to an image: resize, rescale, normalise.
     processor = transformers.ViTImageProcessorPil.from_pretrained(folder, local_files_only=True)
     return Sam2Propagator(model, processor, transformers.Sam2VideoInferenceSession, torch, device)
 
 
 def _objects(labels: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "P"]:
-    """The labels that there are, without the background."""
+    """The labels that occur, without the background."""
     names = np.unique(labels)
     return names[names > 0]

@@ -1,7 +1,7 @@
-"""Segmenters that need no weights: objects are what stands out of the planes, or regions of like colour.
+"""Segmenters without weights: objects are what protrudes from planes, or regions of similar colour.
 
-They know nothing of things, only of geometry and colour, and are named for that. Masks of a foundation model
-or from files do better where there are any.
+They use only geometry and colour, not semantics, and are named accordingly. Masks of a foundation model, or
+from files, are better where available.
 """
 
 from dataclasses import dataclass, field
@@ -23,31 +23,31 @@ from gsjax.perception.planes import find_levels, find_planes, surface_normals
 
 @dataclass(frozen=True)
 class PlaneSegmenter:
-    """Objects are what remains when floor, walls and tables are taken out of a depth picture.
+    """Objects are what remains of a depth image once floor, walls and tables are removed.
 
     1. Planes are found one after the other by RANSAC; those with nothing behind them (floor, walls) are
        background. A large flat object, such as a lid, does have something behind it.
-    2. Flat patches parallel to the floor are background too if they are large (a table) or if most of their
-       rim goes up (the bottom of a tray, in which things stand), and not the top of a thing.
-    3. What is left is split where depth jumps or, if asked, where colour does, and named by size.
+    2. Flat patches parallel to the floor are background too if they are large (a table), or if most of their
+       rim rises (the bottom of a tray, as opposed to the top of an object).
+    3. The remaining pixels are split at jumps of depth and, optionally, of colour, and labelled by size.
 
-    Objects that touch are one. Everything is determined by the picture and `seed`.
+    Objects that touch are merged. The result depends only on the image and `seed`.
     """
 
     plane_distance: float = 0.008
-    """Half the thickness of a plane, metres, at one metre's distance; it grows with depth as noise does."""
+    """Half the thickness of a plane at a distance of one metre, metres; it grows with depth like noise."""
     min_plane_fraction: float = 0.05
-    """Smallest part of the picture that makes a wall, a floor or a table."""
+    """Smallest fraction of the image that counts as a wall, a floor or a table."""
     min_support_fraction: float = 0.005
-    """Smallest part of the picture that makes a lesser support, whose rim must rise."""
+    """Smallest fraction of the image that counts as a minor support, whose rim must rise."""
     min_rising: float = 0.5
-    """Part of a lesser support's rim that must rise."""
+    """Fraction of a minor support's rim that must rise."""
     max_planes: int = 8
-    """Most planes looked for."""
+    """Largest number of planes to find."""
     depth_jump: float = 0.02
-    """Neighbouring pixels belong together up to this relative difference of depth."""
+    """Largest relative difference of depth between neighbouring pixels of one object."""
     color_jump: float | None = None
-    """... and up to this difference of smoothed CIELAB colour; None never splits by colour."""
+    """Largest difference of smoothed CIELAB colour between them; None does not split by colour."""
     min_pixels: int = 60
     """Smaller components are dropped."""
     seed: int = 0
@@ -58,23 +58,25 @@ class PlaneSegmenter:
         depth: Num[np.ndarray, "H W"] | None,
         K: Float[np.ndarray, "3 3"] | None,
     ) -> Int[np.ndarray, "H W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... from the largest object to the smallest.
+        """Labels of an image: 0 for background, then 1, 2, ... from the largest object to the smallest.
 
         Args:
             image: uint8, or floats 0 to 1.
             depth: z-depth in metres, 0 or NaN where unknown; such pixels are background.
-            K: intrinsics.
+            K: intrinsics, pixels.
 
         Raises:
             ValueError: depth or K is missing, sizes differ, or no pixel has depth.
         """
         if depth is None or K is None:
-            raise ValueError("depth, K: got None, want both; without depth use RegionSegmenter")
+            raise ValueError("depth, K: expected both, found None; without depth use RegionSegmenter")
         if image.shape[:2] != depth.shape:
-            raise ValueError(f"depth: got shape {depth.shape}, want {image.shape[:2]} to match image")
+            raise ValueError(f"depth: expected shape {image.shape[:2]} to match image, found {depth.shape}")
         valid = np.isfinite(depth) & (depth > 0)
         if not valid.any():
-            raise ValueError("depth: no pixel is positive and finite; without depth use RegionSegmenter")
+            raise ValueError(
+                "depth: expected positive, finite pixels, found none; without depth use RegionSegmenter"
+            )
         points = _camera_points(np.where(valid, depth, 1.0), K)
         foreground = valid & ~self._background(points, valid)
         jumps = _relative_jumps(points[..., 2])
@@ -87,7 +89,7 @@ class PlaneSegmenter:
     def _background(
         self, points: Float[np.ndarray, "H W 3"], valid: Bool[np.ndarray, "H W"]
     ) -> Bool[np.ndarray, "H W"]:
-        """Pixels of the planes that bound the scene or support what stands in it."""
+        """Pixels of the planes that bound the scene or support objects."""
         tolerance = self.plane_distance * np.maximum(1.0, points[..., 2])
         normals = surface_normals(points)
         large = int(self.min_plane_fraction * valid.size)
@@ -102,7 +104,7 @@ class PlaneSegmenter:
             return background
         for plane in bounding:
             background |= plane.pixels
-        # Cameras mostly stand upright: of the bounding planes the floor is the large one that looks up (-y).
+        # Cameras are mostly upright, so the floor is the large bounding plane whose normal points up (-y).
         floor = max(bounding, key=lambda plane: plane.pixels.sum() * (0.2 + max(0.0, -plane.normal[1])))
         small = int(self.min_support_fraction * valid.size)
         for patch in find_levels(
@@ -116,21 +118,21 @@ class PlaneSegmenter:
 
 @dataclass(frozen=True)
 class RegionSegmenter:
-    """Objects are regions of like colour: Felzenszwalb's superpixels, merged while their means are near.
+    """Objects are regions of similar colour: Felzenszwalb's superpixels, merged while their means are close.
 
-    Regions that are large, or line much of the picture's border, are background. No depth is needed or used.
+    Regions that are large, or cover much of the image's border, are background. Depth is not used.
     """
 
     scale: float = 150.0
-    """Felzenszwalb's scale: larger makes larger superpixels."""
+    """Scale of Felzenszwalb's method; larger values give larger superpixels."""
     sigma: float = 0.8
-    """Blur before, pixels."""
+    """Standard deviation of the blur before segmentation, pixels."""
     merge_distance: float = 12.0
-    """Neighbouring regions are merged up to this difference of mean CIELAB colour."""
+    """Largest difference of mean CIELAB colour at which neighbouring regions are merged."""
     max_fraction: float = 0.25
-    """A region with more of the picture is background."""
+    """A region that covers more of the image is background."""
     max_border_fraction: float = 0.1
-    """A region with more of the picture's border is background."""
+    """A region that covers more of the image's border is background."""
     min_pixels: int = 60
     """Smaller regions are dropped."""
 
@@ -140,14 +142,14 @@ class RegionSegmenter:
         depth: Num[np.ndarray, "..."] | None = None,
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "H W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... from the largest region to the smallest.
+        """Labels of an image: 0 for background, then 1, 2, ... from the largest region to the smallest.
 
         Args:
             image: uint8, or floats 0 to 1.
-            depth, K: not used; they stand here so that all segmenters are called alike.
+            depth, K: not used; present so that all segmenters have the same signature.
         """
         lab = rgb2lab(unit_floats(image))
-        # In CIELAB over 100, a distance of 1 is as much as black to white, which is what `scale` is made for.
+        # In CIELAB / 100, the distance from black to white is 1, the range for which `scale` is meant.
         regions = felzenszwalb(
             lab / 100.0, scale=self.scale, sigma=self.sigma, min_size=self.min_pixels, channel_axis=-1
         )
@@ -172,7 +174,7 @@ class PlaneOrRegionSegmenter:
         depth: Num[np.ndarray, "H W"] | None = None,
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "image_H image_W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... by size. Raises as the one that is chosen."""
+        """Labels of an image: 0 for background, then 1, 2, ... by size. Errors are the chosen segmenter's."""
         if depth is None or K is None or not np.any(np.nan_to_num(depth) > 0):
             return self.region(image)
         return self.plane(image, depth, K)
@@ -180,9 +182,9 @@ class PlaneOrRegionSegmenter:
 
 @dataclass(frozen=True)
 class PieceSegmenter:
-    """Pieces of things: regions of like colour, where there is depth only of what stands out of the planes.
+    """Pieces of objects: regions of similar colour, with depth only those that protrude from planes.
 
-    For who joins pieces by other evidence, such as that they move together: a door is a piece, and so is each
+    For methods that merge pieces by other evidence, such as common motion: a door is a piece, and so is each
     side of a box.
     """
 
@@ -201,7 +203,7 @@ class PieceSegmenter:
         depth: Num[np.ndarray, "H W"] | None = None,
         K: Float[np.ndarray, "3 3"] | None = None,
     ) -> Int[np.ndarray, "image_H image_W"]:
-        """Labels of a picture: 0 background, then 1, 2, ... by size."""
+        """Labels of an image: 0 for background, then 1, 2, ... by size."""
         regions = self.region(image)
         if depth is not None and K is not None and np.any(np.nan_to_num(depth) > 0):
             regions = np.where(self.plane(image, depth, K) > 0, regions, 0)
@@ -232,7 +234,7 @@ def _color_jumps(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _components(
     foreground: Bool[np.ndarray, "H W"], right: Bool[np.ndarray, "H W-1"], down: Bool[np.ndarray, "H-1 W"]
 ) -> Int[np.ndarray, "H W"]:
-    """Connected components of the foreground, 1 and up; neighbours touch only if `right`, `down` say so."""
+    """Connected components of the foreground, from 1; `right` and `down` are True where connected."""
     index = np.arange(foreground.size).reshape(foreground.shape)
     right = right & foreground[:, 1:] & foreground[:, :-1]
     down = down & foreground[1:] & foreground[:-1]
@@ -244,7 +246,7 @@ def _components(
 
 
 def _merge_regions(regions: np.ndarray, lab: np.ndarray, distance: float) -> Int[np.ndarray, "H W"]:
-    """Merge the two neighbours with the nearest mean colours until none are nearer than `distance`."""
+    """Merge the pair of neighbours with the closest mean colours until none are closer than `distance`."""
     count = regions.max() + 1
     sizes = np.bincount(regions.ravel(), minlength=count).astype(float)
     means = np.stack([np.bincount(regions.ravel(), lab[..., i].ravel(), count) for i in range(3)], axis=1)

@@ -1,9 +1,9 @@
-"""The one array of a torch file (.pt, .pth) as `torch.save(tensor, path)` writes it, without torch and
+"""Read the tensor in a torch file (.pt, .pth) written by `torch.save(tensor, path)`, without torch and
 without unpickling.
 
-Such a file is a zip of the numbers, plain, and of a pickle that says their type and shape. A pickle can run
-anything when it is loaded. So it is not: its opcodes are listed (`pickletools.genops`, which runs nothing),
-and must be the few that rebuild one tensor.
+Such a file is a zip of the raw numbers and of a pickle with their type and shape. Loading a pickle can run
+arbitrary code, so it is never loaded: its opcodes are listed (`pickletools.genops`, which runs nothing), and
+only the few that rebuild one tensor are accepted.
 """
 
 import math
@@ -26,26 +26,26 @@ _TYPES = {
     "BoolStorage": np.bool_,
 }
 _CALLS = {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
-_LONGEST_PICKLE = 4096  # bytes; that of a tensor has about 300
+_LONGEST_PICKLE = 4096  # bytes; the pickle of a tensor has about 300
 _ADVICE = "Save it again as .npy: numpy.save('features.npy', tensor.cpu().numpy())."
 
 
 def read_torch_array(path: Path) -> np.ndarray:
-    """The array of a file that holds one tensor.
+    """The array in a file that holds one tensor.
 
     Raises:
-        ValueError: it is no such file, or holds anything besides one tensor of plain numbers.
+        ValueError: it is not such a file, or holds anything besides one tensor of plain numbers.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             described = [name for name in names if name.endswith("/data.pkl") or name == "data.pkl"]
             if len(described) != 1:
-                raise ValueError(f"{path}: expected a file of torch.save, found none of its parts. {_ADVICE}")
+                raise ValueError(f"{path}: expected a file of torch.save, found no data.pkl in it. {_ADVICE}")
             kind, key, offset, shape, strides = _tensor(path, _part(path, archive, described[0]))
             root = described[0].removesuffix("data.pkl")
             if f"{root}data/{key}" not in names:
-                raise ValueError(f"{path}: expected its numbers in data/{key}, found none. {_ADVICE}")
+                raise ValueError(f"{path}: expected its numbers in data/{key}, found none there. {_ADVICE}")
             if f"{root}byteorder" in names and _part(path, archive, f"{root}byteorder") != b"little":
                 raise ValueError(f"{path}: expected little-endian numbers, found others. {_ADVICE}")
             stored = _part(path, archive, f"{root}data/{key}")
@@ -57,7 +57,7 @@ def read_torch_array(path: Path) -> np.ndarray:
             f"{path}: expected numbers of {dtype.itemsize} bytes, found {len(stored)} bytes. {_ADVICE}"
         )
     numbers = np.frombuffer(stored, dtype)
-    count = math.prod(shape)  # more than are stored only where some are repeated, perhaps without end
+    count = math.prod(shape)  # exceeds the stored numbers only if strides repeat some, possibly without bound
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if min([0, offset, *shape, *strides]) < 0 or count > len(numbers) or (count and last >= len(numbers)):
         raise ValueError(
@@ -70,19 +70,21 @@ def read_torch_array(path: Path) -> np.ndarray:
         return np.lib.stride_tricks.as_strided(numbers[offset:], shape, bytes_apart).copy()
     except (ValueError, OverflowError) as error:  # too many axes, or huge ones beside an axis of 0
         raise ValueError(
-            f"{path}: expected a shape that numpy knows, found {list(shape)} ({error}). {_ADVICE}"
+            f"{path}: expected a shape that numpy supports, found {list(shape)} ({error}). {_ADVICE}"
         ) from error
 
 
 def _part(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
-    """As torch.save stores it, not packed: so it is no larger than the file."""
+    """An entry of the archive. torch.save does not compress, so an entry is never larger than the file."""
     if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:
-        raise ValueError(f"{path}: expected {name} as torch.save stores it, found it packed. {_ADVICE}")
+        raise ValueError(
+            f"{path}: expected {name} uncompressed, as torch.save writes it, found it compressed. {_ADVICE}"
+        )
     return archive.read(name)
 
 
 def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], tuple[int, ...]]:
-    """Type, file, first place, shape and strides, by following what the opcodes would put on a stack."""
+    """Type, key, offset, shape and strides, by simulating the stack of the pickle machine."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     mark = object()
@@ -90,7 +92,7 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
     def refuse(found: str) -> ValueError:
         return ValueError(
             f"{path}: expected one tensor and nothing else, found {found}; gsjax loads no pickles, which can "
-            f"run any program. {_ADVICE}"
+            f"run arbitrary code. {_ADVICE}"
         )
 
     def since_mark() -> list[Any]:
@@ -100,7 +102,7 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
         return items
 
     if len(pickle) > _LONGEST_PICKLE:
-        raise refuse(f"{len(pickle)} bytes that say what it holds")
+        raise refuse(f"a pickle of {len(pickle)} bytes")
     try:
         for opcode, operand, _ in pickletools.genops(pickle):
             name, argument = opcode.name, cast(Any, operand)
@@ -133,7 +135,9 @@ def _tensor(path: Path, pickle: bytes) -> tuple[str, str, int, tuple[int, ...], 
                 stack.append(("storage", stack.pop()))
             elif name == "REDUCE":
                 arguments, function = stack.pop(), stack.pop()
-                called = function if isinstance(function, str) else "no function"  # perhaps too deep to hash
+                called = (
+                    function if isinstance(function, str) else "no function"
+                )  # others may be too deep to hash
                 if called not in _CALLS:
                     raise refuse(f"a call of {called!r}")
                 stack.append((function, arguments))

@@ -1,5 +1,5 @@
-"""Where adapters of foundation models find their weights: in a folder on this machine, nowhere else, and in
-files that cannot run anything when they are read.
+"""Weights of foundation models. They are read only from local folders, and only from files that cannot run
+code when they are read.
 """
 
 import json
@@ -19,25 +19,25 @@ _CONVERT = (
     "save_file({k: v.clone().contiguous() for k, v in w.items()}, sys.argv[2], {'format': 'pt'})"
 )
 LOCAL_FILES = {"local_files_only": True, "trust_remote_code": False}
-"""How transformers is to load; left alone it would ask whether to run code that lies in the folder."""
+"""Options for transformers to load anything; by default it would ask whether to run code in the folder."""
 LOCAL_WEIGHTS = LOCAL_FILES | {"use_safetensors": True}
-"""How it is to load a model."""
+"""Options with which transformers loads a model."""
 PROCESSOR = "preprocessor_config.json|processor_config.json"
-"""The file that says how pictures are resized and normalised, under either of its names."""
+"""The file that specifies how images are resized and normalised, under either of its names."""
 
 
 def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], example: str) -> Path:
     """The folder of a model in the layout of Hugging Face, checked.
 
     Args:
-        path: as the user gave it.
-        model: what it should hold, in words.
-        others: further files that must be there; one with "|" in it names alternatives.
+        path: the folder, as given by the user.
+        model: description of what it should hold, for error messages.
+        others: further required files; "|" separates alternatives.
         example: a model of that kind on the Hugging Face hub.
 
     Raises:
-        FileNotFoundError: there is no such folder, or a file is missing.
-        ValueError: a file leads to weights that are a pickle, or is not JSON.
+        FileNotFoundError: the folder does not exist, or a file is missing.
+        ValueError: a file points to pickled weights, or is not valid JSON.
     """
     folder = Path(path)
     wanted = (_CONFIG, f"{_WHOLE}|{_INDEX}", *others)
@@ -53,8 +53,8 @@ def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], e
         pickles = sorted(folder.glob("*.bin"))
         if pickles and _WHOLE in lacking:
             advice = (
-                f"{pickles[0].name} is a pickle, which can run code when it is read, so none is read here. "
-                f'In an environment of your own that has torch and safetensors: python -c "{_CONVERT}" '
+                f"{pickles[0].name} is a pickle, which can run code when read, so it is refused. "
+                f'In an environment with torch and safetensors: python -c "{_CONVERT}" '
                 f"{shlex.quote(str(pickles[0]))} {shlex.quote(str(folder / _WHOLE))}"
             )
         raise FileNotFoundError(f"{folder}: expected {model}; it lacks {lacking}, found {names}. {advice}")
@@ -63,22 +63,22 @@ def model_folder(path: str | os.PathLike, model: str, others: tuple[str, ...], e
 
 
 def image_processor(transformers: ModuleType, folder: Path) -> Any:
-    """What resizes and normalises pictures for the model in a folder: the one that needs no torchvision."""
+    """The image processor of the model in a folder, in the variant that needs no torchvision."""
     return transformers.AutoImageProcessor.from_pretrained(folder, **LOCAL_FILES, backend="pil")
 
 
 def _check_no_pickles(folder: Path) -> None:
-    """Files beside the weights in which transformers finds the names of others, pickles too."""
+    """Refuse files that could make transformers load other weights, which may be pickles."""
     named = _read_json(folder / _CONFIG).get("transformers_weights")
     if named is not None:
         raise ValueError(
             f"{folder / _CONFIG}: expected no transformers_weights, found {named!r}; delete the entry, "
-            f"weights are those of {_WHOLE}"
+            f"so that weights come from {_WHOLE}"
         )
     if (adapter := folder / "adapter_config.json").exists():
         raise ValueError(
             f"{adapter}: expected the weights of a whole model, found an adapter to one; merge it into the "
-            "model (merge_and_unload and save_pretrained of peft's)"
+            "model (with merge_and_unload and save_pretrained of peft)"
         )
     if not (folder / _WHOLE).is_file():
         parts = _read_json(folder / _INDEX).get("weight_map")
@@ -102,9 +102,9 @@ def _read_json(path: Path) -> dict:
 
 
 def foundation_modules(model: str) -> tuple[ModuleType, ModuleType]:
-    """(torch, transformers), imported now.
+    """Import and return (torch, transformers).
 
     Raises:
-        MissingExtra: one is not installed.
+        MissingExtra: one of them is not installed.
     """
     return extras.load("torch", "foundation", model), extras.load("transformers", "foundation", model)

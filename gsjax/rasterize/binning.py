@@ -1,9 +1,9 @@
-"""Which tiles a Gaussian touches, and each tile's list from front to back.
+"""The tiles that each Gaussian touches, and each tile's list from front to back.
 
 Gaussians are ranked by depth. Each is expanded to the rows of tiles that its ellipse crosses, and in every
-row to the columns between which it lies there; so the list of pairs is known before it is laid out: every
-tile where it reaches alpha_min at a pixel's centre, and the few between centres or within rounding. Pairs are
-sorted by (tile, rank). Lists have any length: nothing but the total is bounded.
+row to the range of columns that it covers; so the number of pairs is known before they are laid out: every
+tile where it reaches alpha_min at a pixel's centre, and a few between centres or within rounding. Pairs are
+sorted by (tile, rank). Lists can have any length: only their total is bounded.
 """
 
 from typing import NamedTuple
@@ -21,13 +21,13 @@ _TOO_MANY = 2**30  # above this an int32 running sum is no longer trusted
 
 
 class TileLists(NamedTuple):
-    """Lists of all tiles of one camera, one after the other in `ids`."""
+    """Lists of all tiles of one camera, concatenated in `ids`."""
 
     ids: Int[Array, "capacity"]  # Gaussians, by tile, front to back
     starts: Int[Array, "tiles"]
     counts: Int[Array, "tiles"]
     pairs: Int[Array, ""]  # Gaussian-tile pairs that are drawn
-    needed: Int[Array, ""]  # what the capacity must hold
+    needed: Int[Array, ""]  # the capacity that is needed
     overflow: Bool[Array, ""]
 
 
@@ -42,7 +42,7 @@ class _Spans(NamedTuple):
 def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan) -> TileLists:
     """Front-to-back lists of every tile of one camera.
 
-    Equal depths keep the order of the input. Tiles outside `tile_mask`, where there is one, get empty lists.
+    Equal depths keep the order of the input. Tiles outside `tile_mask`, if given, get empty lists.
     """
     projected = jax.lax.stop_gradient(projected)
     by_depth = _depth_order(projected, plan)
@@ -55,7 +55,7 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
     pairs = _total(spans.count)
     overflow = ~enough_rows | (pairs > plan.capacity)
     needed = jnp.where(enough_rows, jnp.maximum(pairs, 2 * rows), _bounding_pairs(projected, plan))
-    count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing, and says so
+    count = jnp.where(overflow, 0, spans.count)  # a call that overflowed draws nothing and reports it
     tiles, ids = _sorted_pairs(spans._replace(count=count), tile_mask, by_depth, plan)
     edges = jnp.searchsorted(tiles, jnp.arange(plan.num_tiles + 1, dtype=tiles.dtype)).astype(jnp.int32)
     counts = edges[1:] - edges[:-1]
@@ -74,12 +74,12 @@ def bin_gaussians(projected: Projected, tile_mask: Bool[Array, "tiles"] | None, 
 def needed_capacity(
     projected: Projected, tile_mask: Bool[Array, "tiles"] | None, plan: Plan
 ) -> Int[Array, ""]:
-    """What `bin_gaussians` needs: exactly, if the capacity holds twice the rows; else twice the rows.
+    """The capacity that `bin_gaussians` needs: exact if the plan holds twice the rows; else twice the rows.
 
     Args:
-        projected: what the camera sees.
-        tile_mask: tiles that are drawn; all unless given.
-        plan: whose capacity says how many rows fit.
+        projected: Gaussians projected into the camera.
+        tile_mask: tiles that are drawn (default: all).
+        plan: its capacity determines how many rows fit.
     """
     first_row, num_rows = _rows(projected, tile_mask, plan)
     rows = _total(num_rows)
@@ -90,7 +90,7 @@ def needed_capacity(
 
 
 def _total(counts: Int[Array, "*n"]) -> Int[Array, ""]:
-    """Sum that saturates at the largest int32: 2.2e9 pairs have been seen in the wild."""
+    """Sum that saturates at the largest int32: real scenes have reached 2.2e9 pairs."""
     estimate = counts.astype(jnp.float32).sum()
     return jnp.where(estimate > _TOO_MANY, jnp.iinfo(jnp.int32).max, counts.sum(dtype=jnp.int32))
 
@@ -104,7 +104,7 @@ def _depth_order(projected: Projected, plan: Plan) -> Int[Array, "n"]:
     depths = jnp.where(projected.visible, projected.depths, jnp.inf)
     if depths.dtype != jnp.float32:
         return jnp.argsort(depths, stable=True).astype(jnp.int32)
-    # Floats that are not negative are ordered as their bits are.
+    # Non-negative floats have the same order as their bits.
     return argsort_keys(jax.lax.bitcast_convert_type(depths, jnp.uint32), plan.sort)
 
 
@@ -115,7 +115,7 @@ def _tile_of(position: Array, plan: Plan, limit: int) -> Int[Array, "*n"]:
 
 
 def _box(projected: Projected, axis: int, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
-    """First and one past the last tile of each bounding box along an axis (0: x); equal if not visible."""
+    """First tile and one past the last of each bounding box along an axis (0: x); equal if not visible."""
     limit = (plan.tiles_x, plan.tiles_y)[axis]
     mean, half = projected.means2d[:, axis], projected.extents[:, axis]
     low = jnp.maximum(_tile_of(mean - half, plan, limit), 0)
@@ -124,7 +124,7 @@ def _box(projected: Projected, axis: int, plan: Plan) -> tuple[Int[Array, "n"], 
 
 
 def _rows(projected: Projected, tile_mask, plan: Plan) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
-    """First row of tiles of each Gaussian and how many; none where it touches no tile of the mask."""
+    """First row of tiles and number of rows of each Gaussian; no rows if it touches no tile of the mask."""
     top, bottom = _box(projected, 1, plan)
     if tile_mask is None:
         return top, bottom - top
@@ -136,7 +136,7 @@ def _rows(projected: Projected, tile_mask, plan: Plan) -> tuple[Int[Array, "n"],
 
 
 def _bounding_pairs(projected: Projected, plan: Plan) -> Int[Array, ""]:
-    """An upper bound of what is needed, from bounding boxes alone."""
+    """An upper bound on the needed capacity, from bounding boxes alone."""
     (left, right), (top, bottom) = _box(projected, 0, plan), _box(projected, 1, plan)
     columns, rows = right - left, bottom - top
     return jnp.maximum(_total(columns * rows), _doubled(_total(rows)))
@@ -161,17 +161,17 @@ def _spans(projected: Projected, tile_mask, by_depth, first_row, num_rows, plan:
 
 
 def _columns_in_row(projected: Projected, gaussian, row, plan: Plan):
-    """First and one past the last column of tiles where alpha reaches alpha_min in a row's pixel centres.
+    """First column of tiles and one past the last where alpha reaches alpha_min at pixel centres of a row.
 
     The ellipse A dx^2 + 2 B dx dy + C dy^2 = t, t = 2 ln(o / alpha_min), reaches furthest to the right at
     dy = -(B/C) h_x, as a concave function of dy; so within a band of rows it does so at the nearest dy of the
-    band, and likewise to the left. At dy it is -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)) wide.
+    band, and likewise to the left. At dy it spans -(B/A) dy +- sqrt(t/A (1 - (dy/h_y)^2)).
     """
     u, v, half_x, half_y, a, b, c, opacity = (column[gaussian] for column in _ellipses(projected))
-    # What follows is worked out for each row again: gathers of what is there already are the quick ones.
-    tiny = jnp.finfo(a.dtype).tiny  # a conic whose entry has underflown is flat that way
+    # The rest is recomputed for each row: only gathers of existing arrays are fast.
+    tiny = jnp.finfo(a.dtype).tiny  # a conic with an underflowed entry is flat in that direction
     level = 2 * jnp.log(jnp.maximum(opacity / plan.alpha_min, 1.0))
-    level = level * 1.0002 + 1e-3  # the pixels have the last word: rounding errs to keeping
+    level = level * 1.0002 + 1e-3  # compositing decides exactly: rounding errs towards keeping pairs
     furthest, slope = -b / jnp.maximum(c, tiny) * half_x, -b / jnp.maximum(a, tiny)
     width = jnp.sqrt(level / jnp.maximum(a, tiny))
     top = row * plan.tile_size + 0.5 - v
@@ -199,7 +199,7 @@ def _ellipses(projected: Projected) -> list[Float[Array, "n"]]:
 
 
 def _sorted_pairs(spans: _Spans, tile_mask, by_depth, plan: Plan):
-    """(tile, Gaussian) of every pair in order of (tile, depth); unused slots hold the tile past the last."""
+    """(tile, Gaussian) of every pair, ordered by (tile, depth); unused slots hold the tile past the last."""
     num_tiles, n = plan.num_tiles, by_depth.shape[0]
     slot, count = slots(plan.capacity), spans.count.ravel()
     ends = running_sum(count, plan.sort)

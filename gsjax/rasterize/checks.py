@@ -1,4 +1,4 @@
-"""Shapes of the rasterizer's arguments: checked, named in errors, and brought to one layout."""
+"""Checks of the rasterizer's arguments, with errors that name them, and their conversion to one layout."""
 
 import math
 from typing import Any
@@ -11,7 +11,7 @@ from gsjax.rasterize.plan import Plan
 
 
 def is_concrete(tree: Any) -> bool:
-    """Whether every array holds values now, rather than standing for values to come."""
+    """Whether every array holds concrete values, as opposed to traced ones."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -40,11 +40,11 @@ def check_inputs(
 ) -> tuple[tuple, tuple[int, ...]]:
     """All arguments with leading axes flattened to [scenes, cameras, ...], and those leading axes.
 
-    Arguments as for `gsjax.rasterization`, under a plan that is resolved. Half precision is computed in
-    float32; colours and features (not SH coefficients) are stored as they are.
+    Arguments as for `gsjax.rasterization`, under a resolved plan. Half precision is computed in float32;
+    colours and features (not SH coefficients) are stored as they are.
 
     Raises:
-        ValueError: names the argument, the shape it got and the shape it wants.
+        ValueError: names the argument, the shape found and the shape expected.
     """
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     arrays |= {"viewmats": viewmats, "Ks": Ks}
@@ -67,11 +67,11 @@ def check_inputs(
     if viewmats.ndim != len(lead) + 3:
         wanted = ", ".join(map(str, (*lead, "C", 4, 4)))
         raise ValueError(
-            f"viewmats must have shape ({wanted}); got {tuple(viewmats.shape)}. One camera is viewmats[None]"
+            f"viewmats must have shape ({wanted}); got {tuple(viewmats.shape)}; one camera: viewmats[None]"
         )
     num_cameras = viewmats.shape[-3]
     _expect("viewmats", viewmats, (*lead, num_cameras, 4, 4), "leading axes as in means")
-    _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one for each of viewmats; one camera is Ks[None]")
+    _expect("Ks", Ks, (*lead, num_cameras, 3, 3), "one for each of viewmats; one camera: Ks[None]")
     if 0 in (*lead, num_cameras):
         raise ValueError(f"viewmats must hold at least one camera of one scene; got {tuple(viewmats.shape)}")
     colors = _check_colors(colors, plan, lead, num_cameras, n)
@@ -86,19 +86,19 @@ def check_inputs(
     channels = colors.shape[-1]
     if backgrounds is not None:
         wanted = (*lead, num_cameras, channels)
-        _expect("backgrounds", backgrounds, wanted, "one row a camera, as wide as colors")
+        _expect("backgrounds", backgrounds, wanted, "one row per camera, as wide as colors")
         backgrounds = flat(backgrounds, (num_cameras, channels))
     if features is not None:
         _expect("features", features, (*lead, n, None), lead_words)
         features = flat(features, features.shape[-2:], stored=True)
     if means2d_offset is not None:
         wanted = (*lead, num_cameras, n, 2)
-        _expect("means2d_offset", means2d_offset, wanted, "a pixel offset a camera and Gaussian")
+        _expect("means2d_offset", means2d_offset, wanted, "a pixel offset per camera and Gaussian")
         means2d_offset = flat(means2d_offset, (num_cameras, n, 2))
     tile_mask = None
     if roi is not None:
         inner = (num_cameras, plan.height, plan.width)
-        _expect("roi", roi, (*lead, *inner), "a pixel mask a camera; one camera's is roi[None]")
+        _expect("roi", roi, (*lead, *inner), "a pixel mask per camera; one camera: roi[None]")
         if roi.dtype != bool:
             raise ValueError(f"roi must hold booleans, True where a pixel is wanted; got {roi.dtype}")
         tile_mask = _tiles_with_a_pixel(jnp.asarray(roi, bool).reshape(scenes, *inner), plan.tile_size)

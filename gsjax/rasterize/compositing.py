@@ -1,12 +1,12 @@
 """Front-to-back alpha compositing (Kerbl et al. 2023, eq. 3) of one tile, and of all tiles.
 
 Arrays are [Gaussian, pixel] within a tile and [tile, Gaussian, pixel] within a batch of tiles. XLA:CPU cannot
-write two results from one loop, which is why things are split as they are: the alphas of a chunk of Gaussians
-are stored once, in a stack that stays in cache, and whatever follows from them (the light that is left,
-colours, gradients) is a pass of cheap multiply-adds over that stack.
+write two results from one loop, so the work is split as follows: the alphas of a chunk of Gaussians are
+stored once, in a stack that stays in cache, and whatever is computed from them (the remaining light, colours,
+gradients) is a pass of cheap multiply-adds over that stack.
 
-Tiles are taken in batches. A batch walks its lists chunk by chunk until each of them has ended or has all its
-pixels opaque. So lists have any length, and one compiled program serves them all.
+Tiles are processed in batches. A batch walks its lists chunk by chunk until each list has ended or all its
+pixels are opaque. So lists can have any length, and one compiled program serves them all.
 """
 
 import math
@@ -21,34 +21,35 @@ from jaxtyping import Array, Bool, Float, Int
 from gsjax.rasterize.plan import DEFAULT_LIMITS, FEW_CHANNELS, Limits, Plan
 from gsjax.rasterize.sorting import argsort_keys
 
-SATURATION = 1e-6  # an alpha so close, relatively, to alpha_max is alpha_max
+SATURATION = 1e-6  # relative distance to alpha_max within which an alpha counts as saturated
 CHUNK = 8  # Gaussians whose alphas are stored together
 MANY_CHUNK = 32  # the same where many channels are composited, by matmul
 
 
 class Splats(NamedTuple):
-    """A list of projected Gaussians, front to back. An opacity of 0 is an empty slot."""
+    """A list of projected Gaussians, front to back. An opacity of 0 marks an empty slot."""
 
     means2d: Float[Array, "*list 2"]  # pixels
     conics: Float[Array, "*list 3"]
     opacities: Float[Array, "*list"]
-    values: Float[Array, "*list channels"]  # whatever is composited: colours, depth, features
+    values: Float[Array, "*list channels"]  # the composited values: colours, depth, features
 
 
 class Columns(NamedTuple):
-    """Splats as loops read them: in columns, for a gather of scalars is the quick one, opacities as logs."""
+    """Splats as loops read them: in columns, because gathers of scalars are fast, with opacities as logs."""
 
     u: Float[Array, "*list"]  # means2d
     v: Float[Array, "*list"]
     a: Float[Array, "*list"]  # conics
     b: Float[Array, "*list"]
     c: Float[Array, "*list"]
-    log_opacities: Float[Array, "*list"]  # -inf is an empty slot
-    values: tuple[Float[Array, "*list"], ...] | Float[Array, "*list channels"]  # many stay together
+    log_opacities: Float[Array, "*list"]  # -inf marks an empty slot
+    values: tuple[Float[Array, "*list"], ...] | Float[Array, "*list channels"]  # many channels stay together
 
 
 def in_columns(splats: Splats, limits: Limits) -> Columns:
-    """The same list. An opacity far below alpha_min is as good as 0, and its logarithm has a derivative."""
+    """The same list in columns. Opacities are bounded below alpha_min, where they have no effect, so that the
+    logarithm has a derivative."""
     logs = jnp.log(jnp.maximum(splats.opacities, 0.5 * limits.alpha_min))
     shapes = (*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.conics, -1, 0))
     few = splats.values.shape[-1] <= FEW_CHANNELS
@@ -56,14 +57,14 @@ def in_columns(splats: Splats, limits: Limits) -> Columns:
 
 
 class TileState(NamedTuple):
-    """Compositing of P pixels, as far as it has come."""
+    """The state of compositing of P pixels."""
 
     values: Float[Array, "*tiles channels pixels"]
     light: Float[Array, "*tiles pixels"]  # the transmittance; its negative once the pixel has ended
 
     @property
     def transmittance(self) -> Float[Array, "*tiles pixels"]:
-        """What light still passes."""
+        """The share of light that still passes."""
         return jnp.abs(self.light)
 
 
@@ -72,8 +73,8 @@ def start_tile(num_pixels: int, channels: int, dtype=jnp.float32) -> TileState:
 
     Args:
         num_pixels: P.
-        channels: of what is composited.
-        dtype: of values and light.
+        channels: number of composited channels.
+        dtype: type of values and light.
     """
     return TileState(jnp.zeros((channels, num_pixels), dtype), jnp.ones(num_pixels, dtype))
 
@@ -85,10 +86,10 @@ def splat_alphas(
     u, v, a, b, c, log_opacities = (column[:, None] for column in columns[:6])
     dx, dy = pixels[:, 0] - u, pixels[:, 1] - v
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-    # In logarithms, since what ends in the exponential XLA:CPU stores; the rest it would work out many times.
+    # In logarithms, because XLA:CPU stores the result of the exponential; it would recompute anything else.
     log_alpha = log_opacities + jnp.minimum(power, 0.0)
     ceiling = math.log(limits.alpha_max)
-    saturated = log_alpha >= ceiling - SATURATION  # without gradient, there too where both are the same
+    saturated = log_alpha >= ceiling - SATURATION  # no gradient, also where both are equal
     clamped = jnp.where(saturated, ceiling, log_alpha)
     return jnp.exp(jnp.where(log_alpha >= math.log(limits.alpha_min), clamped, -jnp.inf))
 
@@ -99,9 +100,9 @@ def dimmed(
     """The light of a TileState behind a list.
 
     Args:
-        light: before the list, as in a TileState.
-        alphas: of the list, front to back.
-        limits: say where a pixel ends.
+        light: light in front of the list, as in a TileState.
+        alphas: alphas of the list, front to back.
+        limits: thresholds that determine where a pixel ends.
     """
     for alpha in alphas:
         after = light * (1 - alpha)
@@ -114,13 +115,13 @@ def splat_weights(
 ) -> Float[Array, "list pixels"]:
     """w_i = alpha_i T_i, and 0 from where the pixel has ended.
 
-    Every row multiplies its own T_i together, in list order and so to the same bits as `dimmed`: for a short
-    list that is cheaper than to store them all.
+    Every row computes its own product T_i, in list order and therefore bit for bit as `dimmed`: for a short
+    list this is cheaper than storing them all.
 
     Args:
         alphas: from `splat_alphas`.
-        light: before the list, as in a TileState.
-        limits: say where a pixel ends.
+        light: light in front of the list, as in a TileState.
+        limits: thresholds that determine where a pixel ends.
     """
     length = alphas.shape[0]
     row = np.arange(length)[:, None]
@@ -146,7 +147,7 @@ def weights_of_many(alphas, light, limits: Limits):
 
 @weights_of_many.defjvp
 def _weights_of_many_jvp(limits: Limits, primals, tangents):
-    """Tangents one Gaussian after the other: those of the products above would be products of products."""
+    """Tangents one Gaussian after the other: the tangents of the products above would be nested products."""
 
     def step(carry, entry):
         (light, d_light), (alpha, d_alpha) = carry, entry
@@ -170,14 +171,14 @@ def composite_tile(
 ) -> TileState:
     """Composite one list of Gaussians, front to back, over the pixels of one tile.
 
-    alpha_i = min(alpha_max, o_i exp(-d^T conic d / 2)) with contributions under alpha_min skipped; the pixel
-    ends before the Gaussian that would take its transmittance to min_transmittance. A pure function for one
-    tile: vmap it over many, and pass the state on to go through a long list piece by piece.
+    alpha_i = min(alpha_max, o_i exp(-d^T conic d / 2)) with contributions below alpha_min skipped; the pixel
+    ends before the Gaussian that would reduce its transmittance to min_transmittance. A pure function for one
+    tile: vmap it over many, and pass the state on to process a long list piece by piece.
 
     Args:
         splats: the list, [L] of each field.
         pixels: positions of the pixels, in the same coordinates as `splats.means2d`.
-        state: where an earlier piece of the list ended; an empty tile unless given.
+        state: the state after an earlier piece of the list (default: an empty tile).
         limits: where contributions start and saturate (their opacity then gets no gradient) and pixels end.
 
     Returns:
@@ -193,10 +194,10 @@ def composite_tile(
     if length <= chunk:
         return composite_columns(in_columns(splats, limits), pixels, state, limits)
 
-    def filled_up(a):  # with empty slots
+    def padded(a):  # with empty slots
         return jnp.pad(a, [(0, -length % chunk)] + [(0, 0)] * (a.ndim - 1))
 
-    columns = in_columns(jax.tree.map(filled_up, splats), limits)
+    columns = in_columns(jax.tree.map(padded, splats), limits)
     pieces = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), columns)
     return jax.lax.scan(
         lambda state, piece: (composite_columns(piece, pixels, state, limits), None), state, pieces
@@ -204,20 +205,20 @@ def composite_tile(
 
 
 def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits) -> TileState:
-    """`composite_tile` of one chunk.
+    """`composite_tile` for one chunk.
 
     Args:
         columns: the chunk.
-        pixels: [P, 2], relative to what the columns' means are.
-        state: so far.
-        limits: of alphas and transmittance.
+        pixels: [P, 2], in the same coordinates as the means in `columns`.
+        state: the state before the chunk.
+        limits: thresholds of alphas and transmittance.
     """
     alphas, dtype = splat_alphas(columns, pixels, limits), state.light.dtype
     if not isinstance(columns.values, tuple):
         weights, light = weights_of_many(alphas, state.light, limits)
         painted = jnp.matmul(columns.values.astype(dtype).T, weights, precision="highest")
         return TileState(state.values + painted, light)
-    # Every channel goes through the light on its own, which costs less than to store the weights.
+    # Every channel recomputes the light itself, which is cheaper than storing the weights.
     values, light = state.values, jnp.broadcast_to(state.light, state.values.shape)
     for alpha, value in zip(alphas, jnp.stack(columns.values).T.astype(dtype), strict=True):
         after = light * (1 - alpha)
@@ -228,7 +229,7 @@ def composite_columns(columns: Columns, pixels, state: TileState, limits: Limits
 
 
 def chunk_length(channels: int) -> int:
-    """Gaussians that one pass over a tile's pixels takes."""
+    """Number of Gaussians per pass over a tile's pixels."""
     return CHUNK if channels <= FEW_CHANNELS else MANY_CHUNK
 
 
@@ -241,7 +242,7 @@ class Lists(NamedTuple):
 
 
 class Batches(NamedTuple):
-    """Tiles that are read about equally far, side by side: [batches, batch, ...]."""
+    """Tiles grouped by similar numbers of entries read: [batches, batch, ...]."""
 
     tiles: Int[Array, "batches batch"]  # -1 where a batch is not full
     centers: Float[Array, "batches batch 2"]  # pixels
@@ -250,13 +251,13 @@ class Batches(NamedTuple):
 
 
 def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: Plan) -> Batches:
-    """All tiles by falling `length`, an estimate of how far each is read, of speed alone.
+    """All tiles in order of decreasing `length`, an estimate of the entries read, which affects only speed.
 
     Args:
-        lists: of all tiles.
-        length: entries.
-        channels: of what is composited; more make batches smaller.
-        plan: has the size of a batch.
+        lists: lists of all tiles.
+        length: estimated number of entries read from each list.
+        channels: number of composited channels; more channels make batches smaller.
+        plan: determines the size of a batch.
     """
     order = argsort_keys(jnp.iinfo(jnp.int32).max - length.astype(jnp.uint32), plan.sort)
     size = min(plan.batch_size(channels), order.shape[0])
@@ -269,14 +270,15 @@ def batch_tiles(lists: Lists, length: Int[Array, "tiles"], channels: int, plan: 
 
 
 def tile_pixels(plan: Plan, dtype) -> Float[Array, "pixels 2"]:
-    """Pixel centres relative to the tile's centre: small numbers, whose squares float32 holds exactly."""
+    """Pixel centres relative to the tile's centre: small numbers, whose squares are exact in float32."""
     offsets = np.arange(plan.tile_size) + 0.5 - plan.tile_size / 2
     x, y = np.meshgrid(offsets, offsets)
     return jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), dtype)
 
 
 def read_chunk(columns: Columns, lists: Lists, batch: Batches, first: Int[Array, ""], chunk: int):
-    """Ids and columns `first .. first + chunk - 1` of each tile of a batch; means from the tile's centre."""
+    """Ids and columns of entries `first .. first + chunk - 1` of each tile of a batch; means are relative to
+    the tile's centre."""
     entry = first + jnp.arange(chunk, dtype=jnp.int32)
     ids = lists.ids[jnp.minimum(batch.starts[:, None] + entry, lists.ids.shape[0] - 1)]
     piece = jax.tree.map(lambda column: column[ids], columns)
@@ -295,8 +297,8 @@ def still_read(
 
     Args:
         batch: the tiles.
-        first: how many entries of each list are read.
-        light: that the pixels of each have left.
+        first: number of entries of each list that have been read.
+        light: remaining light of the pixels of each tile.
     """
     return (first < batch.counts) & jnp.any(light > 0, axis=1)
 
@@ -304,7 +306,7 @@ def still_read(
 def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan):
     """Every tile's values [tiles, channels, pixels], transmittance [tiles, pixels], and entries read [tiles].
 
-    `reads` from an earlier call groups tiles that end early with their like; it does not change the result.
+    `reads` from an earlier call groups tiles that end equally early; it does not change the result.
     """
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
@@ -326,7 +328,7 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
         return None, (state.values, state.transmittance, jnp.minimum(read, batch.counts))
 
     _, outputs = jax.lax.scan(one_batch, None, batches)
-    # Where each tile stands in the batches; what fills up the last batch, -1, is the largest of keys.
+    # The position of each tile in the batches; the padding of the last batch, -1, is the largest key.
     place = argsort_keys(batches.tiles.ravel().astype(jnp.uint32), plan.sort)[: lists.counts.shape[0]]
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[place], outputs)
 
@@ -334,7 +336,7 @@ def composite_forward(splats: Splats, lists: Lists, reads: Int[Array, "tiles"] |
 def untile(
     tiles: Float[Array, "tiles channels pixels"], shape: tuple[int, ...], plan: Plan
 ) -> Float[Array, "*shape height width channels"]:
-    """The images of what was composited tile by tile, `shape` of them, each of the plan's size."""
+    """Images of the plan's size, [*shape] of them, assembled from tiles."""
     channels, edge, y = tiles.shape[1], plan.tile_size, len(shape)
     image = tiles.reshape(*shape, plan.tiles_y, plan.tiles_x, channels, edge, edge)
     image = image.transpose(*range(y + 1), y + 3, y + 1, y + 4, y + 2)

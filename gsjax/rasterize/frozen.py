@@ -1,10 +1,10 @@
-"""Views of Gaussians that stand still: projected and listed once, painted as often as their values change.
+"""Views of fixed Gaussians: projected and listed once, painted as often as their values change.
 
-Where values alone train, as features do on a scene that somebody else has fitted, a render would project,
-sort and list the same Gaussians in every step. What it finds is kept here instead, 28 bytes a Gaussian that
-the view shows and 4 a pair. Those that it does not show, for they are beside it or behind others, need no
-values. An image of many channels need not be there as a whole either: a strip of its tile rows can be
-painted, and used up, after the other.
+When only values are trained, such as features on an already fitted scene, a render would project, sort and
+list the same Gaussians in every step. The result is stored here instead, with 28 bytes per Gaussian that the
+view shows and 4 per pair. Gaussians that it does not show, because they are outside or occluded, need no
+values. Nor does an image of many channels have to exist as a whole: it can be painted and consumed strip by
+strip, in rows of tiles.
 """
 
 import dataclasses
@@ -23,17 +23,17 @@ from gsjax.rasterize.plan import Plan
 from gsjax.rasterize.projection import project_gaussians
 from gsjax.rasterize.rasterization import plan as _plan
 
-_OF_ROWS = ("rows", "means2d", "conics", "opacities")  # of a view, one for each Gaussian that it shows
+_OF_ROWS = ("rows", "means2d", "conics", "opacities")  # fields with one entry per Gaussian that is shown
 
 
 class FrozenView(NamedTuple):
-    """What a camera sees of N Gaussians, whatever they are painted with; or a strip of it.
+    """A camera's view of N Gaussians, independent of the values they are painted with; or a strip of it.
 
     Attributes:
         rows: which of the N are shown, in the order in which tiles list them.
-        means2d, conics, opacities: of these, as projected, in pixels of the image or of the strip.
-        ids: places in `rows`, of all tiles' lists, front to back, no further than they are read.
-        starts, counts: of each tile's list in `ids`.
+        means2d, conics, opacities: their projections, in pixels of the image or of the strip.
+        ids: indices into `rows`: the lists of all tiles, front to back, only as far as they are read.
+        starts, counts: start and length of each tile's list in `ids`.
     """
 
     rows: Int[Array, "*views seen"]
@@ -58,8 +58,8 @@ def freeze_views(
 ) -> tuple[FrozenView, Plan]:
     """The views [C, ...] of C cameras, and the plan that they are painted with. On the host.
 
-    Arguments as for `gsjax.rasterization`, its options too; gradients stop here. Gaussians that cannot be
-    drawn are in no list.
+    Arguments as for `gsjax.rasterization`, including its options; gradients stop here. Gaussians that cannot
+    be drawn are in no list.
 
     Raises:
         ValueError: as `gsjax.plan`.
@@ -68,21 +68,21 @@ def freeze_views(
     plan = _plan(*scene, viewmats, Ks, width, height, headroom=1.0, **options)
     frozen = [_freeze(*scene, viewmat, K, plan) for viewmat, K in zip(viewmats, Ks, strict=True)]
     if any(bool(overflow) for _, overflow in frozen):
-        raise RuntimeError("a plan that was made for these views did not hold them; please report this")
+        raise RuntimeError("the plan made for these views is too small for them; please report this as a bug")
     shown = [_shown(jax.device_get(view)) for view, _ in frozen]
     seen, pairs = (max(1, *(len(getattr(view, name)) for view in shown)) for name in ("rows", "ids"))
-    views = [filled_up(view, seen, pairs) for view in shown]
+    views = [padded_view(view, seen, pairs) for view in shown]
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *views), plan
 
 
-def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
-    """One view with longer `rows` and `ids`, so that views can be stacked: by the first of the N Gaussians,
+def padded_view(view: FrozenView, seen: int, pairs: int) -> FrozenView:
+    """One view with `rows` and `ids` padded, so that views can be stacked: with the first of the N Gaussians,
     which no tile lists for it. On the host.
 
     Args:
-        view: of one camera.
-        seen: length that `rows` and what goes with it are to have.
-        pairs: length that `ids` is to have.
+        view: the view of one camera.
+        seen: wanted length of `rows` and the fields that go with it.
+        pairs: wanted length of `ids`.
     """
 
     def more(a: np.ndarray, length: int) -> np.ndarray:
@@ -94,23 +94,23 @@ def filled_up(view: FrozenView, seen: int, pairs: int) -> FrozenView:
 
 
 def rows_within(megabytes: float, numbers: int, plan: Plan) -> int:
-    """Rows of tiles in a strip whose pixels, with so many numbers each, take no more memory; one at least.
+    """Number of tile rows in a strip whose pixels fit into the given memory; at least one.
 
     Args:
-        megabytes: what the pixels of a strip may take.
-        numbers: floats a pixel, of 4 bytes.
-        plan: of the view.
+        megabytes: memory for the pixels of a strip, in MiB.
+        numbers: floats per pixel, of 4 bytes each.
+        plan: plan of the view.
     """
     a_row = 4 * numbers * plan.tile_size * plan.width
     return int(max(1, min(plan.tiles_y, megabytes * 2**20 // a_row)))
 
 
 def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: int) -> tuple[FrozenView, Plan]:
-    """`rows` rows of tiles of one view, from `first` on, and their plan; below the image they are empty."""
+    """A strip of `rows` tile rows of a view, from `first` on, and its plan; empty below the image."""
     wide = plan.tiles_x
 
     def cut(a):
-        padded = jnp.pad(a, (0, rows * wide))  # a slice that would reach beyond begins earlier instead
+        padded = jnp.pad(a, (0, rows * wide))  # or a slice that reaches beyond the end would start earlier
         return jax.lax.dynamic_slice_in_dim(padded, first * wide, rows * wide)
 
     down = jnp.stack([jnp.zeros(()), first * plan.tile_size]).astype(view.means2d.dtype)
@@ -121,10 +121,10 @@ def strip_of(view: FrozenView, plan: Plan, first: Int[Array, ""] | int, rows: in
 def paint(
     view: FrozenView, values: Float[Array, "n d"], plan: Plan
 ) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
-    """The image of one view, sum_i w_i v_i without background, and its alphas. Differentiable by the values,
-    which are those of all Gaussians.
+    """The image of one view, sum_i w_i v_i without background, and its alphas. Differentiable in the values
+    of all Gaussians.
 
-    The weights are those of `gsjax.rasterization`, so the image is too.
+    The weights, and therefore the image, are those of `gsjax.rasterization`.
     """
     return paint_shown(view, values[view.rows], plan)
 
@@ -132,7 +132,7 @@ def paint(
 def paint_shown(
     view: FrozenView, values: Float[Array, "seen d"], plan: Plan
 ) -> tuple[Float[Array, "height width d"], Float[Array, "height width"]]:
-    """As `paint`, with the values of `view.rows` alone."""
+    """As `paint`, with values for `view.rows` only."""
     view = jax.lax.stop_gradient(view)
     splats = Splats(view.means2d, view.conics, view.opacities, values)
     lists = Lists(view.ids, view.starts, view.counts)
@@ -141,12 +141,12 @@ def paint_shown(
 
 
 def _shown(view: FrozenView) -> FrozenView:
-    """Without the Gaussians that no list has, and lists one after another. On the host."""
+    """The view without unlisted Gaussians, with its lists packed one after another. On the host."""
     counts, total = view.counts, int(view.counts.sum())
     starts = np.cumsum(counts) - counts
     ids = view.ids[np.repeat(view.starts - starts, counts) + np.arange(total)]
     there, first, place = np.unique(ids, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # tile by tile: what is painted together lies together
+    order = np.argsort(first)  # tile by tile, so that Gaussians painted together are adjacent in memory
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     rows = there[order]

@@ -1,14 +1,15 @@
 """`composite`, the compositing of all tiles, with its hand-written VJP.
 
-The backward pass reads the lists front to back as the forward pass did, and makes the same weights from the
-same alphas. With q_i = sum_c v_ic dL/dI_c, and what is behind Gaussian i, S_i = sum_{j>i} w_j q_j + T dL/dT,
+The backward pass reads the lists front to back like the forward pass, and computes the same weights from the
+same alphas. With q_i = sum_c v_ic dL/dI_c, and the contribution behind Gaussian i,
+S_i = sum_{j>i} w_j q_j + T dL/dT,
 
     dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i),  so  dL/dpower_i = w_i q_i - S_i alpha_i / (1 - alpha_i),
 
-where S begins as the whole, which the finished image knows: sum_c I_c dL/dI_c + T dL/dT. The pixels'
+where S starts as the total, which follows from the finished image: sum_c I_c dL/dI_c + T dL/dT. The pixels'
 gradients are summed to Gaussians by two matmuls: dL/dpower against the monomials 1, x, y, x^2, xy, y^2 of the
-tile's pixels, and w against dL/dI. Where nobody asks for the geometry's gradients, as when features are
-learned on a scene that stands, the last matmul is all there is.
+tile's pixels, and w against dL/dI. If the gradients of the geometry are not needed, as when features are
+learned on a fixed scene, only the last matmul remains.
 """
 
 from functools import partial
@@ -38,16 +39,16 @@ from gsjax.rasterize.compositing import (
 )
 from gsjax.rasterize.plan import Limits, Plan
 
-_SMALL = 1e-6  # 1 - alpha is not divided by less
+_SMALL = 1e-6  # lower bound of 1 - alpha as a divisor
 
 
 def composite(
     splats: Splats, lists: Lists, reads: Int[Array, "tiles"] | None, plan: Plan
 ) -> tuple[Float[Array, "tiles channels pixels"], Float[Array, "tiles pixels"], Int[Array, "tiles"]]:
-    """Values of all tiles, the transmittance left, and how far each list was read.
+    """Values of all tiles, the remaining transmittance, and the number of entries read from each list.
 
-    Differentiable as the plan says. `reads` from an earlier call makes this one faster where much is the
-    same; it does not change the result.
+    Differentiable in the plan's mode. `reads` from an earlier, similar call makes this one faster; it does
+    not change the result.
     """
     if plan.derivative == "forward":
         return composite_forward(splats, lists, reads, plan)
@@ -79,7 +80,7 @@ def _composite_bwd(plan: Plan, residuals, cotangents):
 
 
 def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Plan) -> Splats:
-    """By all that a splat has."""
+    """Gradients with respect to all fields of the splats."""
     (values, transmittance), (d_values, d_transmittance) = image, cotangents
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
@@ -106,7 +107,7 @@ def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Pla
         start = (jnp.int32(0), jnp.ones((len(tile), plan.tile_pixels), dtype), behind[tile], total)
         return jax.lax.while_loop(unfinished, step, start)[3], None
 
-    # One row a Gaussian: (u, v, A, B, C, log opacity), then its values.
+    # One row per Gaussian: (u, v, A, B, C, log opacity), then its values.
     rows = jnp.zeros((splats.opacities.shape[0], 6 + channels), dtype)
     rows, _ = jax.lax.scan(one_batch, rows, batch_tiles(lists, reads, channels, plan))
     visible = splats.opacities > 0
@@ -117,7 +118,7 @@ def _gradients(splats: Splats, lists: Lists, reads, image, cotangents, plan: Pla
 def _values_gradients(
     splats: Splats, lists: Lists, reads, d_values: Float[Array, "tiles channels pixels"], plan: Plan
 ) -> Float[Array, "n channels"]:
-    """By the values alone: w^T dL/dI."""
+    """Gradients with respect to the values only: w^T dL/dI."""
     dtype, channels = splats.opacities.dtype, splats.values.shape[1]
     chunk, pixels = chunk_length(channels), tile_pixels(plan, dtype)
     columns = in_columns(splats._replace(values=splats.values[:, :0]), plan.limits)
@@ -147,13 +148,13 @@ def _values_gradients(
 
 
 def _monomials(pixels: Float[Array, "pixels 2"]) -> Float[Array, "pixels 8"]:
-    """1, x, y, x^2, xy, y^2, and two columns of zeros: eight is a width that matmuls are made for."""
+    """1, x, y, x^2, xy, y^2, and two columns of zeros: matmuls are efficient for a width of eight."""
     x, y = pixels[:, 0], pixels[:, 1]
     return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y, 0 * x, 0 * x], axis=-1)
 
 
 def _chunk_gradients(piece: Columns, d_image, light, behind, *, pixels, monomials, limits: Limits):
-    """(light, S) behind one chunk of one tile, and its rows of gradients: geometry, then values."""
+    """(light, S) behind one chunk of one tile, and the chunk's rows of gradients: geometry, then values."""
     alphas = splat_alphas(piece, pixels, limits)
     weights, light = weights_of_many(alphas, light, limits)
     if isinstance(piece.values, tuple):
@@ -180,7 +181,7 @@ def _chunk_gradients(piece: Columns, d_image, light, behind, *, pixels, monomial
 def _suffix(
     behind: Float[Array, "pixels"], passed: Float[Array, "list pixels"]
 ) -> Float[Array, "list pixels"]:
-    """S_i: what is behind, less what entries up to i have contributed."""
+    """S_i: `behind` less the contributions of entries up to i."""
     row = np.arange(passed.shape[0])[:, None]
     suffix = jnp.broadcast_to(behind, passed.shape)
     for j in range(passed.shape[0]):

@@ -1,8 +1,8 @@
-"""Numpy's functions as XLA custom calls, for what XLA:CPU does with one scalar at a time.
+"""Numpy functions as XLA custom calls, for operations that XLA:CPU does one scalar at a time.
 
-The call hands XLA's own buffers to numpy. It speaks XLA's foreign function interface (xla/ffi/api/c_api.h,
-which jaxlib ships) through ctypes and needs no compiler. Unlike `jax.pure_callback` it copies nothing, and it
-cannot hang on a machine with a single core.
+The call passes XLA's own buffers to numpy. It implements XLA's foreign function interface
+(xla/ffi/api/c_api.h, which jaxlib ships) through ctypes and needs no compiler. Unlike `jax.pure_callback` it
+copies nothing, and it cannot hang on a machine with a single core.
 """
 
 import contextlib
@@ -15,13 +15,13 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-_EXTENSION_METADATA = 1  # XLA asks which version of the interface a handler speaks
-_VERSION = (0, 1)  # the oldest that has what is used here: newer runtimes accept it for a year at least
+_EXTENSION_METADATA = 1  # XLA asks which version of the interface a handler implements
+_VERSION = (0, 1)  # the oldest version with what is used here: newer runtimes accept it for at least a year
 _INTERNAL_ERROR = 13
 
 
 def _struct(name: str, *fields) -> type[ctypes.Structure]:
-    """A C structure; every one of the interface opens with its size and a pointer to extensions."""
+    """A C structure; every structure of the interface starts with its size and a pointer to extensions."""
     head = [("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
     return type(name, (ctypes.Structure,), {"_fields_": head + list(fields)})
 
@@ -61,7 +61,7 @@ class _Extension(ctypes.Structure):
         ("struct_size", ctypes.c_size_t),
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),  # there if the type says so
+        ("metadata", ctypes.POINTER(_Metadata)),  # present if the type says so
     ]
 
 
@@ -69,11 +69,11 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArgs))
 
 
-_DTYPES = {4: np.int32, 8: np.uint32}  # XLA's numbers for what is passed here
+_DTYPES = {4: np.int32, 8: np.uint32}  # XLA's codes for the types that are passed here
 
 
 def _views(buffers) -> list[np.ndarray]:
-    """Arrays on the memory of these buffers."""
+    """Numpy arrays that share the memory of these buffers."""
     views = []
     for i in range(buffers.size):
         buffer = buffers.items[i].contents
@@ -90,7 +90,7 @@ def _views(buffers) -> list[np.ndarray]:
 def _handler(work: Callable[..., None]) -> ctypes._CFuncPtr:
     """`work(*inputs, output)` on numpy views, as a function that XLA can call."""
 
-    def called_by_xla(pointer):  # nothing that it raises would be heard: all is caught, Ctrl-C too
+    def called_by_xla(pointer):  # exceptions would be lost here, so all are caught, Ctrl-C included
         frame = pointer.contents
         try:
             if frame.extension:
@@ -114,10 +114,10 @@ _HANDLERS: dict[str, Any] = {}  # kept alive: XLA holds their addresses
 
 
 def register(name: str, work: Callable[..., None]) -> bool:
-    """Make `work(*inputs, output)`, which fills the output, known to XLA:CPU by this name.
+    """Register `work(*inputs, output)`, which fills the output, with XLA:CPU under this name.
 
     Returns:
-        whether that worked: another version of the interface may refuse it.
+        Whether registration succeeded: another version of the interface may refuse it.
     """
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
@@ -135,8 +135,8 @@ def register(name: str, work: Callable[..., None]) -> bool:
 
 
 def _let_checkpoints_repeat_calls() -> None:
-    """`jax.checkpoint` refuses effects that it was not told of. Ours may happen twice; JAX has no public way
-    to say so, and where its private one is another, `jax.checkpoint` says that it cannot."""
+    """Allow our calls under `jax.checkpoint`, which refuses unknown effects. Ours may be repeated; JAX has no
+    public way to declare that, and if the private one changes, `jax.checkpoint` raises its own error."""
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import effects, ffi
 
@@ -147,9 +147,9 @@ _let_checkpoints_repeat_calls()
 
 
 def call(name: str, result: jax.ShapeDtypeStruct, *arguments: Array) -> Array:
-    """What was registered by this name, of int32 and uint32 arrays. Under vmap it gets leading axes."""
-    # The work needs the interpreter. An effect is waited for before Python ends; else a program that leaves
-    # while a call is under way would hang. XLA cannot split effects over devices: there, programs must wait.
+    """Call the function registered under this name on int32 and uint32 arrays; vmap adds leading axes."""
+    # The work needs the interpreter. Effects are awaited before Python exits; otherwise a program that exits
+    # during a call would hang. XLA cannot split effects over several devices: there, programs must wait.
     return jax.ffi.ffi_call(
         name, result, vmap_method="broadcast_all", has_side_effect=_num_cpu_devices() == 1
     )(*arguments)
@@ -158,5 +158,5 @@ def call(name: str, result: jax.ShapeDtypeStruct, *arguments: Array) -> Array:
 def _num_cpu_devices() -> int:
     try:
         return jax.device_count("cpu")
-    except RuntimeError:  # JAX was told to do without
+    except RuntimeError:  # JAX is configured without the CPU
         return 0

@@ -1,8 +1,8 @@
-"""A Plan: the static half of a rasterization. Image size, options, capacities; never a value of a scene.
+"""A Plan: the static half of a rasterization. Image size, options, capacities; never values of a scene.
 
-The idea is jax-md's neighbour list: shapes are fixed ahead with some headroom, the device reports what it
-needed, and the host re-plans when that was too little. Capacities climb one geometric ladder, so that a
-scene that grows compiles a few variants in all, and re-planning on a known rung compiles nothing.
+The idea is jax-md's neighbour list: shapes are fixed in advance with some headroom, the device reports what
+it needed, and the host re-plans if the capacity was too small. Capacities climb one geometric ladder, so that
+a growing scene compiles only a few variants, and re-planning on a known rung compiles nothing.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ RASTERIZE_MODES = ("classic", "antialiased")
 DERIVATIVES = ("reverse", "forward")
 TILE_SIZES = (4, 8, 16, 32)
 SORTS = ("host", "device")
-FEW_CHANNELS = 8  # up to here multiply-adds are cheaper than many tiny matmuls
+FEW_CHANNELS = 8  # up to this many, multiply-adds are cheaper than many tiny matmuls
 _BATCH_PIXELS = {"cpu": 2048, "gpu": 16384}
-"""Pixels composited together. A batch ends with its longest list: small ones wait less. A GPU is to be kept
-busy."""
-_LEAST_PIXELS = 512  # of a batch, however many channels there are: tiny matmuls take a third longer on a CPU
+"""Pixels composited together. A batch ends with its longest list, so small batches wait less; a GPU needs
+large ones to stay busy."""
+_LEAST_PIXELS = 512  # per batch, even with many channels: tiny matmuls take a third longer on a CPU
 
 
 class Limits(NamedTuple):
-    """Where compositing starts and ends. What the field agrees on (Kerbl et al. 2023) is the default."""
+    """Thresholds where compositing starts, saturates and ends; defaults as in Kerbl et al. 2023."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
@@ -41,26 +41,26 @@ DEFAULT_LIMITS = Limits()
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Options and capacities of one kind of call. Frozen, hashable, and a pytree without leaves.
+    """Options and capacities for one kind of call. Frozen, hashable, and a pytree without leaves.
 
     Attributes:
         width, height: image size in pixels.
-        capacity: Gaussian-tile pairs that one camera may have, and twice the tile rows that its Gaussians may
+        capacity: most Gaussian-tile pairs of one camera, and twice the most tile rows that its Gaussians may
             cross.
         near_plane, far_plane: depths between which Gaussians are drawn, metres.
         eps2d: variance added to projected Gaussians, square pixels.
-        sh_degree: None when colours are values, else the degree their coefficients are read to.
+        sh_degree: None if colours are values, else the degree up to which their coefficients are used.
         render_mode: RGB, D (accumulated depth), ED (expected depth), RGB+D, RGB+ED.
-        rasterize_mode: classic, or antialiased (opacity scaled by what the dilation spread out).
+        rasterize_mode: classic, or antialiased (opacity compensated for the dilation of small splats).
         derivative: "reverse" for the hand-written VJP, "forward" for jvp, linearize and Gauss-Newton.
-        alpha_min: a fainter contribution is skipped.
+        alpha_min: fainter contributions are skipped.
         alpha_max: where a single contribution saturates.
-        min_transmittance: a pixel ends before the Gaussian that would take its transmittance to this.
-        max_per_tile: Gaussians of a tile that are drawn, nearest first; None for all. With a number the image
-            is an approximation, and Gaussians left out get no gradient.
+        min_transmittance: a pixel ends before the Gaussian that would reduce its transmittance to this.
+        max_per_tile: most Gaussians drawn per tile, nearest first; None for all. With a number the image is
+            an approximation, and omitted Gaussians get no gradient.
         tile_size: edge of a tile, pixels. Small tiles have fewer pixel pairs, large ones shorter lists.
-        tiles_per_batch: tiles composited together (default: 2048 pixels, on a GPU 16384); of speed alone.
-        sort: "host" for numpy's sort where XLA runs on the CPU, "device" for XLA's own; of speed alone.
+        tiles_per_batch: tiles composited together (default: 2048 pixels, 16384 on a GPU); affects only speed.
+        sort: "host" for numpy's sort where XLA runs on the CPU, "device" for XLA's own; affects only speed.
     """
 
     width: int
@@ -101,7 +101,7 @@ class Plan:
                 raise ValueError(f"{name} must be a positive Python int (it is static); got {value!r}")
         if not isinstance(self.capacity, int) or (self.capacity < 2 and self.capacity != 0):
             raise ValueError(
-                f"capacity must be a Python int of 2 or more, or 0, which is yet to be planned; "
+                f"capacity must be a Python int of 2 or more, or 0 if it is yet to be planned; "
                 f"got {self.capacity!r}"
             )
         for name in ("near_plane", "far_plane", "eps2d", *Limits._fields):
@@ -122,31 +122,31 @@ class Plan:
 
     @property
     def tiles_x(self) -> int:
-        """How many tiles lie side by side; the last one may reach out of the image."""
+        """Number of tiles per row; the last one may extend beyond the image."""
         return -(-self.width // self.tile_size)
 
     @property
     def tiles_y(self) -> int:
-        """How many tiles lie one above the other; the last one may reach out of the image."""
+        """Number of tiles per column; the last one may extend beyond the image."""
         return -(-self.height // self.tile_size)
 
     @property
     def num_tiles(self) -> int:
-        """How many tiles one image has."""
+        """Number of tiles of one image."""
         return self.tiles_x * self.tiles_y
 
     @property
     def limits(self) -> Limits:
-        """The three thresholds that compositing knows."""
+        """The three thresholds of compositing."""
         return Limits(self.alpha_min, self.alpha_max, self.min_transmittance)
 
     @property
     def tile_pixels(self) -> int:
-        """How many pixels one tile has."""
+        """Number of pixels of one tile."""
         return self.tile_size * self.tile_size
 
     def batch_size(self, channels: int) -> int:
-        """Tiles composited together: `tiles_per_batch`, or fewer the more channels there are."""
+        """Tiles composited together: `tiles_per_batch` if set, else a number that falls with the channels."""
         pixels = _BATCH_PIXELS["cpu" if jax.default_backend() == "cpu" else "gpu"]
         pixels = max(_LEAST_PIXELS, FEW_CHANNELS * pixels // max(channels, FEW_CHANNELS))
         return self.tiles_per_batch or max(1, pixels // self.tile_pixels)
@@ -156,7 +156,7 @@ class Plan:
 
         Raises:
             ValueError: `needed` is negative, or 2^31 - 1, which stands for more than can be counted; or
-                `headroom` is below 1, under which re-planning would never end.
+                `headroom` is below 1, with which re-planning would never end.
         """
         if not isinstance(headroom, Real) or not headroom >= 1:
             raise ValueError(f"headroom must be 1 or more, so that what is needed fits; got {headroom!r}")
@@ -196,7 +196,7 @@ def with_room(
 
 
 def rung(pairs: float) -> int:
-    """The smallest capacity of the ladder that holds `pairs`."""
+    """The smallest capacity on the ladder that holds `pairs`."""
     capacity, steps = _LADDER_START, 0
     while capacity < pairs:
         steps += 1
@@ -205,7 +205,7 @@ def rung(pairs: float) -> int:
 
 
 class _Unset:
-    """Stands for "not given", so that a plan's own option can be told from an explicit one."""
+    """Stands for "not given", so that an explicit option can be distinguished from a plan's own."""
 
     def __repr__(self):
         return "UNSET"
@@ -218,15 +218,15 @@ OPTION_NAMES = tuple(f.name for f in dataclasses.fields(Plan) if f.name not in _
 
 
 def resolve(plan: Plan | None, width: int, height: int, options: dict[str, Any]) -> Plan:
-    """The plan a call runs under; without one, a plan of the given options whose capacity is still 0.
+    """The plan that a call runs under; without one, a plan with the given options whose capacity is still 0.
 
     Args:
-        plan: the caller's, or None.
-        width, height: of the image, pixels.
-        options: by name; those that are UNSET are the plan's, or else the default.
+        plan: the caller's plan, or None.
+        width, height: image size in pixels.
+        options: options by name; those that are UNSET come from the plan, or else are the defaults.
 
     Raises:
-        ValueError: an explicit option contradicts the plan, or that is none.
+        ValueError: an explicit option contradicts the plan, or `plan` is not a Plan.
     """
     if not isinstance(plan, Plan | None):
         raise ValueError(f"plan must be a gsjax.Plan, from gsjax.plan(...); got {type(plan).__name__}")

@@ -15,7 +15,7 @@ from gsjax.rasterize.lanes import columns_in_lanes, flat, in_lanes
 from gsjax.rasterize.plan import Plan
 
 MIN_COMPENSATION = 0.005  # floor of the antialiasing factor
-HEADROOM = 1e8  # by so much less than the largest float are variances and determinants that are drawn
+HEADROOM = 1e8  # factor by which drawn variances and determinants stay below the largest float
 
 
 class Projected(NamedTuple):
@@ -27,7 +27,7 @@ class Projected(NamedTuple):
     opacities: Float[Array, "n"]  # after antialiasing
     extents: Float[Array, "n 2"]  # half-widths of the box where alpha reaches alpha_min, pixels; else 0
     visible: Bool[Array, "n"]
-    culled: Int[Array, ""]  # rows refused for their values: not finite, no rotation, no area
+    culled: Int[Array, ""]  # rows rejected for their values: not finite, no rotation, no area
 
 
 def _all_finite(columns: list[Array]) -> Bool[Array, "rows lanes"]:
@@ -35,15 +35,15 @@ def _all_finite(columns: list[Array]) -> Bool[Array, "rows lanes"]:
 
 
 def _stored(flags: Bool[Array, "rows lanes"]) -> Bool[Array, "rows lanes"]:
-    """The same flags, stored: XLA:CPU would work them out again in each of the places where they are used.
+    """The same flags, stored in memory: XLA:CPU would recompute them at each use.
 
-    It does so with everything but what it deems expensive, such as a square root; barriers it drops.
+    It recomputes everything except what it considers expensive, such as a square root, and drops barriers.
     """
     return jnp.sqrt(flags.astype(jnp.float32)) > 0.5
 
 
 def _rotate(matrix: Float[Array, "3 3"], vector: list) -> list:
-    """By explicit products: a matmul may be less precise on accelerators."""
+    """Rotate by explicit products: a matmul may be less precise on accelerators."""
     return [sum(matrix[i, j] * vector[j] for j in range(3)) for i in range(3)]
 
 
@@ -53,7 +53,7 @@ def _to_camera(means, viewmat):
 
 @jax.custom_jvp
 def _quotient(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """a / b whose derivative does not square b: the determinant of a needle is 1e26."""
+    """a / b with a derivative that does not square b: the determinant of a needle can be 1e26."""
     return a / b
 
 
@@ -66,7 +66,7 @@ def _quotient_jvp(primals, tangents):
 
 def _rotation_columns(quats):
     """Columns of the rotation matrices of (not necessarily unit) quaternions."""
-    # Their length first, by a number near to it: the derivative of rsqrt holds its cube.
+    # First divide by a number near their length: the derivative of rsqrt contains its cube.
     largest = jax.lax.stop_gradient(jnp.stack([jnp.abs(c) for c in quats]).max(axis=0))
     w, x, y, z = (c / largest for c in quats)
     unit = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
@@ -79,15 +79,15 @@ def _rotation_columns(quats):
 
 
 def _project_local(local, quats, scales, opacities, viewmat, K, plan: Plan):
-    """Columns of (means2d, conics, opacities, variances, determinant), without a thought for bad values."""
+    """Columns of (means2d, conics, opacities, variances, determinant), without checks for bad values."""
     x, y, z = local
     fx, skew, cx, fy, cy = K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]
-    # Far outside the image the linearisation J would explode: its x/z is held near the frame.
+    # Far outside the image the linearisation J would blow up: its x/z is clamped to near the frame.
     margin_x, margin_y = 0.15 * plan.width / fx, 0.15 * plan.height / fy
     tx = jnp.clip(x / z, -cx / fx - margin_x, (plan.width - cx) / fx + margin_x)
     ty = jnp.clip(y / z, -cy / fy - margin_y, (plan.height - cy) / fy + margin_y)
     # Rows of M = J W R S, one entry for each of the Gaussian's axes. They divide last because XLA:CPU stores
-    # a quotient, while products and sums it would work out again wherever they are used.
+    # quotients, while it would recompute products and sums wherever they are used.
     row_u, row_v = [], []
     for axis, scale in zip(_rotation_columns(quats), scales, strict=True):
         in_x, in_y, in_z = _rotate(viewmat[:3, :3], axis)
@@ -125,18 +125,18 @@ def project_gaussians(
     """Project N Gaussians into one camera.
 
     A row that is not finite, has |q|^2 < 1e-12, no area on the image or z outside (near, far), or does not
-    reach into the frame, is not visible and its gradients are exactly zero: visibility is found first, on
-    values alone; then the same arithmetic runs on inputs in which such rows were replaced.
+    reach into the frame, is not visible and has gradients of exactly zero: visibility is determined first,
+    from values alone; then the same arithmetic runs on inputs in which such rows are replaced.
 
     Args:
         means, quats, scales, opacities: the Gaussians, as for `gsjax.rasterization`.
         usable: rows whose colours can be drawn.
-        viewmat, K: of the camera; world to camera, pixels.
+        viewmat, K: the camera: world to camera, and intrinsics in pixels.
         plan: image size and options.
         means2d_offset: added to the projected means, pixels.
     """
     n = means.shape[0]
-    # The gradients of x/z's bounds hold 1 / focal^2. A focal length of 0 fails too.
+    # The gradients of the bounds of x/z contain 1 / focal^2. A focal length of 0 fails too.
     slopes = jnp.stack([c / (f * f) for f in (K[0, 0], K[1, 1]) for c in (1.0, K[0, 2], K[1, 2])])
     camera_finite = jnp.isfinite(viewmat).all() & jnp.isfinite(K).all() & jnp.isfinite(slopes).all()
     viewmat = jnp.where(camera_finite, viewmat, jnp.eye(4, dtype=viewmat.dtype))
@@ -145,7 +145,7 @@ def project_gaussians(
     opacities, usable = in_lanes(opacities), in_lanes(usable)
     offset = [] if means2d_offset is None else columns_in_lanes(means2d_offset)
     sound = _all_finite([*means, *quats, *scales, opacities, *offset]) & usable & camera_finite
-    # Unlike jnp.clip this hands the whole gradient on at exactly 0 and 1.
+    # Unlike jnp.clip this passes the whole gradient at exactly 0 and 1.
     opacities = jnp.where(opacities < 0, 0.0, jnp.where(opacities > 1, 1.0, opacities))
 
     # First on values alone: which rows can be drawn, and how far they reach.
@@ -158,21 +158,21 @@ def project_gaussians(
         u, v = u + du, v + dv
     squared = sum(c * c for c in values[1])
     sound &= (squared >= MIN_SQUARED_NORM) & jnp.isfinite(squared)
-    # The gradient of 1 / det holds its square. A det of 0, infinity or NaN fails too.
-    large = [HEADROOM * c for c in (*variances, det)]  # and what the gradients multiply them with
+    # The gradient of 1 / det contains its square. A det of 0, infinity or NaN fails too.
+    large = [HEADROOM * c for c in (*variances, det)]  # allows for factors in the gradients
     has_area = _all_finite([u, v, *conics, *large, 1 / (det * det)])
     in_range = (z > plan.near_plane) & (z < plan.far_plane)
     culled = flat(~sound | (in_range & ~has_area), n).sum(dtype=jnp.int32)
 
     # The box in which alpha = o exp(-q/2) reaches alpha_min, that is q <= 2 ln(o / alpha_min).
     reach = 2 * jnp.log(jnp.maximum(alphas / plan.alpha_min, 1e-30))
-    # Rounding must not shave a pixel off.
+    # Rounding must not cut off a pixel.
     half_x, half_y = (jnp.sqrt(jnp.maximum(reach, 0.0) * c) * 1.0001 + 1e-3 for c in variances)
     in_frame = (u + half_x > 0) & (u - half_x < plan.width) & (v + half_y > 0) & (v - half_y < plan.height)
     visible = _stored(sound & in_range & has_area & (reach > 0) & in_frame)
 
-    # Then in earnest, on inputs whose other rows are harmless: their gradients are zero, and never 0 * inf.
-    # What is harmless depends on the camera: the first row it sees is. One that sees nothing is replaced.
+    # Then again, on inputs whose invisible rows are harmless: their gradients are zero, and never 0 * inf.
+    # What is harmless depends on the camera: its first visible row is. One that sees nothing is replaced.
     sees = visible.any()
     viewmat = jnp.where(sees, viewmat, jnp.eye(4, dtype=viewmat.dtype))
     K = jnp.where(sees, K, jnp.eye(3, dtype=K.dtype))

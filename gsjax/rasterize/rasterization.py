@@ -1,6 +1,6 @@
 """The public rasterizer: Gaussians and cameras in, images out. A pure function of arrays.
 
-Same meaning as gsplat's function of this name (https://docs.gsplat.studio), in JAX: jit, grad, jvp, vmap.
+The counterpart of gsplat's function of this name (https://docs.gsplat.studio), in JAX: jit, grad, jvp, vmap.
 """
 
 import math
@@ -24,17 +24,17 @@ from gsjax.rasterize.projection import Projected, project_gaussians
 
 
 class Meta(NamedTuple):
-    """What a rasterization has to say besides its images."""
+    """Outputs of a rasterization besides its images."""
 
     means2d: Float[Array, "*batch n 2"]  # pixels, where visible
     radii: Int[Array, "*batch n 2"]  # half-widths in pixels, (x, y); 0 where not visible
     depths: Float[Array, "*batch n"]  # z in the camera's frame, where visible
     features: Float[Array, "*batch height width channels"] | None
-    reads: Int[Array, "*batch tiles"]  # how far each tile's list was read before all its pixels were opaque
+    reads: Int[Array, "*batch tiles"]  # entries of each tile's list read until all its pixels were opaque
     pairs: Int[Array, "*batch"]  # Gaussian-tile pairs drawn
-    culled: Int[Array, "*batch"]  # Gaussians refused for their values (NaN, no rotation, no area)
+    culled: Int[Array, "*batch"]  # Gaussians rejected for their values (NaN, no rotation, no area)
     overflow: Bool[Array, "*batch"]  # the plan was too small: nothing was drawn
-    needed: Int[Array, "*batch"]  # what the plan's capacity has to hold
+    needed: Int[Array, "*batch"]  # capacity that the plan needs
 
 
 class _Views(NamedTuple):
@@ -90,45 +90,46 @@ def rasterization(
     """Draw 3D Gaussians (Kerbl et al. 2023) into one or many cameras.
 
     Differentiable in everything continuous: means, quats, scales, opacities, colors, features, viewmats, Ks,
-    backgrounds, means2d_offset. What cannot be drawn (NaN, a zero quaternion, no area, a colour whose square
-    overflows) is culled, counted in `meta.culled`, and receives gradients of exactly zero.
+    backgrounds, means2d_offset. Gaussians that cannot be drawn (NaN, a zero quaternion, no area, a colour
+    whose square overflows) are culled, counted in `meta.culled`, and receive gradients of exactly zero.
 
     Args:
         means: centres, metres.
         quats: rotations wxyz, need not be normalised.
-        scales: standard deviations along the own axes, metres.
+        scales: standard deviations along the Gaussian's own axes, metres.
         opacities: 0 to 1 (values outside are clipped).
-        colors: values of any dimension D, or SH coefficients [N, K, D] when `sh_degree` is given. An axis of
-            cameras before N, [..., C, N, D], makes them differ from camera to camera. Values of type
-            bfloat16 or float16 stay so until they are composited, in float32.
+        colors: values of any dimension D, or SH coefficients [N, K, D] when `sh_degree` is given. With an
+            axis of cameras before N, [..., C, N, D], they differ between cameras. bfloat16 and float16 values
+            keep their type until they are composited, in float32.
         viewmats: world to camera, OpenCV axes.
         Ks: intrinsics, pixels; pixel centres at +0.5.
         width, height: image size, static.
-        plan: capacities and options, from `gsjax.plan`. Without one the call plans by itself, which needs
+        plan: capacities and options, from `gsjax.plan`. Without one the call makes its own, which needs
             concrete values: under jit or vmap, plan outside and pass it in.
         near_plane, far_plane: depths between which Gaussians are drawn (default 0.01, 1e10).
         eps2d: variance added on the image, square pixels (default 0.3).
-        sh_degree: degree to which coefficients are read, 0 to 3 (default None: colors are values).
-        backgrounds: value behind everything, one row a camera, of the colours' dimension; black unless given,
-            and where its square is not finite (nothing counts that: it shows).
+        sh_degree: degree up to which coefficients are used, 0 to 3 (default None: colors are values).
+        backgrounds: value behind everything, one row per camera, with the colours' dimension (default:
+            black). One whose square is not finite also counts as black; this is not counted in `meta.culled`.
         render_mode: RGB (default), D (sum of w z), ED (D over alpha), RGB+D or RGB+ED: depth comes last.
         rasterize_mode: classic (default) or antialiased.
-        features: more values [N, F], composited in the same pass into `meta.features`, without background. In
-            half precision like the colours they stay so until they are composited.
-        roi: pixels that are wanted. Tiles without one are not drawn and show the background.
+        features: more values [N, F], composited in the same pass into `meta.features`, without background.
+            If they share a half-precision type with the colours, both keep it until they are composited.
+        roi: pixels of interest. Tiles without one are not drawn and show the background.
         means2d_offset: added to the projected means; pass zeros to read their gradient.
-        reads: `meta.reads` of an earlier call with a similar view. The image does not change, but tiles that
-            end early are then drawn beside their like, which is faster.
+        reads: `meta.reads` of an earlier call with a similar view. The image does not change, but tiles with
+            similar numbers of reads are batched together, which is faster.
         derivative: "reverse" (default, a fast VJP) or "forward" (jvp, linearize, Gauss-Newton).
-        alpha_min: a fainter contribution is skipped (default 1/255).
-        alpha_max: where one contribution saturates (default 0.99).
-        min_transmittance: a pixel ends before the Gaussian that would take its transmittance to this (default
-            1e-4).
-        max_per_tile: Gaussians of a tile that are drawn, nearest first (default None: all). With a number the
-            image is an approximation; `docs/choosing.md` says how good.
-        tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Of speed alone.
-        tiles_per_batch: tiles composited together (default: 2048 pixels, on a GPU 16384); of speed alone.
-        sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; of speed alone.
+        alpha_min: fainter contributions are skipped (default 1/255).
+        alpha_max: where a single contribution saturates (default 0.99).
+        min_transmittance: a pixel ends before the Gaussian that would reduce its transmittance to this
+            (default 1e-4).
+        max_per_tile: draw at most this many Gaussians per tile, nearest first (default None: all). With a
+            number the image is an approximation; `docs/choosing.md` says how good.
+        tile_size: edge of a tile, pixels (default 8); 4, 8, 16 or 32. Affects only speed.
+        tiles_per_batch: tiles composited together (default: 2048 pixels, 16384 on a GPU). Affects only speed.
+        sort: "host" (default) sorts with numpy where XLA runs on the CPU, "device" with XLA; affects only
+            speed.
 
     Returns:
         (render_colors, render_alphas, meta).
@@ -173,10 +174,10 @@ def plan(
     tiles_per_batch: int | None = UNSET,
     sort: str = UNSET,
 ) -> Plan:
-    """A plan whose capacity holds what the neediest of these cameras needs, times `headroom`.
+    """A plan whose capacity is the largest need among these cameras, times `headroom`.
 
     Arguments as for `rasterization`. Values must be concrete: call it outside jit. With `roi` the plan is for
-    calls that draw no more than that.
+    calls that draw no more than this region.
 
     Raises:
         ValueError: a shape or an option is wrong, or values are traced.
@@ -194,11 +195,11 @@ def _options(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def planned_for(views, bare: Plan, headroom: float) -> Plan:
-    """`bare` with a capacity that holds what these checked inputs need, times `headroom`.
+    """`bare` with a capacity for these checked inputs, times `headroom`.
 
     Args:
-        views: as `check_inputs` returns them.
-        bare: has the options.
+        views: inputs as returned by `check_inputs`.
+        bare: a plan with the options.
         headroom: 1 or more.
 
     Raises:
@@ -209,7 +210,7 @@ def planned_for(views, bare: Plan, headroom: float) -> Plan:
         raise ValueError(
             "planning looks at values, and these are traced (jit, vmap or scan). Call plan = "
             "gsjax.plan(means, quats, scales, opacities, viewmats, Ks, width, height, ...) outside, with "
-            "typical values, and pass plan=plan inside; meta.overflow tells if it becomes too small"
+            "typical values, and pass plan=plan inside; meta.overflow reports if it becomes too small"
         )
     if values[0].shape[1] == 0:
         return bare.grown(0, headroom)
@@ -234,8 +235,8 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
     def one_camera(means, quats, scales, opacities, usable, viewmat, K, offset):
         return project_gaussians(means, quats, scales, opacities, usable, viewmat, K, plan, offset)
 
-    # What a Gaussian is painted with decides too whether it can be drawn; so large that its square overflows,
-    # it would drown the gradients of all that share a pixel with it.
+    # Whether a Gaussian can be drawn also depends on its values: if their squares overflow, they would
+    # corrupt the gradients of all Gaussians that share a pixel with it.
     def paintable(a):
         a = a.astype(views.means.dtype)
         return jnp.isfinite(a * a).all(axis=(1, *range(3, a.ndim)))
@@ -252,7 +253,7 @@ def _project_all(views: _Views, plan: Plan) -> Projected:
 
 
 def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c n channels"]:
-    """The values each camera composites: colours, depth, features, as the plan asks."""
+    """The values that each camera composites: colours, depth and features, as the plan requires."""
     seen = projected.visible[..., None]
     columns = []
     if "RGB" in plan.render_mode:
@@ -268,7 +269,7 @@ def _paint(views: _Views, projected: Projected, plan: Plan) -> Float[Array, "b c
         columns.append(projected.depths[..., None])
     if views.features is not None:
         columns.append(jnp.where(seen, views.features[:, None], 0.0))
-    same = len({c.dtype for c in columns}) == 1  # half precision stays only where all are
+    same = len({c.dtype for c in columns}) == 1  # half precision is kept only if all have the same type
     dtype = columns[0].dtype if same else views.means.dtype
     return jnp.concatenate([c.astype(dtype) for c in columns], axis=-1)
 
@@ -301,8 +302,8 @@ def _draw(projected: Projected, values: Float[Array, "views n channels"], mask, 
     num_views, n, channels = values.shape
     if num_views * max(n, plan.capacity + LANES) >= 2**31:
         raise ValueError(
-            f"{num_views} views of {n} Gaussians and {plan.capacity} pairs each are more than 32-bit indices "
-            "reach; draw fewer cameras or scenes at a time"
+            f"{num_views} views of {n} Gaussians and {plan.capacity} pairs each exceed 32-bit indices; "
+            "draw fewer cameras or scenes at a time"
         )
     if n == 0:
         zeros = jnp.zeros(num_views, jnp.int32)
@@ -334,7 +335,7 @@ def _finish(image, alphas, views: _Views, projected: Projected, counts: _Counts,
     num_colors = views.colors.shape[-1] if "RGB" in plan.render_mode else 0
     colors = image[..., :num_colors]
     if views.backgrounds is not None and num_colors:
-        # As with colours: one whose square overflows would overflow the gradients too.
+        # As with colours: a background whose square overflows would make the gradients overflow too.
         usable = jnp.isfinite(jax.lax.stop_gradient(views.backgrounds) ** 2)
         backgrounds = jnp.where(usable, views.backgrounds, 0.0)
         colors = colors + (1 - alphas) * backgrounds[:, :, None, None, :]

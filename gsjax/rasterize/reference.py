@@ -1,8 +1,8 @@
-"""The rasterizer written as slowly and plainly as can be: every Gaussian at every pixel, in float64.
+"""The rasterizer written as slowly and plainly as possible: every Gaussian at every pixel, in float64.
 
 It shares no code with the fast path. Its gradients are plain autodiff. It also marks the pixels whose value
-hangs on a comparison that rounding may turn the other way (the thresholds of alpha, the early stop,
-the order of nearly equal depths); there, two correct renderings may differ by up to 1/255.
+depends on a comparison that rounding could reverse (the thresholds of alpha, the early stop, the order of
+nearly equal depths); there, two correct renderings may differ by up to 1/255.
 """
 
 from typing import NamedTuple
@@ -15,18 +15,18 @@ from gsjax.geometry.spherical_harmonics import evaluate_sh
 
 _DOUBT = 1e-5  # relative distance to a threshold at which float32 may decide otherwise
 _TIE = 5e-7  # the same for two depths: a few units in the last place of float32
-_BLOCK = 256  # pixels at once; of speed and memory alone
-_VISIBLE = 1e-3  # behind less transmittance than this a flip changes a pixel by less than 4e-6
+_BLOCK = 256  # pixels at once; affects only speed and memory
+_VISIBLE = 1e-3  # below this transmittance a flip changes a pixel by less than 4e-6
 
 
 class Reference(NamedTuple):
     """The images of one camera, and which of their pixels may be off.
 
     Attributes:
-        colors: as `render_mode` says; depth comes last.
+        colors: channels selected by `render_mode`; depth comes last.
         alphas: 0 to 1.
-        features: None where none were given.
-        doubtful: pixels that hang on a comparison which rounding may turn the other way.
+        features: None if none were given.
+        doubtful: pixels that depend on a comparison which rounding could reverse.
     """
 
     colors: Float[Array, "height width d"]
@@ -47,7 +47,7 @@ def _rotation(q):
 
 
 def _splat(mean, quat, scale, opacity, viewmat, K, width, height, eps2d, antialiased):
-    """Image mean, conic, depth and opacity of one Gaussian, by the textbook."""
+    """Image mean, conic, depth and opacity of one Gaussian, by the textbook formulas."""
     rotation = _rotation(quat)
     covariance = rotation @ jnp.diag(scale**2) @ rotation.T
     x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
@@ -128,7 +128,7 @@ def rasterization_reference(
 
     x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
     pixels = jnp.stack([x, y], axis=-1).reshape(-1, 2)
-    # A few hundred pixels at a time, whose intermediate values are computed again for the gradient.
+    # A few hundred pixels at a time, whose intermediate values are recomputed for the gradient.
     pixels = jnp.pad(pixels, ((0, -len(pixels) % _BLOCK), (0, 0))).reshape(-1, _BLOCK, 2)
     blocks = jax.lax.map(jax.checkpoint(some_pixels), pixels)
     values, alphas, doubtful = (

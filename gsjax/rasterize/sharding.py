@@ -1,7 +1,7 @@
 """Cameras and scenes over a mesh of devices: each device draws its own, Gaussians are shared.
 
-Every camera's image depends on that camera and its scene alone, so drawing needs no communication. Only the
-backward pass does: a Gaussian that many devices drew receives the sum of what they have to say.
+The image of a camera depends only on that camera and its scene, so drawing needs no communication. Only the
+backward pass does: a Gaussian drawn by several devices receives the sum of their gradients.
 """
 
 import functools
@@ -34,20 +34,20 @@ def sharded_rasterization(
 
     Cameras (axis C of viewmats, Ks, backgrounds, roi, means2d_offset, reads, and of colors that have one) are
     split over the mesh axis `cameras`, scenes (the first leading axis of all arrays) over `scenes`. Gaussians
-    are whole on every device of their scene, and their gradients are summed over `cameras`. Images and every
-    field of `meta` come out split in the same way. Mesh axes named in neither repeat the work.
+    are replicated on every device of their scene, and their gradients are summed over `cameras`. Images and
+    every field of `meta` are split in the same way. Mesh axes named in neither repeat the work.
 
     Args:
-        mesh: of devices, from `jax.make_mesh`; with `jax.distributed` those of all processes.
-        cameras: the mesh axis, or a tuple of them, that cameras are split over; None leaves them together.
+        mesh: mesh of devices, from `jax.make_mesh`; with `jax.distributed`, of the devices of all processes.
+        cameras: the mesh axis, or a tuple of axes, over which to split cameras; None does not split them.
         scenes: the same for scenes, which then need a leading axis.
 
     Returns:
-        A function with the arguments of `gsjax.rasterization`. It may be called under jit, grad (a reverse
-        plan) and jvp (a forward plan). A plan is for the neediest camera of all, as ever.
+        A function with the arguments of `gsjax.rasterization`. It can be called under jit, grad (a reverse
+        plan) and jvp (a forward plan). As usual, a plan must fit the camera with the largest need.
 
     Raises:
-        ValueError: an axis is not of the mesh, or both are the same, or neither is given. When called: as
+        ValueError: an axis is not in the mesh, or both are the same, or neither is given. When called: as
             `gsjax.rasterization`, and if cameras or scenes do not divide evenly over their axis.
     """
     cameras, scenes = _names("cameras", cameras, mesh), _names("scenes", scenes, mesh)
@@ -63,7 +63,7 @@ def sharded_rasterization(
         options = {name: given[name] for name in OPTION_NAMES if given.get(name, UNSET) is not UNSET}
         width, height, plan = given["width"], given["height"], given.get("plan")
         plan = resolve(plan, width, height, options)
-        # Shapes alone, and those of the whole: a message about one device's part would puzzle its reader.
+        # Shapes only, and those of the whole arrays: a message about one device's shard would be confusing.
         shapes = {name: _shape_of(array) for name, array in arrays.items()}
         jax.eval_shape(functools.partial(check_inputs, plan), *map(shapes.get, _ARRAYS))
         _check_divides(arrays, mesh, cameras, scenes)
@@ -76,12 +76,12 @@ def sharded_rasterization(
 
 
 def _shape_of(array):
-    """What the checks look at, without how the array is split over an explicit mesh: their reshapes mind."""
+    """Shape and type for the checks, without sharding: their reshapes would not allow an explicit one."""
     return jax.ShapeDtypeStruct(array.shape, array.dtype) if hasattr(array, "dtype") else array
 
 
 def _placed(array, mesh: Mesh, spec: P):
-    """The array split as `spec` says, where types carry that (explicit mesh axes); else XLA sees to it."""
+    """The array sharded as in `spec` if the mesh has explicit axes; otherwise XLA takes care of it."""
     if array is None or AxisType.Explicit not in mesh.axis_types:
         return array
     return jax.reshard(array, NamedSharding(mesh, spec))
@@ -101,17 +101,17 @@ def _check_divides(arrays: dict[str, Any], mesh: Mesh, cameras, scenes) -> None:
     if scenes and means.ndim == 2:
         raise ValueError(
             f"means has no leading axis to split over mesh axis {_quoted(scenes)}; got shape {means.shape}, "
-            "wanted (B, N, 3). One scene is split by its cameras: cameras=... in place of scenes=..."
+            "wanted (B, N, 3). To split one scene by its cameras, pass cameras=... instead of scenes=..."
         )
     _check_even("means", "scenes", means.shape[0], mesh, scenes)
 
 
 def _check_even(argument: str, things: str, count: int, mesh: Mesh, axes: tuple[str, ...]) -> None:
-    parts = math.prod(mesh.shape[name] for name in axes)  # 1 where they are not split
+    parts = math.prod(mesh.shape[name] for name in axes)  # 1 if they are not split
     if count % parts:
         raise ValueError(
             f"{argument} holds {count} {things}, which do not divide evenly over the {parts} devices of mesh "
-            f"axis {_quoted(axes)}. Take a mesh whose axis divides {count}; or repeat one of the {things} in "
+            f"axis {_quoted(axes)}. Use a mesh whose axis divides {count}; or repeat one of the {things} in "
             f"every argument until there are {-(-count // parts) * parts}, and leave copies out of the loss"
         )
 
@@ -121,7 +121,7 @@ def _quoted(names: tuple[str, ...]) -> str:
 
 
 def _specs(arrays: dict[str, Any], plan: Plan, cameras, scenes) -> tuple[dict[str, P], P]:
-    """How each argument is split, and how every result is."""
+    """Partition specs of each argument, and of all results."""
     lead = arrays["means"].ndim - 2
     per_scene = P(*((scenes or None), *(None,) * (lead - 1))) if lead else P()
     per_camera = P(*per_scene, cameras or None)
@@ -138,7 +138,7 @@ def _draw(arrays: dict[str, Any], mesh: Mesh, cameras, scenes, plan: Plan):
     def own_part(arrays):
         return rasterization(**arrays, width=plan.width, height=plan.height, plan=plan)
 
-    # Loops inside start from constants, which are the same everywhere, and end with what differs; the check
-    # of varying axes refuses that. Without it gradients of shared inputs are summed all the same.
+    # Inner loops start from constants, which are replicated, and end with varying values; the check of
+    # varying axes rejects that. Without the check, gradients of shared inputs are still summed.
     split = jax.shard_map(own_part, mesh=mesh, in_specs=(specs,), out_specs=per_camera, check_vma=False)
     return split({name: _placed(array, mesh, specs[name]) for name, array in arrays.items()})

@@ -1,8 +1,8 @@
 """Sorts and running sums of 32-bit numbers: numpy's where XLA runs on the CPU, XLA's own elsewhere.
 
 XLA:CPU sorts with scalar comparisons: half a million keys take it 17 ms, numpy 1.1 ms; a running sum of a
-million takes it 2 ms, numpy 0.3. Binning is mostly that. Both ways give the same to the bit. Where the call
-to numpy (`host.py`) cannot be made, XLA's ways are used on the CPU too.
+million takes it 2 ms, numpy 0.3. Binning consists mostly of these. Both implementations agree bit for bit.
+Where the call to numpy (`host.py`) is not possible, XLA's own is used on the CPU too.
 """
 
 import math
@@ -22,7 +22,7 @@ def _sort_into(keys: np.ndarray, out: np.ndarray) -> None:
 
 
 def _argsort_into(keys: np.ndarray, out: np.ndarray) -> None:
-    # The position below the key makes every key unique, hence the order stable, and 64 bits sort fast.
+    # The position in the low bits makes every key unique, hence the order stable, and 64 bits sort fast.
     paired = keys.astype(np.uint64)
     paired <<= np.uint64(32)
     paired |= np.arange(keys.shape[-1], dtype=np.uint64)
@@ -38,7 +38,7 @@ def _repeat_into(values: np.ndarray, starts: np.ndarray, out: np.ndarray) -> Non
     rows = (a.reshape(math.prod(a.shape[:-1]), a.shape[-1]) for a in (values, starts, out))
     for row, begins, filled in zip(*rows, strict=True):
         steps = np.diff(row, prepend=row.dtype.type(0))
-        inside = np.searchsorted(begins, len(filled))  # starts do not fall
+        inside = np.searchsorted(begins, len(filled))  # starts are non-decreasing
         filled[:] = 0
         np.add.at(filled, begins[:inside], steps[:inside])
         np.cumsum(filled, dtype=filled.dtype, out=filled)
@@ -54,7 +54,7 @@ _AVAILABLE = all([register(name, work) for name, work in _WORK.items()])
 
 
 def _either(name: str, where: str, on_device: Callable, result, *arguments: Array) -> Array:
-    """Numpy's way if `where` is "host" and the platform is the CPU, else `on_device(*arguments)`."""
+    """Numpy's result if `where` is "host" and the platform is the CPU, else `on_device(*arguments)`."""
     if where == "device" or not _AVAILABLE:
         return on_device(*arguments)
     return jax.lax.platform_dependent(
@@ -63,7 +63,7 @@ def _either(name: str, where: str, on_device: Callable, result, *arguments: Arra
 
 
 def sort_keys(keys: UInt32[Array, "n"], where: str = "host") -> UInt32[Array, "n"]:
-    """The keys in ascending order. `where` is a plan's `sort`: "host", or "device" for XLA's own way."""
+    """The keys in ascending order. `where` is a plan's `sort`: "host", or "device" for XLA's own sort."""
     return _either("gsjax_sort", where, jnp.sort, jax.ShapeDtypeStruct(keys.shape, jnp.uint32), keys)
 
 
@@ -88,9 +88,9 @@ def repeat(
     """[length]: `values[i]` from `starts[i]` to the next start. `where` as in `sort_keys`.
 
     Args:
-        values: any, whose differences may wrap.
-        starts: not falling. Of several values that start at one place the last is meant.
-        length: of the result; what starts beyond is left out.
+        values: any values; their differences may wrap.
+        starts: non-decreasing. If several values start at the same place, the last one counts.
+        length: length of the result; values that start beyond it are left out.
     """
 
     def on_device(values, starts):

@@ -1,11 +1,11 @@
-"""Scenes that deform: what a field says of each Gaussian at a time, and the Gaussians there.
+"""Scenes that deform: a field that gives offsets for each Gaussian at a time, and the deformed Gaussians.
 
     mean' = mean + dmean,    scale' = exp(log s + ds)
-    q' = Exp(dw) q                    SurstSplat (papers/003, eq. 4): dw an axis times an angle
-    q' = normalize(q + dq)            GaussianClin (papers/004, eq. 3), with q of length 1
+    q' = Exp(dw) q                    SurstSplat, eq. 4: dw an axis times an angle
+    q' = normalize(q + dq)            GaussianClin, eq. 3, with q of length 1
 
-A field has an encoding of place and time, a small network on it, and a last layer that begins at zero, so
-that nothing moves before it was trained. Encodings are in `gsjax.scene.time_encodings`.
+A field consists of an encoding of position and time, a small network on it, and a last layer that is
+initialised to zero, so that nothing moves before training. Encodings are in `gsjax.scene.time_encodings`.
 """
 
 from dataclasses import dataclass
@@ -27,30 +27,31 @@ from gsjax.scene.time_encodings import HexPlane, Sinusoids, Voxels, init_hexplan
 
 @dataclass(frozen=True)
 class DeformationConfig:
-    """Sizes of a deformation field, and what it changes beside where Gaussians are, turned and sized."""
+    """Sizes of a deformation field, and what it changes besides positions, orientations and scales."""
 
     kind: Literal["hexplane", "mlp", "voxels"] = "hexplane"
-    """Encoding of place and time: six planes a level, of each pair of axes (Cao and Johnson 2023); sines of
-    both; or a dense grid of voxels in space and sines of the time (papers/003, section 2.1)."""
+    """Encoding of position and time: six planes per level, one for each pair of axes (Cao and Johnson 2023);
+    sinusoids of both; or dense voxels in space with sinusoids of the time (SurstSplat, section 2.1)."""
     rotation: Literal["exp", "add"] = "exp"
-    """An axis and angle before the rotation, as in SurstSplat, or a difference of quaternions, as in
+    """Axis and angle composed with the rotation, as in SurstSplat, or a difference of quaternions, as in
     GaussianClin."""
     resolution: int = 64
-    """Vertices an axis of the coarsest planes, or of the voxels."""
+    """Vertices per axis of the coarsest planes, or of the voxels."""
     time_resolution: int = 30
-    """Vertices along the time of all planes: about half of the frames, so that those between are learned."""
+    """Vertices along the time of all planes: about half the number of frames, so that nearby frames share
+    vertices."""
     levels: int = 2
-    """Of planes, each twice as fine in space as the one before."""
+    """Levels of planes, each twice as fine in space as the one before."""
     channels: int = 16
-    """Numbers at a vertex."""
+    """Channels per vertex."""
     frequencies: int = 6
-    """Of sines: 1, 2, 4, ... half periods over the box or the whole time."""
+    """Number of sinusoid frequencies: 1, 2, 4, ... half periods over the box or the whole time."""
     hidden: int = 64
-    """Width of the network."""
+    """Width of the network's hidden layers."""
     depth: int = 1
-    """Hidden layers of the network."""
+    """Number of hidden layers of the network."""
     semantic: bool = False
-    """Show the network the Gaussians' features."""
+    """Feed the Gaussians' features to the network."""
     color: bool = False
     """Change colours over time."""
     opacity: bool = False
@@ -67,13 +68,13 @@ class DeformationConfig:
 
 
 class Offsets(NamedTuple):
-    """What changes of N Gaussians; None of what does not.
+    """Offsets of N Gaussians; None for fields that do not change.
 
     Attributes:
-        means: metres.
+        means: offsets of the centres, metres.
         turns: axis times angle, radians; or, with four columns, differences of unit quaternions.
-        log_scales: of logarithms of the standard deviations.
-        logit_opacities, sh0, features: of these raw values.
+        log_scales: offsets of the logarithms of the standard deviations.
+        logit_opacities, sh0, features: offsets of these raw values.
     """
 
     means: Float[Array, "N 3"]
@@ -85,11 +86,11 @@ class Offsets(NamedTuple):
 
 
 class DeformationField(eqx.Module):
-    """(place, time) -> `Offsets`. All leaves are floats, so `jax.grad` takes the whole.
+    """(position, time) -> `Offsets`. All leaves are floats, so `jax.grad` applies to the whole module.
 
     Attributes:
-        encoding: of place and time.
-        layers: of the network, with a ReLU between them.
+        encoding: encoding of position and time.
+        layers: layers of the network, with a ReLU between them.
         config: sizes.
         bounds: least and largest coordinates of the scene's box, metres; its longest edge is the unit of
             `means`.
@@ -103,19 +104,19 @@ class DeformationField(eqx.Module):
     def __call__(
         self, means: Float[Array, "N 3"], time: Float[Array, ""], features: Float[Array, "N D"] | None = None
     ) -> Offsets:
-        """What changes of Gaussians at a time.
+        """Offsets of Gaussians at a time.
 
         Args:
-            means: canonical, metres; those outside the box count as on its surface.
-            time: 0 to 1 over the whole recording; beyond, as at its ends.
-            features: of the Gaussians, where the field is shown them or changes them.
+            means: canonical centres, metres; those outside the box are clamped to its surface.
+            time: 0 to 1 over the whole recording; clamped beyond its ends.
+            features: features of the Gaussians, if the field reads or changes them.
 
         Raises:
             ValueError: the field needs features and there are none.
         """
         config = self.config
         if features is None and (config.semantic or config.feature):
-            raise ValueError("features: this field is shown features or changes them, found None")
+            raise ValueError("features: expected an array, as this field reads or changes them, found None")
         values = self.encoding(within(means, self.bounds), time)
         if config.semantic:
             values = jnp.concatenate([values, features], axis=-1)
@@ -139,22 +140,24 @@ class DeformationField(eqx.Module):
 def init_deformation(
     key: PRNGKeyArray, config: DeformationConfig, bounds: ArrayLike, feature_size: int = 0
 ) -> DeformationField:
-    """A field that changes nothing yet.
+    """A field that does not change anything yet.
 
     Args:
-        key: for its first values.
+        key: random key for the initial values.
         config: sizes.
         bounds: [2, 3], least and largest coordinates of the scene, metres. They are static.
-        feature_size: of the Gaussians' features, where the field is shown them or changes them.
+        feature_size: size of the Gaussians' features, if the field reads or changes them.
 
     Raises:
-        ValueError: the box is none, or features are wanted that have no size.
+        ValueError: the box is invalid, or the field needs features and `feature_size` is 0.
     """
     box = np.asarray(bounds, np.float32)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
         raise ValueError(f"bounds: expected [2, 3], least and largest coordinates, found {box.tolist()}")
     if (config.semantic or config.feature) and feature_size < 1:
-        raise ValueError("feature_size: the field is shown features or changes them, found none")
+        raise ValueError(
+            f"feature_size: expected 1 or more, as the field reads or changes features, found {feature_size}"
+        )
     key, first = jax.random.split(key)
     encoding: HexPlane | Sinusoids | Voxels
     if config.kind == "hexplane":
@@ -177,7 +180,7 @@ def init_deformation(
 
 
 def _widths(config: DeformationConfig, feature_size: int) -> dict[str, int]:
-    """How many numbers of the last layer each field has."""
+    """Number of outputs of the last layer for each field of `Offsets`."""
     return {
         "means": 3,
         "turns": 3 if config.rotation == "exp" else 4,
@@ -189,11 +192,11 @@ def _widths(config: DeformationConfig, feature_size: int) -> dict[str, int]:
 
 
 def deform(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
-    """The Gaussians with what a field says is added to them.
+    """The Gaussians with the offsets of a field applied.
 
     Args:
-        gaussians: canonical.
-        offsets: of each.
+        gaussians: canonical Gaussians.
+        offsets: offsets of each Gaussian.
     """
     quats = normalize_quats(gaussians.quats)
     if offsets.turns.shape[-1] == 3:
@@ -210,13 +213,13 @@ def deform(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 
 
 class Nodes(NamedTuple):
-    """Places that a field is asked about instead of every Gaussian, whose answers are blended: what deforms
-    does so more smoothly than Gaussians lie (Sumner et al. 2007; SC-GS, Huang et al. 2024).
+    """Control nodes: the field is evaluated there instead of at every Gaussian, and the offsets are blended,
+    as deformations are smoother than Gaussians are dense (Sumner et al. 2007; SC-GS, Huang et al. 2024).
 
     Attributes:
-        rows: which Gaussians are nodes.
-        indices: which nodes each Gaussian blends.
-        weights: how much of each, 1 in sum.
+        rows: the Gaussians that are nodes.
+        indices: the nodes that each Gaussian blends.
+        weights: weights of these nodes, which sum to 1.
     """
 
     rows: Int[Array, "M"]
@@ -227,19 +230,19 @@ class Nodes(NamedTuple):
 def deform_by_nodes(
     gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes
 ) -> Gaussians:
-    """The scene at a time, where each Gaussian moves as the nodes around it do.
+    """The scene at a time, with each Gaussian moved by the nodes around it.
 
     Args:
-        gaussians: canonical.
-        field: what moves them.
+        gaussians: canonical Gaussians.
+        field: the deformation field.
         time: 0 to 1.
-        nodes: of these Gaussians.
+        nodes: control nodes among these Gaussians.
     """
     return deform(gaussians, _by_nodes(gaussians, field, time, nodes))
 
 
 def _by_nodes(gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], nodes: Nodes) -> Offsets:
-    """What changes of the Gaussians whose blends `nodes` has."""
+    """Offsets of the Gaussians that `nodes` blends."""
     features = None if gaussians.features is None else gaussians.features[nodes.rows]
     offsets = field(gaussians.means[nodes.rows], time, features)
 
@@ -258,14 +261,14 @@ def features_at(
     rows: Int[Array, "n"],
     nodes: Nodes | None = None,
 ) -> Float[Array, "T n D"]:
-    """Features of some Gaussians at some times; the field is asked only if it changes them.
+    """Features of selected Gaussians at several times; the field is evaluated only if it changes features.
 
     Args:
-        gaussians: canonical, with features.
-        field: what moves them; None moves nothing.
+        gaussians: canonical Gaussians with features.
+        field: the deformation field; None changes nothing.
         times: 0 to 1.
-        rows: which Gaussians.
-        nodes: that the field is asked about; None: it is asked about the Gaussians themselves.
+        rows: the selected Gaussians.
+        nodes: control nodes at which to evaluate the field; None evaluates it at the Gaussians themselves.
     """
     some = jax.tree.map(lambda leaf: leaf[rows], gaussians)
     still = jnp.broadcast_to(some.features, (len(times), *some.features.shape))
@@ -282,14 +285,14 @@ def features_at(
 def deform_rows(
     gaussians: Gaussians, field: DeformationField, time: Float[Array, ""], rows: Int[Array, "M"] | None = None
 ) -> Gaussians:
-    """The scene at a time, where only some Gaussians deform: the field is asked about those alone.
+    """The scene at a time, with only some Gaussians deformed: the field is evaluated only at those.
 
     Args:
-        gaussians: canonical.
-        field: what moves them.
+        gaussians: canonical Gaussians.
+        field: the deformation field.
         time: 0 to 1.
-        rows: which deform; all unless given. Rows beyond the last Gaussian (`gaussians.num`) fill up a list
-            to a static length and change nothing.
+        rows: the Gaussians that deform (default: all). Rows beyond the last Gaussian (`gaussians.num`) pad
+            the list to a static length and change nothing.
     """
     if rows is None:
         return deform(gaussians, field(gaussians.means, time, gaussians.features))

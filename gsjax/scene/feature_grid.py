@@ -1,20 +1,20 @@
 """A field over a box: features in a multiresolution hash grid, and a small network on them (Müller et al.
-2022, "Instant Neural Graphics Primitives", section 3). What it maps a place to is up to its user: logits of
-skinning weights (papers/001, section 3.3), or semantic features (papers/002, section 3.3).
+2022, "Instant Neural Graphics Primitives", section 3). The outputs are up to the user: logits of skinning
+weights (MotionSplicer, section 3.3), or semantic features (FD-3DGS, section 3.3).
 
-Level l has a resolution N_l, and b is such that they reach from the least to the most (eq. 2, 3):
+Level l has a resolution N_l, with b such that resolutions range from the least to the most (eq. 2, 3):
 
     N_l = floor(N_min b^l),    b = exp((ln N_max - ln N_min) / (L - 1))
 
 A position x, 0 to 1 within the box, lies at (N_l - 1) x + 1/2 among the vertices 0, 1, ... N_l of each axis,
-and its features are interpolated between the eight around it. Scale and offset are those of tiny-cuda-nn, the
-paper's own code, so that a field is here what it is elsewhere; the offset keeps the cells of all levels from
-beginning together on the faces of the box. Two things differ. tiny-cuda-nn scales by b^l N_min - 1, without
-the floor. And it has entries for N_l vertices an axis, so that the last, which half a cell needs, shares an
-entry with another; here it has its own.
+and its features are interpolated between the eight vertices around it. Scale and offset are those of
+tiny-cuda-nn, the paper's own code, so that a field means the same here as there; the offset prevents the
+cells of all levels from starting together on the faces of the box. There are two differences. tiny-cuda-nn
+scales by b^l N_min - 1, without the floor. And it has entries for N_l vertices per axis, so that the last
+vertex, which half a cell needs, shares an entry with another; here it has its own.
 
-A level of which all vertices, (N_l + 1)^3, fit the table is dense: each has an entry of its own. In finer
-ones they share entries by the paper's hash (eq. 4).
+A level whose vertices, (N_l + 1)^3, all fit the table is dense: each has its own entry. In finer levels they
+share entries by the paper's hash (eq. 4).
 """
 
 from dataclasses import dataclass
@@ -31,27 +31,27 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 _PRIMES = (1, 2_654_435_761, 805_459_861)
-_FIRST_FEATURES = 1e-4  # largest at the start, as in the paper
+_FIRST_FEATURES = 1e-4  # largest initial value, as in the paper
 
 
 @dataclass(frozen=True)
 class FeatureGridConfig:
-    """Sizes of a grid and of its network; the defaults are those of FD-3DGS (papers/002, section 4)."""
+    """Sizes of a grid and its network; the defaults are those of FD-3DGS, section 4."""
 
     levels: int = 16
-    """Resolutions, from the coarsest to the finest; a place has features of each."""
+    """Number of resolutions, from the coarsest to the finest; a position has features from each."""
     least_resolution: int = 16
-    """Of the coarsest level."""
+    """Resolution of the coarsest level."""
     most_resolution: int = 128
-    """Of the finest level."""
+    """Resolution of the finest level."""
     log2_entries: int = 20
-    """A level has at most 2 to this power entries; one with more vertices is hashed."""
+    """Base-2 logarithm of the most entries in a level; a level with more vertices is hashed."""
     features: int = 8
-    """Numbers in an entry."""
+    """Number of features per entry."""
     hidden: int = 128
     """Width of the network's hidden layers."""
     depth: int = 1
-    """How many hidden layers there are."""
+    """Number of hidden layers."""
 
     def __post_init__(self):
         ranges = {
@@ -78,29 +78,29 @@ class FeatureGridConfig:
     def resolutions(self) -> tuple[int, ...]:
         """N_l of each level, from the coarsest to the finest.
 
-        In float64, and a little more than the power before the floor: float32 makes 31 of 32.
+        In float64 with a small margin before the floor: float32 would turn 32 into 31.
         """
         powers = np.geomspace(self.least_resolution, self.most_resolution, self.levels)
         return tuple(int(n) for n in np.floor(powers + 1e-6))
 
     @property
     def entries(self) -> tuple[int, ...]:
-        """How many each level has."""
+        """Number of entries in each level."""
         return tuple(min((n + 1) ** 3, 2**self.log2_entries) for n in self.resolutions)
 
     @property
     def dense(self) -> tuple[bool, ...]:
-        """Whether each vertex of a level has an entry of its own."""
+        """Whether each vertex of a level has its own entry."""
         return tuple((n + 1) ** 3 <= 2**self.log2_entries for n in self.resolutions)
 
 
 class Located(NamedTuple):
-    """Where N positions lie in the grid: between which entries, and how near to each.
+    """N positions located in the grid: the entries around them and their interpolation weights.
 
     Attributes:
-        indices: rows of the grid's table, of the eight vertices around the position at each level.
-        weights: of those in the interpolation; 1 in sum, or all 0 where a coordinate is NaN.
-        valid: whether all three coordinates are numbers.
+        indices: rows of the grid's table for the eight vertices around the position at each level.
+        weights: interpolation weights of those vertices; they sum to 1, or are all 0 if a coordinate is NaN.
+        valid: whether no coordinate is NaN.
     """
 
     indices: Int[Array, "N L 8"]
@@ -109,44 +109,45 @@ class Located(NamedTuple):
 
 
 class FeatureGrid(eqx.Module):
-    """A function of the place. All leaves are floats, so `jax.grad` takes the whole.
+    """A function of position. All leaves are floats, so `jax.grad` applies to the whole module.
 
     Attributes:
-        table: features of all levels' entries, one level after another.
-        layers: of the network, with a ReLU between them.
+        table: features of the entries of all levels, one level after another.
+        layers: layers of the network, with a ReLU between them.
         config: sizes.
         bounds: least and largest coordinates of the box, metres.
     """
 
-    # All levels in one, so one gather and one scatter-add: a table a level takes 1.4 times as long on a CPU.
+    # One table for all levels, so one gather and one scatter-add: a table per level takes 1.4 times as long
+    # on a CPU.
     table: Float[Array, "entries F"]
     layers: tuple[eqx.nn.Linear, ...]
     config: FeatureGridConfig = eqx.field(static=True)
     bounds: tuple[tuple[float, ...], tuple[float, ...]] = eqx.field(static=True)
 
     def __call__(self, positions: Float[Array, "N 3"]) -> Float[Array, "N outputs"]:
-        """Outputs at positions in metres; those outside the box count as on its surface.
+        """Outputs at positions in metres; those outside the box are clamped to its surface.
 
-        A position with a NaN gives a row of NaN, and nothing else: gradients of the other rows are as they
-        would be without it.
+        A position with a NaN gives a row of NaN and affects nothing else: the gradients of the other rows are
+        as they would be without it.
         """
         return self.at(locate(self, positions))
 
     def at(self, located: Located) -> Float[Array, "N outputs"]:
-        """Outputs at positions that `locate` has found, for those that stay while the grid is trained."""
+        """Outputs at positions located by `locate`, which has to run only once for fixed positions."""
         values = jax.vmap(self.layers[-1])(self.hidden_at(located))
-        # Not before: the network's gradient would meet the NaN even where nobody asks for that row.
+        # Only here: inside the network, a NaN would reach the gradient even if that row is not used.
         return jnp.where(located.valid[:, None], values, jnp.nan)
 
     def hidden_at(self, located: Located) -> Float[Array, "N hidden"]:
-        """What the last layer is given, which is linear: whoever adds up outputs may add up these instead."""
+        """Inputs of the last layer, which is linear: these can be summed with weights instead of outputs."""
         values = self.encode(located)
         for layer in self.layers[:-1]:
             values = jax.nn.relu(jax.vmap(layer)(values))
         return values
 
     def encode(self, located: Located) -> Float[Array, "N features"]:
-        """What the network is given: the interpolated features of all levels; 0 where a position is NaN."""
+        """Inputs of the network: the interpolated features of all levels; 0 where a position is NaN."""
         found = interpolated(self.table, located.weights, located.indices)
         return found.reshape(len(found), -1)
 
@@ -157,14 +158,14 @@ def init_feature_grid(
     """A grid of small random features and a network with `outputs` outputs.
 
     Args:
-        key: for both.
+        key: random key for both.
         config: sizes.
-        outputs: how many numbers a position is mapped to.
-        bounds: [2, 3], least and largest coordinates of the box, metres. They are static: a function that was
-            compiled for a grid is compiled anew for one in another box.
+        outputs: number of outputs per position.
+        bounds: [2, 3], least and largest coordinates of the box, metres. They are static: a function compiled
+            for a grid is recompiled for a grid with another box.
 
     Raises:
-        ValueError: there are no outputs, or the box is none.
+        ValueError: there are no outputs, or the box is invalid.
     """
     if outputs < 1:
         raise ValueError(f"outputs: expected at least 1, found {outputs}")
@@ -184,15 +185,16 @@ def init_feature_grid(
 
 
 def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
-    """Where positions, in metres, lie in the grid; those outside the box count as on its surface.
+    """Locate positions, in metres, in the grid; those outside the box are clamped to its surface.
 
-    Weights have derivatives by the positions, except across faces of cells, where those jump, and outside.
+    Weights are differentiable in the positions, except across faces of cells, where derivatives jump, and
+    outside the box.
     """
     dtype = positions.dtype
     low, high = jnp.asarray(grid.bounds, dtype)
     valid = ~jnp.isnan(positions).any(axis=-1)
     inside = jnp.where(valid[:, None], (positions - low) / (high - low), 0.5)
-    # Not `clip`, which halves the derivative on the surface, where the outermost points of a scene are.
+    # Not `clip`, which halves the derivative on the surface, where the outermost points of a scene lie.
     inside = jnp.where(inside < 0, 0.0, jnp.where(inside > 1, 1.0, inside))
 
     edges = jnp.asarray(np.array(grid.config.resolutions) - 1, dtype)
@@ -208,16 +210,16 @@ def locate(grid: FeatureGrid, positions: Float[Array, "N 3"]) -> Located:
 def interpolated(
     table: Float[Array, "entries F"], weights: Float[Array, "N L C"], indices: Int[Array, "N L C"]
 ) -> Float[Array, "N L F"]:
-    """Sums of C rows of a table under weights, for each of L levels or planes: features between vertices.
+    """Weighted sums of C rows of a table for each of L levels or planes: interpolation between vertices.
 
-    One vertex after another, and positions along the last axis, XLA:CPU fuses gather, product and sum, a
-    sixth of the time of a gather that is written out; but not on the way back, for which the derivative has
-    the other form.
+    With one vertex after another and positions along the last axis, XLA:CPU fuses gather, product and sum,
+    which takes a sixth of the time of a materialised gather. The backward pass would not fuse, so the
+    derivative uses the other form.
 
     Args:
-        table: F features an entry.
-        weights: of C vertices for each of N points.
-        indices: of these vertices, rows of the table.
+        table: F features per entry.
+        weights: weights of C vertices for each of N points.
+        indices: rows of the table for these vertices.
     """
     columns, found = table.T, jnp.zeros((), table.dtype)
     for weight, rows in zip(
@@ -246,7 +248,7 @@ def _entries(config: FeatureGridConfig, cells: UInt32[Array, "N L 3"]) -> Int[Ar
     edges = np.array(config.resolutions) + 1
     strides = np.stack([np.ones_like(edges), edges, edges**2], axis=-1)
     factors = np.where(dense[:, None], strides, np.array(_PRIMES)).astype(np.uint32)
-    # The hash's products are modulo 2^32, as those of uint32 are.
+    # The products of the hash are modulo 2^32, as is arithmetic on uint32.
     begins = jnp.moveaxis(cells * factors, -1, 0)
     along = [(begin, begin + factor) for begin, factor in zip(begins, factors.T, strict=True)]
     mask = np.uint32(2**config.log2_entries - 1)

@@ -1,4 +1,4 @@
-"""The scene: Gaussians as one pytree of raw (unconstrained) parameters, and the integers beside them."""
+"""The scene: Gaussians as one pytree of raw (unconstrained) parameters, and separate integer tags."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -14,27 +14,28 @@ from jaxtyping import Array, Bool, Float, Integer
 from gsjax.geometry.rotations import MIN_SQUARED_NORM
 from gsjax.geometry.spherical_harmonics import num_sh_bases, rgb_to_sh0
 
-# Activated values are pulled into this range before their logarithm is taken, so that 0 and 1 stay finite.
+# Activated values are clipped to this range before their logarithm is taken, so that 0 and 1 stay finite.
 _MIN_SCALE = 1e-12
 _MIN_OPACITY = 1e-6
 SH_SIZES = tuple(num_sh_bases(degree) for degree in range(4))
 
 
 class Gaussians(eqx.Module):
-    """N Gaussians. All leaves are floats, so `jax.grad` takes the whole; an absent field is None and free.
+    """N Gaussians. All leaves are floats, so `jax.grad` applies to the whole; an absent field is None and
+    costs nothing.
 
     Attributes:
         means: centres in the world, metres.
         quats: orientations [w, x, y, z], of any non-zero length.
-        log_scales: logarithms of the standard deviations along the own axes, metres.
+        log_scales: logarithms of the standard deviations along the Gaussian's own axes, metres.
         logit_opacities: logits of the opacities.
         sh0: constant spherical-harmonics coefficient of each colour channel.
-        shN: the other coefficients, K in 4, 9, 16; None draws one colour from all sides.
+        shN: the other K - 1 coefficients, K in 4, 9, 16; None means a view-independent colour.
         features: any further values to composite.
 
     Raises:
-        ValueError: a field is no float array or has another shape, when it is constructed (tree
-            transformations such as `vmap` rebuild it unchecked, with whatever axes they put in front).
+        ValueError: a field is not a float array or has the wrong shape. Only construction checks this; tree
+            transformations such as `vmap` rebuild the module unchecked, with whatever leading axes they add.
     """
 
     means: Float[Array, "N 3"]
@@ -68,12 +69,12 @@ class Gaussians(eqx.Module):
 
     @property
     def num(self) -> int:
-        """How many Gaussians there are."""
+        """Number of Gaussians."""
         return self.means.shape[0]
 
     @property
     def scales(self) -> Float[Array, "N 3"]:
-        """Standard deviations along the own axes, metres."""
+        """Standard deviations along the Gaussian's own axes, metres."""
         return jnp.exp(self.log_scales)
 
     @property
@@ -93,11 +94,11 @@ class Gaussians(eqx.Module):
 
 
 class Tags(eqx.Module):
-    """What is known of each Gaussian and is no parameter; kept apart because it has no gradient.
+    """Attributes of each Gaussian that are not parameters; kept apart because they have no gradient.
 
     Attributes:
         labels: object ids; 0 is background.
-        alive: False for slots that hold no Gaussian at present.
+        alive: False for slots that currently hold no Gaussian.
     """
 
     labels: Integer[Array, "N"] | None = None
@@ -128,20 +129,20 @@ def gaussians_from_activated(
     features: ArrayLike | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Gaussians:
-    """Gaussians from values as one thinks of them: the inverse of the activations.
+    """Gaussians from activated values (scales, opacities, colours): the inverse of the activations.
 
     Args:
         means: [N, 3], metres.
         quats: [N, 4], w x y z.
-        scales: [N, 3], metres; smaller than 1e-12 counts as 1e-12.
-        opacities: [N], 0 to 1, pulled into [1e-6, 1 - 1e-6] so that the logits are finite.
-        colors: [N, 3], RGB 0 to 1, from which sh0 is made.
+        scales: [N, 3], metres; values below 1e-12 count as 1e-12.
+        opacities: [N], 0 to 1, clipped to [1e-6, 1 - 1e-6] so that the logits are finite.
+        colors: [N, 3], RGB 0 to 1, converted to sh0.
         shN: [N, K-1, 3] or None.
         features: [N, D] or None.
-        dtype: of all fields.
+        dtype: type of all fields.
 
     Raises:
-        ValueError: a shape is not the one wanted; the message names the argument.
+        ValueError: a shape is wrong; the message names the argument.
     """
     count = np.shape(means)[0] if np.ndim(means) else None
     wanted = {"means": 3, "quats": 4, "scales": 3, "opacities": None, "colors": 3}
@@ -156,7 +157,7 @@ def gaussians_from_activated(
 
 @jax.jit
 def _raw(activated: dict[str, Array]) -> tuple[Array, Array, Array]:
-    """Log scales, logits of opacities, and sh0. One program, for a count of Gaussians seldom comes twice."""
+    """Log scales, opacity logits, and sh0. A single program, because few counts of Gaussians occur twice."""
     opacities = jnp.clip(activated["opacities"], _MIN_OPACITY, 1 - _MIN_OPACITY)
     logits = jnp.log(opacities) - jnp.log1p(-opacities)
     log_scales = jnp.log(jnp.maximum(activated["scales"], _MIN_SCALE))
@@ -164,10 +165,10 @@ def _raw(activated: dict[str, Array]) -> tuple[Array, Array, Array]:
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of `parts`, in order. Missing SH degrees are filled with zeros, which draws the same.
+    """All Gaussians of `parts`, in order. Missing SH degrees are filled with zeros, which renders the same.
 
     Raises:
-        ValueError: there are no parts, or their features differ in dimension or are there only in some.
+        ValueError: there are no parts, or their features differ in dimension or are missing in some parts.
     """
     if not parts:
         raise ValueError("concatenate: got no parts, want at least one Gaussians")
@@ -184,7 +185,7 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
 
 
 def _with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians with zeros for coefficients up to `degree` that they lack."""
+    """The same Gaussians with missing coefficients up to `degree` set to zero."""
     missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
     if missing == 0:
         return gaussians
@@ -207,17 +208,17 @@ def _rows(tree: Tree, indices: Integer[Array, "M"]) -> Tree:
 
 
 def valid_rows(gaussians: Gaussians) -> Bool[np.ndarray, "N"]:
-    """Where all values are finite and the quaternion names a rotation. On the host."""
+    """Rows in which all values are finite and the quaternion is long enough to be a rotation. On the host."""
     valid = np.ones(gaussians.num, bool)
     for leaf in jax.tree.leaves(gaussians):
         valid &= np.isfinite(np.asarray(leaf)).all(axis=tuple(range(1, leaf.ndim)))
-    # In float64, so that 1e38 does not overflow to inf and a denormal does not vanish.
+    # In float64, so that squares of 1e38 do not overflow and those of denormals do not vanish.
     quats = np.where(valid[:, None], np.asarray(gaussians.quats, np.float64), 0.0)
     return valid & (np.sum(quats**2, axis=1) >= MIN_SQUARED_NORM)
 
 
 def cull_invalid(gaussians: Gaussians) -> tuple[Gaussians, int]:
-    """Without the rows that hold NaN, infinity or a quaternion of |q|^2 < 1e-12, and how many those were."""
+    """Remove rows with NaN, infinity or a quaternion of |q|^2 < 1e-12; returns the rest and how many went."""
     valid = valid_rows(gaussians)
     removed = int(np.sum(~valid))
     return (gaussians if removed == 0 else take(gaussians, np.flatnonzero(valid))), removed

@@ -1,12 +1,12 @@
-"""Handles: a few rigid motions that move many Gaussians, each by its own weights (linear blend skinning).
+"""Handles: a few rigid motions that move many Gaussians, each with its own weights (linear blend skinning).
 
-A handle p has a place c_p in the canonical scene, a rotation R_p about it and a translation T_p. A Gaussian
-with weights w moves as MotionSplicer has it (papers/001, section 3.3):
+A handle p has a centre c_p in the canonical scene, a rotation R_p about it and a translation T_p. A Gaussian
+with weights w moves as in MotionSplicer, section 3.3:
 
     mean' = sum_p w_p (R_p (mean - c_p) + c_p + T_p)
 
-Its printed orientation, quat(sum_p w_p R_p^T R(q)), turns the wrong way, and a sum of rotations is none; what
-blends them instead is chosen by `Blend`.
+The paper's formula for the orientation, quat(sum_p w_p R_p^T R(q)), turns the wrong way, and a sum of
+rotations is not a rotation; `Blend` selects how they are blended instead.
 """
 
 from functools import partial
@@ -22,17 +22,17 @@ from gsjax.geometry.rotations import MIN_SQUARED_NORM, multiply_quats, normalize
 from gsjax.scene.gaussians import Gaussians
 
 Blend = Literal["quaternion", "polar", "dual"]
-"""How rotations are blended: the normalised sum of quaternions, signs aligned with that of the largest
-weight; the rotation nearest to the sum of matrices; or dual quaternions (Kavan et al. 2008), which move the
-means too, along screws instead of straight lines, so that what twists keeps its volume."""
-_POLAR_ITERATIONS = 8  # doubles the digits each time, from errors below 1
+"""How rotations are blended: the normalised sum of quaternions, with signs aligned to that of the largest
+weight; the rotation nearest to the sum of matrices; or dual quaternions (Kavan et al. 2008), which also move
+the means, along screws instead of straight lines, so that twisted parts keep their volume."""
+_POLAR_ITERATIONS = 8  # each doubles the correct digits, from errors below 1
 
 
 class HandlePose(eqx.Module):
-    """Where P handles are.
+    """Poses of P handles.
 
     Attributes:
-        quats: rotations about the handles' own places, [w, x, y, z] of any non-zero length.
+        quats: rotations about the handles' own centres, [w, x, y, z] of any non-zero length.
         translations: metres.
     """
 
@@ -52,14 +52,14 @@ def skin(
     pose: HandlePose,
     blend: Blend = "quaternion",
 ) -> Gaussians:
-    """The Gaussians where their handles have moved them; all but means and quats is as it was.
+    """The Gaussians moved by their handles; only means and quats change.
 
     Args:
         gaussians: the canonical scene.
-        weights: of each Gaussian; they sum to 1.
-        centers: places of the handles in the canonical scene, metres.
-        pose: where they are.
-        blend: of rotations.
+        weights: weights of each Gaussian, which sum to 1.
+        centers: centres of the handles in the canonical scene, metres.
+        pose: poses of the handles.
+        blend: how rotations are blended.
     """
     if blend == "dual":
         turns, means = _dual(gaussians.means, weights, centers, pose)
@@ -73,7 +73,7 @@ def skin(
 def rigid_motions(
     centers: Float[Array, "P 3"], pose: HandlePose
 ) -> tuple[Float[Array, "P 3 3"], Float[Array, "P 3"]]:
-    """What each handle does to the canonical scene: x -> R x + offset, with R and offset."""
+    """The motion x -> R x + offset of each handle in the canonical scene, as R and offset."""
     rotations = quats_to_matrices(pose.quats)
     return rotations, centers + pose.translations - jnp.einsum("pij,pj->pi", rotations, centers)
 
@@ -84,13 +84,13 @@ def skin_means(
     centers: Float[Array, "P 3"],
     pose: HandlePose,
 ) -> Float[Array, "N 3"]:
-    """Where linear blend skinning takes points: two products of matrices, nothing of size N x P x 3.
+    """Points moved by linear blend skinning: two matrix products, nothing of size N x P x 3.
 
     Args:
-        means: canonical, metres.
+        means: canonical points, metres.
         weights: rows that sum to 1.
-        centers: of the handles, canonical, metres.
-        pose: where these are.
+        centers: canonical centres of the handles, metres.
+        pose: poses of the handles.
     """
     rotations, offsets = rigid_motions(centers, pose)
     blended = jnp.einsum("np,pij->nij", weights, rotations)
@@ -99,8 +99,8 @@ def skin_means(
 
 @partial(jax.jit, inline=True)
 def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
-    """Unit quaternions of the blended rotations. The sign of a quaternion means nothing, so each is aligned
-    with that of the largest weight; where the sum vanishes all the same, the latter stands alone."""
+    """Unit quaternions of the blended rotations. The sign of a quaternion is arbitrary, so each is aligned
+    with that of the largest weight; if the sum still vanishes, the latter is used alone."""
     signed, leading = _aligned(weights, normalize_quats(quats))
     total = jnp.einsum("np,npi->ni", weights, signed)
     vanishes = jnp.sum(total * total, axis=-1, keepdims=True) < MIN_SQUARED_NORM
@@ -110,16 +110,16 @@ def blend_quats(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Flo
 def _aligned(
     weights: Float[Array, "N P"], quats: Float[Array, "P 4"]
 ) -> tuple[Float[Array, "N P 4"], Float[Array, "N 4"]]:
-    """The quaternions on the half sphere of that of the largest weight, and the latter."""
+    """The quaternions on the same hemisphere as that of the largest weight, and the latter."""
     leading = quats[jnp.argmax(weights, axis=-1)]
     signs = jnp.where(leading @ quats.T < 0, -1.0, 1.0).astype(quats.dtype)
     return signs[..., None] * quats, leading
 
 
 def _polar(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Array, "N 4"]:
-    """Of the rotations nearest to the blended matrices, by Newton's iteration X <- (X + X^-T) / 2 (Higham
-    1986). Where handles are so far apart that the blended matrix is no longer near any, that of the largest
-    weight stands alone."""
+    """Quaternions of the rotations nearest to the blended matrices, by Newton's iteration X <- (X + X^-T) / 2
+    (Higham 1986). If handles are so far apart that the blended matrix is not near any rotation, that of the
+    largest weight is used alone."""
     rotations = quats_to_matrices(quats)
     blended = jnp.einsum("np,pij->nij", weights, rotations)
     lost = (jnp.linalg.det(blended) < 1e-3)[:, None, None]
@@ -130,7 +130,7 @@ def _polar(weights: Float[Array, "N P"], quats: Float[Array, "P 4"]) -> Float[Ar
 
 
 def _inverse(matrices: Float[Array, "N 3 3"]) -> Float[Array, "N 3 3"]:
-    """By cofactors: a solver would cost more than all the rest."""
+    """Inverses by cofactors: a solver would cost more than all the rest."""
     a, b, c = jnp.moveaxis(matrices, -2, 0)
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     return rows / jnp.sum(a * jnp.cross(b, c), axis=-1)[:, None, None]
@@ -142,7 +142,7 @@ def _dual(
     centers: Float[Array, "P 3"],
     pose: HandlePose,
 ) -> tuple[Float[Array, "N 4"], Float[Array, "N 3"]]:
-    """The turns and the places that blended dual quaternions give."""
+    """Rotations and means given by blended dual quaternions."""
     real, (_, offsets) = normalize_quats(pose.quats), rigid_motions(centers, pose)
     dual = multiply_quats(jnp.pad(offsets, ((0, 0), (1, 0))), real) / 2
     signed, leading = _aligned(weights, real)

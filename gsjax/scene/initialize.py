@@ -1,4 +1,4 @@
-"""A first scene from RGB-D: points, and Gaussians on them. All on the host."""
+"""An initial scene from RGB-D: points, and Gaussians on them. All on the host."""
 
 import warnings
 
@@ -12,7 +12,7 @@ from gsjax.geometry.cameras import unproject
 from gsjax.geometry.neighbors import neighbor_spacing, voxel_thin
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
-# A room is metres across: a median depth beyond this is almost surely a millimetre count read as metres.
+# Rooms are metres across: a median depth beyond this is almost certainly in millimetres, not metres.
 _SUSPICIOUS_DEPTH = 100.0
 
 
@@ -30,7 +30,8 @@ def points_from_rgbd(
         image: uint8 0 to 255 or floats 0 to 1.
         depth: z-depth in metres; 0, negative and non-finite values are invalid and dropped.
         viewmat: world to camera, OpenCV axes.
-        K: intrinsics in pixels, principal point for pixel centres at +0.5.
+        K: intrinsics in pixels, with pixel centres at +0.5.
+        stride: step between sampled pixels along rows and columns.
 
     Returns:
         Points in metres and colours 0 to 1, float32. Both are empty, with a warning, if no pixel has depth.
@@ -48,11 +49,11 @@ def points_from_rgbd(
     sampled = depth[rows, columns]
     valid = valid_depth(sampled)
     if not valid.any():
-        warnings.warn("depth: no pixel is positive and finite, so this picture gives no points", stacklevel=2)
+        warnings.warn("depth: no pixel is positive and finite, so this image gives no points", stacklevel=2)
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     if np.median(sampled[valid]) > _SUSPICIOUS_DEPTH:
         warnings.warn(
-            f"depth: the median is {np.median(sampled[valid]):.0f} m; are these millimetres? Want metres",
+            f"depth: the median is {np.median(sampled[valid]):.0f} m; are these millimetres? Expected metres",
             stacklevel=2,
         )
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64)
@@ -75,12 +76,12 @@ def estimate_normals(points: Float[np.ndarray, "N 3"], *, neighbors: int = 12) -
 
 
 def quats_from_normals(normals: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
-    """Unit quaternions wxyz that turn the z axis onto `normals`; a normal of no length gives the identity."""
+    """Unit quaternions wxyz that rotate the z axis onto `normals`; a zero normal gives the identity."""
     normals = np.asarray(normals, np.float64)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     up = np.array([0.0, 0.0, 1.0])
     normals = np.where(lengths > 1e-12, normals / np.maximum(lengths, 1e-12), up)
-    # An axis and its opposite are one disc; the upper one keeps away from the half turn, whose axis is free.
+    # Opposite normals give the same disc; the upper one avoids the half turn, whose axis is undefined.
     normals = np.where(normals[:, 2:] < 0, -normals, normals)
     half = np.column_stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))])
     return half / np.linalg.norm(half, axis=1, keepdims=True)
@@ -89,10 +90,10 @@ def quats_from_normals(normals: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "
 def spacing_scales(
     points: Float[np.ndarray, "N 3"], *, clip_quantile: float = 0.95
 ) -> Float[np.ndarray, "N"]:
-    """Neighbour spacing in metres, without outliers: capped at its `clip_quantile`, so that a lone point
-    gets no giant, and kept above a thousandth of that, so that coinciding points keep some extent."""
+    """Neighbour spacing in metres, without outliers: capped at its `clip_quantile`, so that an isolated point
+    does not become huge, and at least a thousandth of that, so that coinciding points keep some extent."""
     spacing = neighbor_spacing(np.asarray(points, np.float64))
-    # "lower" takes a value that occurs: between few points, interpolation would let the outlier through.
+    # "lower" takes a value that occurs: with few points, interpolation would let the outlier through.
     cap = max(float(np.quantile(spacing, clip_quantile, method="lower")), 1e-6)
     return np.clip(spacing, 1e-3 * cap, cap)
 
@@ -108,20 +109,20 @@ def gaussians_from_points(
     normals: Float[np.ndarray, "normals 3"] | str | None = None,
     flatness: float = 0.2,
 ) -> Gaussians:
-    """A dense cloud of Gaussians, one a voxel, sized by the spacing of their neighbours.
+    """A dense cloud of Gaussians, one per voxel, sized by the spacing of their neighbours.
 
     Args:
         points: metres; rows that are not finite are dropped.
         colors: RGB 0 to 1.
-        voxel: edge of the cubes of which each keeps one point, metres; 0 keeps all.
-        opacity: of all, 0 to 1.
-        scale_factor: standard deviation over neighbour spacing.
-        clip_quantile: spacings above this quantile are cut down to it.
-        normals: None for spheres; "pca" for discs along the neighbours' plane; or an array of normals.
-        flatness: a disc's standard deviation along its normal over that in its plane.
+        voxel: edge of the voxels, each of which keeps one point, metres; 0 keeps all.
+        opacity: opacity of all Gaussians, 0 to 1.
+        scale_factor: standard deviation relative to the neighbour spacing.
+        clip_quantile: spacings above this quantile are clipped to it.
+        normals: None for spheres; "pca" for discs in the plane of their neighbours; or an array of normals.
+        flatness: a disc's standard deviation along its normal relative to that in its plane.
 
     Raises:
-        ValueError: no finite point is given, or a shape or option does not fit.
+        ValueError: no point is finite, or a shape or option is wrong.
     """
     points, colors = np.asarray(points), np.asarray(colors)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -147,7 +148,7 @@ def gaussians_from_points(
 
 
 def check_depth(depth: np.ndarray) -> None:
-    """Refuses what is no depth picture [H, W] of floats.
+    """Check that `depth` is a depth image [H, W] of floats.
 
     Raises:
         ValueError: it has another shape, or holds integers, whose unit is unknown.
@@ -159,10 +160,10 @@ def check_depth(depth: np.ndarray) -> None:
 
 
 def valid_depth(depth: np.ndarray) -> np.ndarray:
-    """Where depth, of any shape, is positive and finite."""
+    """Mask of the positive and finite values of a depth array of any shape."""
     return np.isfinite(depth) & (depth > 0)
 
 
 def on_host(function, *arrays):
-    """`function` of geometry.cameras on numpy arrays, its results as numpy arrays in JAX's precision."""
+    """Call a function of geometry.cameras with numpy arrays and return numpy arrays, in JAX's precision."""
     return jax.tree.map(np.asarray, function(*(jnp.asarray(array, float) for array in arrays)))

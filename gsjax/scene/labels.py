@@ -1,4 +1,4 @@
-"""Which object each point of a first scene belongs to, from one view's mask. All on the host."""
+"""Object labels of the points of an initial scene, from one view's mask. All on the host."""
 
 import warnings
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from gsjax.scene.initialize import check_depth, on_host, valid_depth
 UNKNOWN_LABEL = -1
 BACKGROUND_LABEL = 0
 _NEIGHBORS = 8
-# A crease of 90 degrees, where a box stands on a table, is as far as 16 cm along the surface.
+# A crease of 90 degrees, where a box stands on a table, counts as 16 cm along the surface.
 _METRES_PER_CONCAVE_RADIAN = 0.1
 
 
@@ -31,14 +31,17 @@ def lift_labels(
 ) -> Int[np.ndarray, "N"]:
     """Labels of the points that one view sees, from its mask; -1 for the others.
 
-    A point is seen where its projection falls in the picture and its z is within `max_depth_gap` metres of
-    the depth there, so what stands in front gives its label to nothing behind it.
+    A point is seen if its projection falls in the picture and its z is within `max_depth_gap` metres of the
+    depth there, so an object in front does not label what is behind it.
 
     Args:
+        points: points in the world, metres.
         mask: integer labels, 0 the background.
-        expected_labels: labels that must be in the mask; one that no pixel has gives a warning.
+        depth: z-depth in metres; invalid values are 0, negative or not finite.
         viewmat: world to camera.
         K: intrinsics, pixels.
+        max_depth_gap: metres.
+        expected_labels: labels that must be in the mask; a missing one gives a warning.
 
     Raises:
         ValueError: mask and depth differ in size, or no pixel has depth, so that nothing can be lifted.
@@ -56,7 +59,7 @@ def lift_labels(
     columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
     there = depth[rows, columns]
     seen = inside & valid_depth(there) & (np.abs(there - z) <= max_depth_gap)
-    # Widened before: -1 among the bytes of a mask file would become 255.
+    # Widened first: -1 in an array of bytes, as mask files give, would become 255.
     labels = np.where(seen, mask[rows, columns].astype(np.int32), UNKNOWN_LABEL)
     _warn_of_lost_labels(mask, labels, expected_labels)
     return labels
@@ -70,23 +73,23 @@ def inherit_labels(
     max_distance: float = 0.15,
     max_step: float = 0.02,
 ) -> Int[np.ndarray, "N"]:
-    """Labels in which each unknown (-1) point has that of the known one nearest to it along the surface.
+    """Labels in which each unknown (-1) point takes that of the known point nearest to it along the surface.
 
-    Paths run from neighbour to neighbour, and turning into a concave crease counts as a long way: objects
-    are mostly convex, and what meets in a crease mostly touches (the criterion of Stein et al., "Object
-    Partitioning using Local Convexity", CVPR 2014). So the far side of a box takes the box's label over its
-    edge, not the table's it stands on. What no path reaches becomes background, 0: without a limit, labels
-    bleed into what the view could not see.
+    Paths run from neighbour to neighbour, and turning into a concave crease counts as a long distance:
+    objects are mostly convex, and separate objects mostly meet in a crease (the criterion of Stein et al.,
+    "Object Partitioning using Local Convexity", CVPR 2014). So the far side of a box takes the box's label
+    over its edge, not that of the table it stands on. Points that no path reaches become background, 0:
+    without a limit, labels bleed into what the view could not see.
 
     Args:
         points: metres.
-        labels: of each, -1 where unknown.
-        normals: unit and outward: each towards the camera that saw its point.
+        labels: label of each point, -1 where unknown.
+        normals: unit normals, pointing outward, towards the camera that saw the point.
         max_distance: longest path, metres.
-        max_step: points further apart than this are on no common surface, metres.
+        max_step: points farther apart than this do not share a surface, metres.
 
     Raises:
-        ValueError: labels or normals are not one a point.
+        ValueError: there is not exactly one label or normal per point.
     """
     points, labels, normals = np.asarray(points, np.float64), np.asarray(labels), np.asarray(normals)
     if labels.shape != points.shape[:1]:
@@ -96,7 +99,7 @@ def inherit_labels(
     known = labels != UNKNOWN_LABEL
     inherited = np.where(known, labels, BACKGROUND_LABEL).astype(np.int32)
     begins, ends = _neighbor_pairs(points, max_step)
-    # Known points matter where they border on unknown ones only; the graph is cut down to those.
+    # Known points matter only where they border on unknown ones; the graph is reduced to those.
     border = np.unique(
         np.concatenate([begins[known[begins] & ~known[ends]], ends[known[ends] & ~known[begins]]])
     )
@@ -123,7 +126,7 @@ def inherit_labels(
 
 
 def _neighbor_pairs(points: np.ndarray, max_step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of each point and of its nearest others, a pair a row."""
+    """Indices of neighbouring points: for each pair, the point and one of its nearest neighbours."""
     if len(points) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     count = min(_NEIGHBORS + 1, len(points))
@@ -134,13 +137,13 @@ def _neighbor_pairs(points: np.ndarray, max_step: float) -> tuple[np.ndarray, np
 
 
 def _path_lengths(points, normals, begins, ends) -> np.ndarray:
-    """Length of each step, and what it turns if it turns inwards: normals then lean towards each other."""
+    """Length of each step, plus a cost for its turn if concave: normals then lean towards each other."""
     along = points[begins] - points[ends]
     before, after = normals[begins], normals[ends]
     turn = np.arccos(np.clip(np.sum(before * after, axis=1), -1, 1))
     concave = np.sum((before - after) * along, axis=1) < 0
     length = np.linalg.norm(along, axis=1) + _METRES_PER_CONCAVE_RADIAN * turn * concave
-    return np.maximum(length, 1e-9)  # a sparse graph takes 0 for "no edge"
+    return np.maximum(length, 1e-9)  # a sparse graph treats 0 as "no edge"
 
 
 def _warn_of_lost_labels(mask: np.ndarray, labels: np.ndarray, expected: Sequence[int]) -> None:

@@ -1,4 +1,4 @@
-"""Where pictures may change: the tiles that Gaussians touch."""
+"""Regions in which images may change: the tiles that Gaussians touch."""
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +8,13 @@ from gsjax.geometry.cameras import project
 from gsjax.scene.frame import Frame
 
 TILE = 16
-"""Edge, pixels; a multiple of the rasterizer's."""
+"""Edge of a tile in pixels; a multiple of the rasterizer's."""
 
 
 def touched_tiles(
     positions: list[Float[Array, "m 3"]], frame: Frame, tile: int = TILE
 ) -> Bool[Array, "c rows columns"]:
-    """All tiles, `tile` pixels wide, that hold, or border on, a Gaussian in any of the given positions."""
+    """Tiles, `tile` pixels wide, that contain or border on a Gaussian centre in any of the positions."""
     columns, rows = -(-frame.cameras.width // tile), -(-frame.cameras.height // tile)
     points = jnp.concatenate(positions)
 

@@ -1,4 +1,4 @@
-"""A scene and cameras to images: the one place where activated Gaussians meet the rasterizer."""
+"""Rendering a scene in cameras: the one place where activated Gaussians are passed to the rasterizer."""
 
 from typing import Any, NamedTuple
 
@@ -59,10 +59,10 @@ def render(
     Args:
         gaussians: the scene.
         cameras: C cameras, viewmat [C,4,4] and K [C,3,3].
-        plan: from `plan_render`; needed under jit.
-        features: values composited beside the colours; the scene's own unless given.
+        plan: from `plan_render`; required under jit.
+        features: values composited with the colours (default: the scene's own features).
         backgrounds, roi, means2d_offset: as for `gsjax.rasterization`.
-        visibility: factor on each opacity in each camera, 0 to 1; 1 unless given.
+        visibility: factor on each opacity in each camera, 0 to 1 (default: 1).
 
     Raises:
         ValueError: as `gsjax.rasterization`.
@@ -71,7 +71,7 @@ def render(
     scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, features)
     per_camera = (cameras.viewmat, cameras.K, backgrounds, roi, means2d_offset)
     if visibility is not None:
-        # Opacities that differ from camera to camera make each camera a scene of its own.
+        # Opacities that differ between cameras require a separate scene for each camera.
         scene = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(visibility), *a.shape)), scene)
         scene = (*scene[:3], scene[3] * visibility, *scene[4:])
         per_camera = jax.tree.map(lambda a: a[:, None], per_camera)
@@ -105,14 +105,14 @@ def render_with_room(
     rasterize_mode: str = "classic",
     headroom: float = HEADROOM,
 ) -> tuple[Rendered, Plan]:
-    """What `render` draws, and a plan that held it: that of an earlier call, made or grown where it must be.
-    For loops on the host, over views of one size.
+    """The result of `render` and a plan that is large enough for it: the given one, made or grown if needed.
+    For host loops over views of one size.
 
     Args:
         gaussians, cameras, backgrounds: as for `render`.
-        plan: of an earlier call.
-        rasterize_mode: of a plan that is made.
-        headroom: how many times as much as it needs a plan holds.
+        plan: the plan of an earlier call.
+        rasterize_mode: mode of a new plan.
+        headroom: capacity of a new or grown plan relative to what is needed.
     """
     if plan is None or plan.sh_degree != gaussians.sh_degree:
         plan = plan_render(gaussians, cameras, headroom=headroom, rasterize_mode=rasterize_mode)

@@ -1,4 +1,4 @@
-"""What is done with some of a scene's Gaussians: taken out, tinted, put elsewhere."""
+"""Operations on selected Gaussians of a scene: extract, remove, hide, tint, shift."""
 
 import equinox as eqx
 import jax
@@ -9,37 +9,36 @@ from jaxtyping import Array, Bool, Float
 from gsjax.geometry.spherical_harmonics import SH_C0, rgb_to_sh0
 from gsjax.scene.gaussians import Gaussians
 
-_LUMA = (0.2126, 0.7152, 0.0722)  # of linear RGB (ITU-R BT.709), here of colours as they are
-_DARK = 0.02  # a mean luma of which shades are noise
-_INVISIBLE = -40.0  # a logit
+_LUMA = (0.2126, 0.7152, 0.0722)  # for linear RGB (ITU-R BT.709), here applied to the colours as they are
+_DARK = 0.02  # mean luma below which shades are noise
+_INVISIBLE = -40.0  # an opacity logit
 
 
 def only(gaussians: Gaussians, selected: Bool[Array | np.ndarray, "n"]) -> Gaussians:
-    """Those alone, in their order. On the host, where another number of them compiles nothing."""
+    """The selected Gaussians, in their order. On the host, where a new number of rows compiles nothing."""
     rows = np.flatnonzero(selected)
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), gaussians)
 
 
 def without(gaussians: Gaussians, selected: Bool[Array | np.ndarray, "n"]) -> Gaussians:
-    """All others; as `only`."""
+    """All Gaussians except the selected ones, in their order. On the host, as `only`."""
     return only(gaussians, ~np.asarray(selected))
 
 
 def hidden(gaussians: Gaussians, selected: Bool[Array, "n"]) -> Gaussians:
-    """As many Gaussians, of which the selected ones cannot be seen: it draws as `without` does."""
+    """The same number of Gaussians with the selected ones made invisible; it renders like `without`."""
     logits = jnp.where(selected, _INVISIBLE, gaussians.logit_opacities)
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 def tinted(gaussians: Gaussians, selected: Bool[Array, "n"], color: Float[Array, "3"]) -> Gaussians:
-    """Selected ones in another colour, the same from all sides; what was bright stays brighter than what was
-    dark.
+    """The selected Gaussians in another, view-independent colour; their relative brightness is kept.
 
     Args:
         gaussians: the scene.
-        selected: whose colour changes.
-        color: RGB, 0 to 1: what the selected ones are on average, but for shades brighter than 1. All of a
-            black thing have this colour, for what shades it has are noise.
+        selected: the Gaussians whose colour changes.
+        color: RGB, 0 to 1: the average colour of the selected Gaussians, before clipping to 1. Black objects
+            get it uniformly, because their shades are noise.
     """
     luma = jnp.clip(0.5 + SH_C0 * gaussians.sh0[:, 0], 0, 1) @ jnp.asarray(_LUMA, gaussians.sh0.dtype)
     mean = jnp.sum(jnp.where(selected, luma, 0)) / jnp.maximum(jnp.sum(selected), 1)
@@ -53,6 +52,6 @@ def tinted(gaussians: Gaussians, selected: Bool[Array, "n"], color: Float[Array,
 
 
 def shifted(gaussians: Gaussians, selected: Bool[Array, "n"], by: Float[Array, "3"]) -> Gaussians:
-    """Selected ones elsewhere, by so many metres along each axis."""
+    """The selected Gaussians translated by `by`, in metres."""
     means = gaussians.means + jnp.where(selected[:, None], jnp.asarray(by, gaussians.means.dtype), 0)
     return eqx.tree_at(lambda g: g.means, gaussians, means)

@@ -1,6 +1,6 @@
-"""Encodings of place and time, for deformation fields: planes, sines, or voxels.
+"""Encodings of position and time for deformation fields: planes, sinusoids, or voxels.
 
-Places are 0 to 1 in each axis of the scene's box, the time 0 to 1 over the whole recording.
+Positions are 0 to 1 along each axis of the scene's box, the time 0 to 1 over the whole recording.
 """
 
 from itertools import product
@@ -20,26 +20,27 @@ _UNIT_BOX = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 def within(
     positions: Float[Array, "N 3"], bounds: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Float[Array, "N 3"]:
-    """Places in a box, 0 to 1; those outside are on its surface, where their slope is 0, and so are NaN."""
+    """Positions in a box, scaled to 0 to 1; outside, they are clamped to its surface, with zero gradient. NaN
+    becomes 0.5, also with zero gradient."""
     low, high = jnp.asarray(bounds, positions.dtype)
     return _clamped((positions - low) / (high - low))
 
 
 def _clamped(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    # Not `clip`, which halves the derivative on the surface, where the outermost points of a scene are.
+    # Not `clip`, which halves the derivative on the surface, where the outermost points of a scene lie.
     x = jnp.where(jnp.isnan(x), 0.5, x)
     return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
 
 
 class HexPlane(eqx.Module):
-    """Planes of all pairs of x, y, z and t; what a place and a time have is the product of their six values
-    (4DGS, Wu et al. 2023, eq. 6, after HexPlane, Cao and Johnson 2023), of all levels one after another.
+    """Planes for all pairs of x, y, z and t; a position and a time are encoded as the product of their six
+    values (4DGS, Wu et al. 2023, eq. 6, after HexPlane, Cao and Johnson 2023), concatenated over levels.
 
-    At one time the planes of t are lines, which are made once for all places.
+    At a fixed time the planes of t reduce to lines, which are computed once for all positions.
 
     Attributes:
-        space: of each level, the planes xy, xz, yz; R vertices an axis.
-        time: of each level, the planes xt, yt, zt; T vertices along t.
+        space: for each level, the planes xy, xz, yz; R vertices per axis.
+        time: for each level, the planes xt, yt, zt; T vertices along t.
     """
 
     space: tuple[Float[Array, "3 _ _ F"], ...]
@@ -47,7 +48,7 @@ class HexPlane(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers it gives."""
+        """Number of output channels."""
         return sum(plane.shape[-1] for plane in self.space)
 
     def __call__(self, places: Float[Array, "N 3"], time: Float[Array, ""]) -> Float[Array, "N size"]:
@@ -66,24 +67,23 @@ class HexPlane(eqx.Module):
             weights = [[one[1][:, axis] for one in (below, above)] for axis in range(3)]
             lines = _line(planes, time).reshape(-1, channels)
             value *= interpolated(lines, *map(_stacked, (weights, rows)))
-            levels.append(
-                value[:, 0] * value[:, 1] * value[:, 2]
-            )  # the slope of `prod` takes 50 times as long
+            # The gradient of `prod` takes 50 times as long.
+            levels.append(value[:, 0] * value[:, 1] * value[:, 2])
         return jnp.concatenate(levels, axis=-1)
 
 
 def init_hexplane(
     key: PRNGKeyArray, resolution: int, time_resolution: int, levels: int, channels: int
 ) -> HexPlane:
-    """Planes of space from 0.1 to 0.5, those of time 1 (K-Planes, Fridovich-Keil et al. 2023): at first
-    nothing depends on the time.
+    """Spatial planes initialised from 0.1 to 0.5 and time planes to 1 (K-Planes, Fridovich-Keil et al. 2023):
+    at first nothing depends on the time.
 
     Args:
-        key: for the planes of space.
-        resolution: vertices a side of the coarsest planes; each level has twice as many.
+        key: random key for the spatial planes.
+        resolution: vertices per side of the coarsest planes; each level doubles it.
         time_resolution: vertices along the time, on all levels.
-        levels: how many.
-        channels: numbers a vertex.
+        levels: number of levels.
+        channels: channels per vertex.
     """
     space, time = [], []
     for level, one in enumerate(jax.random.split(key, levels)):
@@ -94,7 +94,7 @@ def init_hexplane(
 
 
 def _between(places: Float[Array, "*n"], resolution: int):
-    """The vertices below and above places on an axis of so many, each with its weight."""
+    """The vertices below and above positions on an axis with `resolution` vertices, each with its weight."""
     scaled = places * (resolution - 1)
     first = jnp.clip(jnp.floor(jax.lax.stop_gradient(scaled)), 0, resolution - 2)
     share = scaled - first
@@ -107,23 +107,23 @@ def _stacked(nested: list[list[Array]]) -> Num[Array, "N L C"]:
 
 
 def _line(planes: Float[Array, "3 T R F"], time: Float[Array, ""]) -> Float[Array, "3 R F"]:
-    """Planes at one time."""
+    """Time planes evaluated at one time."""
     (now, most), (then, rest) = _between(_clamped(time), planes.shape[1])
     return most * planes[:, now] + rest * planes[:, then]
 
 
 class Sinusoids(eqx.Module):
-    """Places and the time beside sines and cosines of 1, 2, 4, ... half periods over the whole.
+    """Positions and the time, with their sines and cosines of 1, 2, 4, ... half periods over the whole range.
 
     Attributes:
-        frequencies: how many.
+        frequencies: number of frequencies.
     """
 
     frequencies: int = eqx.field(static=True)
 
     @property
     def size(self) -> int:
-        """How many numbers it gives."""
+        """Number of output channels."""
         return 4 * (1 + 2 * self.frequencies)
 
     def __call__(self, places: Float[Array, "N 3"], time: Float[Array, ""]) -> Float[Array, "N size"]:
@@ -132,7 +132,7 @@ class Sinusoids(eqx.Module):
 
 
 def sinusoids(values: Float[Array, "N D"], frequencies: int) -> Float[Array, "N size"]:
-    """Values in 0 to 1, -1 to 1, beside their sines and cosines (papers/003, section 2.1: gamma)."""
+    """Values rescaled from 0..1 to -1..1, with their sines and cosines (SurstSplat, section 2.1: gamma)."""
     centered = 2 * values - 1
     phases = centered[..., None] * (np.pi * 2.0 ** np.arange(frequencies)).astype(values.dtype)
     waves = jnp.concatenate([jnp.sin(phases), jnp.cos(phases)], axis=-1)
@@ -140,12 +140,12 @@ def sinusoids(values: Float[Array, "N D"], frequencies: int) -> Float[Array, "N 
 
 
 class Voxels(eqx.Module):
-    """Dense neural voxels (papers/003, section 2.1) beside sines of the time. They stand for what is where,
-    "organ or background", so meanings are read from them too.
+    """Dense neural voxels (SurstSplat, section 2.1) with sinusoids of the time. The voxels represent what is
+    where, "organ or background", so semantic features are read from them too.
 
     Attributes:
-        grid: a single dense level, whose network is the projection to features.
-        frequencies: of sines of the time.
+        grid: a single dense level, whose network is the projection to semantic features.
+        frequencies: number of frequencies of the time.
     """
 
     grid: FeatureGrid
@@ -153,7 +153,7 @@ class Voxels(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers it gives."""
+        """Number of output channels."""
         return self.grid.config.features + 1 + 2 * self.frequencies
 
     def __call__(self, places: Float[Array, "N 3"], time: Float[Array, ""]) -> Float[Array, "N size"]:
@@ -162,19 +162,19 @@ class Voxels(eqx.Module):
         return jnp.concatenate([here, jnp.broadcast_to(waves, (len(places), waves.shape[1]))], axis=-1)
 
     def meaning(self, places: Float[Array, "N 3"]) -> Float[Array, "N outputs"]:
-        """Features of places, the same at all times."""
+        """Semantic features of positions, the same at all times."""
         return self.grid(places)
 
 
 def init_voxels(key: PRNGKeyArray, resolution: int, channels: int, frequencies: int, outputs: int) -> Voxels:
-    """Small random voxels.
+    """Voxels with small random features.
 
     Args:
-        key: for all of them.
-        resolution: voxels a side.
-        channels: numbers a voxel.
-        frequencies: of sines of the time.
-        outputs: numbers of a meaning.
+        key: random key.
+        resolution: voxels per side.
+        channels: channels per voxel.
+        frequencies: number of frequencies of the time.
+        outputs: size of the semantic features.
     """
     entries = int(np.ceil(np.log2((resolution + 1) ** 3)))
     config = FeatureGridConfig(
@@ -186,5 +186,5 @@ def init_voxels(key: PRNGKeyArray, resolution: int, channels: int, frequencies: 
         depth=0,
     )
     grid = init_feature_grid(key, config, outputs, _UNIT_BOX)
-    still = jax.tree.map(jnp.zeros_like, grid.layers[-1])  # meanings are as they were, at first
+    still = jax.tree.map(jnp.zeros_like, grid.layers[-1])  # at first, features are unchanged
     return Voxels(eqx.tree_at(lambda g: g.layers[-1], grid, still), frequencies)

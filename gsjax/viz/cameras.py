@@ -1,4 +1,4 @@
-"""A scene from above and from the side: where its cameras stand, what they look at, and its points."""
+"""A scene from above and from the side: its points, and the positions and frusta of its cameras."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,22 +12,22 @@ from matplotlib.figure import Figure
 from gsjax.viz.viewer.cameras import up_direction
 
 _INK, _FAINT, _GRID = "#22262b", "#6b7280", "#e4e7eb"
-_FRUSTUM = 0.05  # of what the picture shows: how long a frustum is drawn
+_FRUSTUM = 0.05  # length of a drawn frustum, as a fraction of the extent of the picture
 _DRAWN_CAMERAS, _DRAWN_POINTS = 200, 30_000
 _OUTER = 2.0  # percent of the points that may lie beyond each edge
-_ROOM = 4.0  # how many times what the cameras span, to each side, points may widen the picture
+_ROOM = 4.0  # points may widen the picture by this multiple of the cameras' extent, on each side
 _MARGIN = 0.08
 _PANEL, _HEIGHTS = 5.0, (2.0, 8.0)  # inches
 
 
 class CameraGroup(NamedTuple):
-    """Cameras that are drawn in one colour.
+    """Cameras drawn in one colour.
 
     Attributes:
         viewmats: world to camera, OpenCV axes, [N,4,4].
-        Ks: pixels, [N,3,3].
+        Ks: intrinsics, pixels, [N,3,3].
         sizes: width and height, pixels, [N,2].
-        color: of matplotlib.
+        color: a matplotlib colour.
     """
 
     viewmats: Float[np.ndarray, "n 4 4"]
@@ -44,18 +44,18 @@ def cameras_and_points(
     unit: str = "units of the data",
     title: str = "",
 ) -> Figure:
-    """Two drawings of one scene in equal axes: from above, and from the side.
+    """Two drawings of one scene with equal axes: from above and from the side.
 
-    Up is at right angles to what was to the right of the cameras, or the axis of the world that is about the
-    same; +z without cameras. All cameras are in the picture. The outer two percent of the points to each side
-    are not waited for, nor is what lies farther off than four times what the cameras span; what is beyond the
-    edges is counted below the picture.
+    Up is perpendicular to the right-hand axes of the cameras, snapped to a nearby world axis; +z without
+    cameras. Every camera is in the picture. The limits ignore the outermost two percent of the points on each
+    side, and points farther away than four times the extent of the cameras; the points beyond the edges are
+    counted below the picture.
 
     Args:
-        groups: the cameras by what the legend calls them; those at one place are drawn once.
-        points, colors: of the scene, RGB 0 to 1.
-        unit: what lengths are in.
-        title: above all.
+        groups: legend name to cameras; cameras with the same pose are drawn once.
+        points, colors: points of the scene and their colours, RGB 0 to 1.
+        unit: unit of lengths, for the axis labels.
+        title: title of the figure.
     """
     viewmats = np.concatenate([np.zeros((0, 4, 4)), *(group.viewmats for group in groups.values())])
     to_world = np.linalg.inv(viewmats)
@@ -72,8 +72,8 @@ def cameras_and_points(
     above, side = figure.subplots(1, 2)
     length = _FRUSTUM * float(np.max(span))
     order = _thinned(np.flatnonzero(inside), _DRAWN_POINTS)
-    for panel, (i, j), words in ((above, (0, 1), "from above"), (side, (0, 2), "from the side")):
-        _dress(panel, f"{names[i]} ({unit})", f"{names[j]} ({unit})", words)
+    for panel, (i, j), subtitle in ((above, (0, 1), "from above"), (side, (0, 2), "from the side")):
+        _style(panel, f"{names[i]} ({unit})", f"{names[j]} ({unit})", subtitle)
         if len(order):
             shade = "#9aa1ab" if colors is None else np.clip(colors[order], 0, 1)
             panel.scatter(*shown[order][:, [i, j]].T, c=shade, s=1.2, lw=0, rasterized=True)
@@ -94,8 +94,8 @@ def cameras_and_points(
 
 
 def _axes(up: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3 3"], list[str]]:
-    """Rows: what is right, ahead and up in the drawings, and their names. Where up is an axis of the world
-    the others are too, else they are as near to them as may be."""
+    """The directions right, ahead and up of the drawings, as rows, and their names. If up is a world axis, so
+    are the other two; otherwise they are as close to world axes as possible."""
     first = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     right = first - (first @ up) * up
     right = right / np.linalg.norm(right)
@@ -109,7 +109,7 @@ def _axes(up: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3 3"], list[st
 def _limits(
     centers: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The box that is shown."""
+    """Lower and upper corner of the box that is shown."""
     finite = points[np.isfinite(points).all(1)]
     if not len(centers) and not len(finite):
         return -np.ones(3), np.ones(3)
@@ -127,14 +127,16 @@ def _limits(
 
 
 def _thinned(indices: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of them, drawn at random by a fixed seed: every so-manieth would follow their order."""
+    """At most `most` of the indices, drawn at random with a fixed seed: a regular stride could alias with
+    their order."""
     if len(indices) <= most:
         return indices
     return np.random.default_rng(0).choice(indices, most, replace=False)
 
 
 def _frusta(group: CameraGroup, length: float) -> Float[np.ndarray, "lines 2 3"]:
-    """Segments: four edges from each centre, and the four sides of what it sees `length` ahead."""
+    """Line segments of each frustum: four edges from the centre, and the four sides of the image rectangle at
+    depth `length`."""
     poses = np.round(group.viewmats, 9).reshape(-1, 16)
     _, first = np.unique(poses, axis=0, return_index=True)
     first = np.sort(first)[:: max(1, -(-len(first) // _DRAWN_CAMERAS))]
@@ -148,8 +150,8 @@ def _frusta(group: CameraGroup, length: float) -> Float[np.ndarray, "lines 2 3"]
     return np.concatenate([edges, sides], axis=1).reshape(-1, 2, 3)
 
 
-def _dress(panel: Axes, xlabel: str, ylabel: str, words: str) -> None:
-    panel.set_title(words, loc="left", fontsize=11, color=_INK)
+def _style(panel: Axes, xlabel: str, ylabel: str, subtitle: str) -> None:
+    panel.set_title(subtitle, loc="left", fontsize=11, color=_INK)
     panel.set_xlabel(xlabel, color=_FAINT, fontsize=10)
     panel.set_ylabel(ylabel, color=_FAINT, fontsize=10)
     panel.tick_params(colors=_FAINT, labelsize=9.5, length=0)

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, Num, UInt8
 
 BACKGROUND = (158, 160, 164)  # label 0
-INVALID = (38, 40, 44)  # no depth there
+INVALID = (38, 40, 44)  # pixels without depth
 _INK = (245, 245, 245)
 
-# Okabe and Ito's colours, then darker ones of Tol's muted scheme: any two neighbours differ for colour-blind
-# eyes, and each is dark enough to read as a line on white (so their yellow comes late and is deepened).
+# Okabe and Ito's colours, then darker ones from Tol's muted scheme: any two neighbours are distinct to
+# colour-blind readers, and each is dark enough for a line on white (so yellow comes late and is deepened).
 PALETTE = (
     (0, 114, 178),
     (230, 159, 0),
@@ -48,8 +48,8 @@ def colorize_depth(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Depth in metres as colours, near bright; zero, negative and non-finite depths are near black.
 
-    `near` and `far` default to the 2nd and 98th percentile of the valid depths: give them where pictures are
-    to be compared.
+    `near` and `far` default to the 2nd and 98th percentile of the valid depths; pass them to make several
+    pictures comparable.
     """
     valid = np.isfinite(depth) & (depth > 0)
     low, high = np.percentile(depth[valid], [2, 98]) if valid.any() else (0.0, 1.0)
@@ -61,7 +61,7 @@ def colorize_depth(
 
 
 class PcaColors(NamedTuple):
-    """Which colour a feature has: its three principal components as red, green and blue."""
+    """A map from features to colours: the three principal components as red, green and blue."""
 
     mean: Float[np.ndarray, "d"]
     axes: Float[np.ndarray, "d three"]
@@ -70,17 +70,17 @@ class PcaColors(NamedTuple):
 
 
 def fit_pca_colors(features: Float[np.ndarray, "n d"]) -> PcaColors:
-    """Colours that tell these features apart; use one fit for all pictures that are to be compared.
+    """Colours that distinguish these features; use one fit for all pictures that are to be compared.
 
-    The colours span the 2nd to the 98th percentile of each component. Features that are not finite do not
-    count, and the signs of the axes are fixed, so the same features always have the same colours.
+    The colours span the 2nd to the 98th percentile of each component. Non-finite features are ignored, and
+    the signs of the axes are fixed, so the same features always have the same colours.
 
     Raises:
         ValueError: no feature is finite.
     """
     finite = np.asarray(features, np.float64)[np.isfinite(features).all(axis=1)]
     if len(finite) == 0:
-        raise ValueError(f"features: got {len(features)} of which none is finite, want at least one")
+        raise ValueError(f"features: expected at least one finite feature, found none among {len(features)}")
     mean = finite.mean(axis=0)
     values, axes = np.linalg.eigh((finite - mean).T @ (finite - mean))
     axes = axes[:, np.argsort(-values)[:3]]
@@ -91,7 +91,7 @@ def fit_pca_colors(features: Float[np.ndarray, "n d"]) -> PcaColors:
 
 
 def colorize_features(features: Float[np.ndarray, "h w d"], pca: PcaColors) -> UInt8[np.ndarray, "h w 3"]:
-    """A feature map as colours; what is not finite is near black."""
+    """A feature map as colours; non-finite features are near black."""
     known = np.isfinite(features).all(axis=-1)
     components = (np.where(known[..., None], features, 0.0) - pca.mean) @ pca.axes
     shares = (components - pca.low) / np.maximum(pca.high - pca.low, 1e-12)
@@ -103,12 +103,12 @@ def colorize_features(features: Float[np.ndarray, "h w d"], pca: PcaColors) -> U
 def highlight(
     image: Num[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """One thing in its own colours with an outline of `color`, the rest grey and dim.
+    """An object in its own colours with an outline in `color`, the rest grey and dim.
 
     Args:
         image: uint8, or floats 0 to 1.
-        mask: of the thing.
-        color: of its outline, 0 to 255.
+        mask: pixels of the object.
+        color: RGB of the outline, 0 to 255.
     """
     image = to_uint8(image)
     dim = np.broadcast_to(image.mean(axis=-1, keepdims=True) * 0.6, image.shape).astype(np.uint8)
@@ -119,20 +119,20 @@ def highlight(
 
 
 def heat(values: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Values from 0, dark, to 1, bright."""
+    """Values as colours, from 0 (dark) to 1 (bright)."""
     return _apply_colormap("inferno", np.clip(np.nan_to_num(values), 0, 1))
 
 
 def with_heat_scale(
     picture: UInt8[np.ndarray, "h w 3"], low: float, high: float, marked: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture of `heat` with its scale along the right side: what is dark and what is bright, and one value
-    between these, which is marked.
+    """A picture made by `heat`, with a colour scale along its right side that is labelled at both ends and at
+    one marked value.
 
     Args:
-        picture: of shares of the way from `low` to `high`.
+        picture: made from values scaled so that `low` is 0 and `high` is 1.
         low, high: the values that 0 and 1 stand for.
-        marked: the value to be marked, where it is on the scale.
+        marked: the value to mark; ignored if it lies outside the scale.
     """
     height, width = picture.shape[:2]
     thick, top = max(4, height // 30), height // 5
@@ -156,7 +156,7 @@ def error_heatmap(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Mean absolute difference over the channels, black where equal and brightest from `limit` (of 1) on.
 
-    Pixels that are not finite in either image are shown as no error: nothing was compared there.
+    Pixels that are not finite in one of the images cannot be compared and are shown as no error.
     """
     error = np.abs(_to_float(a) - _to_float(b)).mean(axis=-1)
     return heat(error / limit)
@@ -180,9 +180,9 @@ def side_by_side(
 
     Args:
         image, render: colours.
-        error: a picture already, the `error_heatmap` of the two unless told.
-        labels: rendered labels, laid over the dimmed input; left out where None.
-        captions: one a picture; longer than needed is fine.
+        error: a picture of the error (default: the `error_heatmap` of the two).
+        labels: rendered labels, laid over the dimmed input; left out if None.
+        captions: one per picture; extra ones are ignored.
     """
     image, render = to_uint8(image), to_uint8(render)
     pictures = [image, render, error_heatmap(image, render) if error is None else error]
@@ -193,7 +193,7 @@ def side_by_side(
 
 
 def enlarged(picture: Num[np.ndarray, "h w 3"], least_height: int) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture that is smaller than so many rows, by a whole factor."""
+    """A picture enlarged by an integer factor until it has at least `least_height` rows."""
     times = max(1, -(-least_height // len(picture)))
     return to_uint8(picture).repeat(times, 0).repeat(times, 1)
 
@@ -201,12 +201,12 @@ def enlarged(picture: Num[np.ndarray, "h w 3"], least_height: int) -> UInt8[np.n
 def in_rows(
     pictures: Mapping[str, Num[np.ndarray, "h w 3"]], columns: int, least_height: int = 0
 ) -> UInt8[np.ndarray, "rows cols 3"]:
-    """Pictures of one size, once enlarged, by their captions, row by row; even-sized, as video codecs want.
+    """Captioned pictures in rows; even-sized, as video codecs want. All must have one size once enlarged.
 
     Args:
-        pictures: colours.
-        columns: how many are beside each other.
-        least_height: of a picture, in pixels; smaller ones are enlarged by a whole factor.
+        pictures: caption to colours.
+        columns: number of pictures per row.
+        least_height: minimum height of a picture in pixels; smaller ones are enlarged by an integer factor.
     """
     framed = [captioned(enlarged(picture, least_height), text) for text, picture in pictures.items()]
     framed += [np.zeros_like(framed[0])] * (-len(framed) % columns)
@@ -222,8 +222,8 @@ def overlay_labels(
 
     Args:
         image: uint8, or floats 0 to 1.
-        labels: of pixels; 0 and below stay grey.
-        strength: share of the label's colour, 0 to 1.
+        labels: labels of the pixels; those of 0 and below stay grey.
+        strength: weight of the label's colour, 0 to 1.
     """
     grey = to_uint8(image).mean(axis=-1, keepdims=True) * 0.75
     inside: Bool[np.ndarray, "h w 1"] = (labels > 0)[..., None]
@@ -247,7 +247,7 @@ def captioned(picture: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
 
 
 def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, beside: tuple[int, int] | None = None) -> None:
-    """Text on a dark chip, in place: in the upper left corner, or to the left of a place (column, row)."""
+    """Draw text on a dark chip, in place: in the upper left corner, or left of `beside` (column, row)."""
     scale = max(len(picture) / 650, 0.42)
     (text_width, text_height), baseline = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     pad = round(5 * scale) + 2

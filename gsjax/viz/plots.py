@@ -1,4 +1,4 @@
-"""Plots of a run, from arrays. Each function returns a matplotlib Figure of its own; `save` writes it.
+"""Plots of a run, from arrays. Each function returns a new matplotlib Figure; `save` writes it.
 
 Only matplotlib's object interface is used: no window, no pyplot, no state shared between plots.
 """
@@ -38,7 +38,7 @@ def update_time(
         axes.axhline(median, color=_BLUE, lw=1.4, alpha=0.9)
         axes.axhline(p95, color=_BLUE, lw=1.0, alpha=0.5)
         _margin_label(axes, median, f"median {median:.0f} ms", _BLUE)
-        if p95 > 1.25 * median:  # else the two labels would lie on each other
+        if p95 > 1.25 * median:  # otherwise the two labels would overlap
             _margin_label(axes, p95, f"p95 {p95:.0f} ms", _BLUE)
         if np.nanmax(ms) > 8 * p95:  # the first update compiles
             axes.set_yscale("log")
@@ -56,12 +56,12 @@ def error_over_frames(
     limit_mm: float | None = None,
     title: str = "Centroid error",
 ) -> Figure:
-    """One line an object: how far it is from where it truly is, in mm.
+    """Position error of each object in mm, one line per object.
 
     Args:
-        errors_mm: name to error of each frame; NaN where there is no truth.
-        labels: name to label, which gives the line its colour; counted from 1 unless told.
-        limit_mm: a goal, drawn dashed.
+        errors_mm: name to error in each frame; NaN where there is no ground truth.
+        labels: name to label, which gives the line its colour (default: counted from 1).
+        limit_mm: a target, drawn dashed.
         title: above the plot.
     """
     figure, axes = _new(title, "frame", "mm")
@@ -79,7 +79,7 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out
     """PSNR of held-out views and, behind it, the number of Gaussians, over minutes.
 
     Args:
-        rows: `seconds`, `alive` and `test_psnr` (None where nobody looked) of each.
+        rows: `seconds`, `alive` and `test_psnr` (None if not evaluated) of each row of the log.
     """
     figure, axes = _new(title, "minutes", "dB")
     minutes = np.array([row["seconds"] for row in rows], float) / 60
@@ -95,10 +95,10 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out
 
 
 def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
-    """Each loss over the steps, on a logarithmic axis; what was not yet counted is left out.
+    """Each loss over the steps, on a logarithmic axis; steps at which a loss was not active are left out.
 
     Args:
-        rows: `step`, and losses by name (None or 0 where there was none); `loss`, their sum, is not shown.
+        rows: `step`, and losses by name (None or 0 where inactive); `loss`, their sum, is not shown.
     """
     figure, axes = _new("Losses", "step", "")
     steps = np.array([row["step"] for row in rows], float)
@@ -115,16 +115,16 @@ def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
 def fit_curves(
     runs: Mapping[str, Sequence[Mapping[str, float | None]]], title: str = "Held-out PSNR"
 ) -> Figure:
-    """PSNR of held-out views over minutes, one line a run, a ring where it ended.
+    """PSNR of held-out views over minutes, one line per run, with a ring at its end.
 
     Args:
-        runs: of each name, its rows: `seconds` and `test_psnr` (None where nobody looked).
+        runs: name to rows of `seconds` and `test_psnr` (None if not evaluated).
     """
     figure, axes = _new(title, "minutes", "dB")
     for i, (name, rows) in enumerate(runs.items()):
-        judged = [row for row in rows if row["test_psnr"] is not None]
-        minutes = np.array([row["seconds"] for row in judged], float) / 60
-        psnr = np.array([row["test_psnr"] for row in judged], float)
+        evaluated = [row for row in rows if row["test_psnr"] is not None]
+        minutes = np.array([row["seconds"] for row in evaluated], float) / 60
+        psnr = np.array([row["test_psnr"] for row in evaluated], float)
         axes.plot(minutes, psnr, color=_rgb(i + 1), lw=1.6, marker="o", ms=2.6, mew=0, label=name)
         axes.plot(minutes[-1:], psnr[-1:], color=_rgb(i + 1), marker="o", ms=7, mfc="white", mew=1.6)
     axes.set_xlim(left=0)
@@ -137,11 +137,11 @@ def psnr_over_frames(
     held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,
     title: str = "PSNR",
 ) -> Figure:
-    """PSNR in dB over frames, one line a camera: solid where it was tracked, dashed where only judged.
+    """PSNR in dB over frames, one line per camera: solid for tracked cameras, dashed for held-out ones.
 
     Args:
         tracked: camera to PSNR of each frame.
-        held_out: the same of cameras that the method did not see.
+        held_out: the same for cameras that the method did not see.
         title: above the plot.
     """
     figure, axes = _new(title, "frame", "dB")
@@ -160,11 +160,11 @@ def trajectories(
     view: Literal["top", "3d"] = "top",
     title: str = "Paths of the objects",
 ) -> Figure:
-    """Where the centroids went, in metres: a ring at the start, a dot at the end, the true path thin below.
+    """Paths of the centroids in metres: a ring at the start, a dot at the end, the true path thin below.
 
     Args:
         centroids: name to position in each frame; NaN where there is none.
-        labels: name to label, which gives the line its colour; counted from 1 unless told.
+        labels: name to label, which gives the line its colour (default: counted from 1).
         truth: name to true position in each frame.
         view: "top" looks along the world's z axis; "3d" shows all three.
         title: above the plot.
@@ -180,7 +180,7 @@ def trajectories(
         if len(finite):
             axes.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
             axes.plot(*finite[-1:].T, color=color, marker="o", ms=6, mew=0)
-    # Three-dimensional axes take "equal" too, but their box then no longer fills the figure.
+    # Three-dimensional axes accept "equal" too, but their box then no longer fills the figure.
     axes.set_aspect("equal", adjustable="datalim" if view == "top" else "box")
     if view == "3d":
         axes.set_zlabel("z (m)", color=_FAINT, fontsize=10)  # pyright: ignore[reportAttributeAccessIssue]
@@ -189,10 +189,10 @@ def trajectories(
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Writes the figure as its suffix says (.svg, .png, .pdf), the same bytes for the same figure.
+    """Write the figure in the format of the suffix (.svg, .png, .pdf); equal figures give equal bytes.
 
     Raises:
-        ValueError: a suffix that matplotlib cannot write.
+        ValueError: matplotlib cannot write this suffix.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -220,13 +220,13 @@ def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) ->
 
 
 def _margin_label(axes: Axes, y: float, text: str, color: str) -> None:
-    """Names a horizontal line at the right end of it, outside the plot."""
+    """Label a horizontal line at its right end, outside the plot."""
     place = axes.get_yaxis_transform()
     axes.text(1.01, y, text, transform=place, color=color, fontsize=9, va="center", clip_on=False)
 
 
 def _legend(figure: Figure, axes: Axes) -> None:
-    """Names the lines below the plot, where no line is hidden."""
+    """Put the legend below the plot, where it hides no line."""
     handles, names = axes.get_legend_handles_labels()
     columns = 5 if max(map(len, names), default=0) < 14 else 3
     if names:

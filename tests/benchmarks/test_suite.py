@@ -1,4 +1,4 @@
-"""The suite: its metric contract, what it times and against what, and a run from end to end."""
+"""The benchmark suite: the metric contract, timing and floors, and a run from end to end."""
 
 import json
 from argparse import Namespace
@@ -84,7 +84,7 @@ def test_a_part_of_the_suite_updates_its_part_of_the_baseline():
     old = make_record([metric("a/x", 1.0), metric("a/gone", 1.0), metric("b/x", 1.0)])
     new = merged(make_record([metric("a/x", 2.0)]), old)
     assert {key: m.value for key, m in read_metrics(new).items()} == {"a/x": 2.0, "b/x": 1.0}
-    with pytest.raises(ValueError, match="run all of it"):
+    with pytest.raises(ValueError, match="found one from another; run the whole suite"):
         merged(make_record([metric("a/x", 2.0)]), old | {"machine_name": "another"})
 
 
@@ -104,7 +104,7 @@ def test_the_pool_moves_means_and_camera_a_little():
         np.testing.assert_allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-6)
         moved = np.abs(viewmat - np.asarray(scene.viewmat)).max()
         assert 1e-6 < moved < 2e-3
-        assert inputs["colors"] is scene.colors  # what stays is shared, not copied
+        assert inputs["colors"] is scene.colors  # unchanged arrays are shared, not copied
 
 
 def test_tangents_of_a_pose_are_its_derivatives():
@@ -154,7 +154,7 @@ def test_names_are_told_apart():
     assert choose(names, []) == names
     assert {w.channels for w in SUITE} == {3, 16, 64, 512}
     assert all(max(w.width, w.height) <= 320 for w in QUICK)
-    with pytest.raises(ValueError, match="no workload is called 'gardn'; there are garden-0"):
+    with pytest.raises(ValueError, match="--only: expected a workload, found 'gardn'; choose from garden-0"):
         choose(names, ["gardn"])
 
 
@@ -168,10 +168,10 @@ def test_the_garden_follows_the_recipe(shared_data, monkeypatch):
 
 @pytest.fixture(scope="module")
 def measured():
-    """A tiny workload on a machine that is calm at the second attempt."""
-    told = iter([Floors(1.0, 1.0), Floors(2.0, 1.0), Floors(1.0, 1.0), Floors(1.1, 1.0)])
+    """A tiny workload on a machine that is calm only at the second attempt."""
+    sequence = iter([Floors(1.0, 1.0), Floors(2.0, 1.0), Floors(1.0, 1.0), Floors(1.1, 1.0)])
     workload = ball_workload(1_000, (48, 32), channels=5)
-    return measure(workload, 2, floors=lambda: next(told))
+    return measure(workload, 2, floors=lambda: next(sequence))
 
 
 @pytest.mark.slow
@@ -219,7 +219,7 @@ def absent() -> None:
 def bench(monkeypatch, tmp_path, capfd, measured):
     """Runs the command on two workloads that are already measured and one without data.
 
-    It returns the exit code and what was said.
+    It returns the exit code and the output.
     """
 
     def remembered(workload, repeats, say):
@@ -242,10 +242,10 @@ def bench(monkeypatch, tmp_path, capfd, measured):
 
 
 def test_a_run_from_end_to_end(bench, tmp_path):
-    code, said = bench(update_baseline=True)
+    code, output = bench(update_baseline=True)
     assert code == 0
     for text in ("ball-1e3-48x32", "forward+backward", "jvp", "garden-0: skipped, no file garden"):
-        assert text in said, said
+        assert text in output, output
     record = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert record["complete"]
     assert list(record) == sorted(record)
@@ -260,12 +260,12 @@ def test_a_run_from_end_to_end(bench, tmp_path):
     stored = json.loads(baseline.read_text())
     stored["metrics"]["ball-1e3-48x32/pairs"]["value"] = 1.0
     baseline.write_text(json.dumps(stored))
-    code, said = bench(only=("ball-1e3-48x32",), check=True)
+    code, output = bench(only=("ball-1e3-48x32",), check=True)
     assert code == 1
-    assert "worse  ball-1e3-48x32/pairs: 1.00 -> " in said
+    assert "worse  ball-1e3-48x32/pairs: 1.00 -> " in output
     stored["metrics"] = {"another/pairs": stored["metrics"]["ball-1e3-48x32/pairs"]}
     baseline.write_text(json.dumps(stored))
-    with pytest.raises(ValueError, match=r"--check: .* has none of what was measured"):
+    with pytest.raises(ValueError, match=r"--check: expected the measured figures in .*, found none"):
         bench(only=("ball-1e3-48x32",), check=True)
 
 
@@ -277,9 +277,9 @@ def test_ctrl_c_keeps_what_was_measured(bench, tmp_path, monkeypatch):
 
     remembered = suite.measure
     monkeypatch.setattr(suite, "measure", interrupted)
-    code, said = bench()
+    code, output = bench()
     assert code == 130
-    assert "what was measured until then is kept" in said
+    assert "the results so far are saved" in output
     record = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert not record["complete"]
     assert {row["workload"] for row in record["rows"]} == {TINY.name}
@@ -287,13 +287,16 @@ def test_ctrl_c_keeps_what_was_measured(bench, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("forward_only")
 def test_the_real_thing_on_one_tiny_workload(monkeypatch, tmp_path, capfd):
-    """Nothing but the workload and the programs is replaced: floors, timing and files are the command's."""
+    """Only the workload and the programs are replaced; floors, timing and files are the command's own."""
     monkeypatch.setattr(suite, "RESULTS", tmp_path / "none")
     monkeypatch.setattr(suite, "QUICK", [TINY])
     out = tmp_path / "out"
     assert main(["bench", "--quick", "--only", "ball", "--repeats", "2", "--out", str(out)]) == 0
     assert "ball-1e3-48x32" in capfd.readouterr().out
-    assert {path.name for path in out.iterdir()} == {"bench.json", "results.md"}  # one point is no curve
+    assert {path.name for path in out.iterdir()} == {
+        "bench.json",
+        "results.md",
+    }  # a single point is not plotted
     (row,) = json.loads((out / "bench.json").read_text())["rows"]
     assert row["exp_floors"] > 0
 
@@ -319,8 +322,8 @@ def test_growth_has_a_panel_for_each_sweep(measured):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--only", "gardn"], "--only: no workload is called 'gardn'; there are garden-0"),
-        (["--check"], "--check: there is no baseline at"),
+        (["--only", "gardn"], "--only: expected a workload, found 'gardn'; choose from garden-0"),
+        (["--check"], "--check: expected a baseline at"),
         (["--repeats", "0"], "--repeats: expected 1 or more, found 0"),
     ],
 )

@@ -61,7 +61,7 @@ def test_missing_dataset(refused, tmp_path):
 
 
 def test_unknown_built_in_scene(refused):
-    assert "no built-in scene 'kitchen'; there are: tabletop, articulated" in refused("simulated:kitchen")
+    assert "no built-in scene 'kitchen'; available: tabletop, articulated" in refused("simulated:kitchen")
 
 
 def test_folder_of_several_sequences(refused, tmp_path):
@@ -72,7 +72,7 @@ def test_folder_of_several_sequences(refused, tmp_path):
 
 def test_missing_image(refused, recording):
     (recording / "ims" / "1" / "000002.png").unlink()
-    assert "000002.png: expected an image of all 3 cameras in frame 2" in refused(recording)
+    assert "000002.png: expected images of all 3 cameras in frame 2" in refused(recording)
 
 
 def test_one_mask_is_enough(sound, recording, still):
@@ -121,7 +121,7 @@ def test_pose_that_is_no_rotation(refused, recording):
         meta["w2c"][1][2][0][0] += 0.3
 
     change_meta(recording, skew)
-    assert "viewmat of camera 2 in frame 1: R is no rotation" in refused(recording)
+    assert "viewmat of camera 2 in frame 1: R is not a rotation" in refused(recording)
 
 
 def test_mask_of_another_size(refused, recording):
@@ -259,10 +259,10 @@ def test_a_truth_that_is_cut_off(refused, recording):
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("fn", 3, "expected lists and numbers as this layout has them"),
-        ("cam_id", [5], "expected lists and numbers as this layout has them"),
-        ("w", "80", "expected a whole number of pixels as w, found '80'"),
-        ("depth_unit_m", 0, "expected metres, more than 0, as depth_unit_m, found 0"),
+        ("fn", 3, "expected the lists and numbers of this layout"),
+        ("cam_id", [5], "expected the lists and numbers of this layout"),
+        ("w", "80", "expected w to be a whole number of pixels, found '80'"),
+        ("depth_unit_m", 0, "expected depth_unit_m to be metres above 0, found 0"),
     ],
 )
 def test_a_meta_of_other_types(refused, recording, key, value, says):

@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from gsjax.engine.interrupts import raise_if_interrupted, heard_interrupts, shielded
+from gsjax.engine.interrupts import heard_interrupts, raise_if_interrupted, shielded
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 

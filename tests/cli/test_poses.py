@@ -102,7 +102,7 @@ def test_a_video(say, tmp_path):
     assert code == 2, said
     code, said = say(tmp_path / "walk.mp4", "--out", tmp_path / "out", "--frames", "9")
     assert code == 0, said
-    assert "comparing neighbours" in said
+    assert "matching neighbours" in said
     scene = open_photographs(tmp_path / "out")
     assert scene.num >= 8
     truth = room.viewmats(18)[[int(name[6:12]) for name in scene.names]]
@@ -138,8 +138,9 @@ def test_pictures_without_texture_and_one_that_cannot_be_read(say, tmp_path):
     assert code == 2
     assert "1 of 4 photographs cannot be read and are left out: " in said
     assert "3.png: expected an image, found a file that is cut off" in said
-    assert "expected photographs that fit together, found 0 pairs that show the same things" in said
-    assert "Take more of them with much overlap" in said
+    expected = "expected photographs that can be registered together, found 0 pairs with verified matches"
+    assert expected in said
+    assert "Take more photographs with more overlap" in said
     assert not (tmp_path / "out").exists()
 
 

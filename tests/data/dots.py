@@ -1,4 +1,4 @@
-"""Pictures of soft dots, whose places are known to a fraction of a pixel, for tests of readers."""
+"""Pictures of soft dots whose positions are known to a fraction of a pixel, for tests of readers."""
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ def draw(width, height, pixels):
 
 
 def offset(image, pixel):
-    """How far the dot near a pixel is from it, in pixels; infinite where there is none."""
+    """Distance in pixels of the dot near a pixel from it; infinite if there is no dot."""
     v, u = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     weight = image.mean(-1) * (np.hypot(u - pixel[0], v - pixel[1]) < _REACH)
     if weight.sum() < 255:
@@ -32,7 +32,7 @@ def offset(image, pixel):
 
 
 def project(K, viewmat, point):
-    """The pixel (x, y) of a point of the world, in front of the camera."""
+    """The pixel (x, y) of a world point in front of the camera."""
     x, y, z = K @ (viewmat[:3, :3] @ point + viewmat[:3, 3])
     assert z > 0
     return np.array([x / z, y / z])

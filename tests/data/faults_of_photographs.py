@@ -1,4 +1,4 @@
-"""Photographs of every layout, and what may be wrong with them."""
+"""Photographs in every layout, and their faults."""
 
 import json
 import struct
@@ -17,7 +17,6 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     array,
     change,
     cut,
@@ -26,6 +25,7 @@ from tests.data.faulty import (
     frame,
     gone,
     holds,
+    load_all,
     moved,
     patch,
     picture,
@@ -53,32 +53,30 @@ TRANSFORMS = (
     Fault("not JSON", holds("transforms.json", "frames: 3"), ("transforms.json",)),
     Fault("cut off", cut("transforms.json"), ("transforms.json",)),
     Fault("no frames", change("transforms.json", lambda m: m.update(frames=[])), ("transforms.json",)),
-    Fault("NaN in one pose", frame("transforms.json", 1, transform_matrix=NAN), ("images/1.png",)),
-    Fault(
-        "a pose that is no rotation", frame("transforms.json", 1, transform_matrix=SKEW), ("frame 1", "1.png")
-    ),
-    Fault("a pose of another shape", frame("transforms.json", 1, transform_matrix=[1, 2]), ("frame 1",)),
+    Fault("NaN in a pose", frame("transforms.json", 1, transform_matrix=NAN), ("images/1.png",)),
+    Fault("pose is no rotation", frame("transforms.json", 1, transform_matrix=SKEW), ("frame 1", "1.png")),
+    Fault("wrong shape of a pose", frame("transforms.json", 1, transform_matrix=[1, 2]), ("frame 1",)),
     Fault("NaN as focal length", frame("transforms.json", 2, fl_x=float("nan")), ("frame 2",)),
     Fault("no focal length", change("transforms.json", lambda m: m.pop("fl_x")), ("transforms.json",)),
-    Fault("a camera model without an equal", frame("transforms.json", 0, camera_model="X"), ("frame 0",)),
+    Fault("unknown camera model", frame("transforms.json", 0, camera_model="X"), ("frame 0",)),
     Fault(
-        "lists of splits without train",
+        "no train list",
         change("transforms.json", lambda m: m.update(test_filenames=["images/0.png"])),
         ("transforms.json",),
     ),
-    Fault("a photograph is missing", gone("images/1.png"), ("images/1.png",)),
-    Fault("all photographs are missing", gone(*(f"images/{i}.png" for i in range(3))), ("images/0.png",)),
-    Fault("a photograph is cut off", cut("images/1.png"), ("images/1.png",)),
-    Fault("a photograph that is none", holds("images/1.png", "text"), ("images/1.png",)),
-    Fault("a photograph of another shape", drawn("images/1.png", picture(1, 24, 32)), ("frame 1",)),
-    Fault("a depth image is missing", gone("depth/1.png"), ("depth/1.png",)),
-    Fault("a depth image of 8 bits", drawn("depth/1.png", picture(0)[..., 0]), ("depth/1.png",)),
-    Fault("a mask is cut off", cut("masks/2.png"), ("masks/2.png",)),
-    Fault("a mask in colours", drawn("masks/2.png", picture(0)), ("masks/2.png",)),
-    Fault("points are missing", gone("points.ply"), ("points.ply",)),
-    Fault("points are cut off", cut("points.ply", 0.97), ("points.ply",)),
+    Fault("photograph missing", gone("images/1.png"), ("images/1.png",)),
+    Fault("all photographs missing", gone(*(f"images/{i}.png" for i in range(3))), ("images/0.png",)),
+    Fault("image cut off", cut("images/1.png"), ("images/1.png",)),
+    Fault("not an image", holds("images/1.png", "text"), ("images/1.png",)),
+    Fault("wrong shape of a photograph", drawn("images/1.png", picture(1, 24, 32)), ("frame 1",)),
+    Fault("depth image missing", gone("depth/1.png"), ("depth/1.png",)),
+    Fault("8-bit depth", drawn("depth/1.png", picture(0)[..., 0]), ("depth/1.png",)),
+    Fault("mask cut off", cut("masks/2.png"), ("masks/2.png",)),
+    Fault("mask in colour", drawn("masks/2.png", picture(0)), ("masks/2.png",)),
+    Fault("points missing", gone("points.ply"), ("points.ply",)),
+    Fault("points cut off", cut("points.ply", 0.97), ("points.ply",)),
     Fault("points without coordinates", swap("points.ply", "float z", "float w"), ("points.ply",)),
-    Fault("points that are no PLY", holds("points.ply", b"PK\3\4"), ("points.ply",)),
+    Fault("points not a PLY", holds("points.ply", b"PK\3\4"), ("points.ply",)),
 )
 
 
@@ -95,13 +93,11 @@ def build_blender(root: Path) -> None:
 BLENDER = (
     Fault("not JSON", holds("transforms_test.json", b"\x93NUMPY"), ("transforms_test.json",)),
     Fault("no frames", change("transforms_train.json", lambda m: m.update(frames=[])), ("_train.json",)),
-    Fault(
-        "an angle that is no number", frame("transforms_train.json", 0, camera_angle_x="0.8"), ("frame 0",)
-    ),
-    Fault("an angle of 0", frame("transforms_test.json", 1, camera_angle_x=0), ("_test.json, frame 1",)),
-    Fault("NaN in one pose", frame("transforms_train.json", 1, transform_matrix=NAN), ("train/r_1",)),
-    Fault("a photograph is missing", gone("train/r_1.png"), ("train/r_1",)),
-    Fault("a photograph is cut off", cut("train/r_1.png"), ("train/r_1.png",)),
+    Fault("angle not a number", frame("transforms_train.json", 0, camera_angle_x="0.8"), ("frame 0",)),
+    Fault("angle of 0", frame("transforms_test.json", 1, camera_angle_x=0), ("_test.json, frame 1",)),
+    Fault("NaN in a pose", frame("transforms_train.json", 1, transform_matrix=NAN), ("train/r_1",)),
+    Fault("photograph missing", gone("train/r_1.png"), ("train/r_1",)),
+    Fault("image cut off", cut("train/r_1.png"), ("train/r_1.png",)),
 )
 
 
@@ -141,40 +137,42 @@ def build_colmap_binary(root: Path) -> None:
 TEXT = {name: f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
 BINARY = {name: f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}
 COLMAP_TEXT = (
-    Fault("a list is missing", gone(TEXT["images"]), ("sparse/0/images.txt",)),
+    Fault("list missing", gone(TEXT["images"]), ("sparse/0/images.txt",)),
     Fault("no camera", holds(TEXT["cameras"], "# none\n"), ("cameras.txt",)),
     Fault("no photograph", holds(TEXT["images"], "# none\n"), ("images.txt",)),
-    Fault("a line is cut off", cut(TEXT["cameras"], 0.2), ("cameras.txt, line 1",)),
-    Fault("a number is missing", swap(TEXT["cameras"], " 12.0", ""), ("cameras.txt, line 1",)),
+    Fault("line cut off", cut(TEXT["cameras"], 0.2), ("cameras.txt, line 1",)),
+    Fault("number missing", swap(TEXT["cameras"], " 12.0", ""), ("cameras.txt, line 1",)),
     Fault("words for numbers", swap(TEXT["images"], "1 1 0 0 0", "1 1 0 zero 0"), ("images.txt, line 3",)),
     Fault(
-        "a model that OpenCV has not",
+        "model unknown to OpenCV",
         swap(TEXT["cameras"], "PINHOLE 32 24", "FOV 32 24 30.0"),
         ("cameras.txt",),
     ),
     Fault("NaN as focal length", swap(TEXT["cameras"], "30.0", "nan"), ("cameras.txt",)),
-    Fault("NaN in one pose", swap(TEXT["images"], "1 1 0 0 0", "1 nan 0 0 0"), ("images.txt", "b.png")),
+    Fault("NaN in a pose", swap(TEXT["images"], "1 1 0 0 0", "1 nan 0 0 0"), ("images.txt", "b.png")),
     Fault(
-        "a quaternion of length 2", swap(TEXT["images"], "1 1 0", "1 2 0"), ("images.txt, line 3", "b.png")
+        "quaternion not normalised", swap(TEXT["images"], "1 1 0", "1 2 0"), ("images.txt, line 3", "b.png")
     ),
-    Fault("a point without colour", holds(TEXT["points3D"], "1 0 0 1\n"), ("points3D.txt, line 1",)),
-    Fault("a photograph is missing", gone("images/b.png"), ("DATA/images", "b.png")),
-    Fault("all photographs are missing", gone(*(f"images/{n}" for n in NAMES)), ("DATA/images",)),
-    Fault("a photograph is cut off", cut("images/b.png"), ("images/b.png",)),
-    Fault("a photograph of another shape", drawn("images/b.png", picture(1, 24, 32)), ("images/b.png",)),
+    Fault("point without colour", holds(TEXT["points3D"], "1 0 0 1\n"), ("points3D.txt, line 1",)),
+    Fault("photograph missing", gone("images/b.png"), ("DATA/images", "b.png")),
+    Fault("all photographs missing", gone(*(f"images/{n}" for n in NAMES)), ("DATA/images",)),
+    Fault("image cut off", cut("images/b.png"), ("images/b.png",)),
+    Fault("wrong shape of a photograph", drawn("images/b.png", picture(1, 24, 32)), ("images/b.png",)),
 )
 COLMAP_BINARY = (
-    Fault("a list is missing", gone(BINARY["images"]), ("sparse/0/images.bin",)),
+    Fault("list missing", gone(BINARY["images"]), ("sparse/0/images.bin",)),
     *(Fault(f"{name}.bin is cut off", cut(BINARY[name], 0.9), (f"{name}.bin",)) for name in BINARY),
-    Fault("something else", holds(BINARY["images"], b"SQLite format 3\0" + bytes(99)), ("images.bin",)),
+    Fault("another format", holds(BINARY["images"], b"SQLite format 3\0" + bytes(99)), ("images.bin",)),
     Fault("no camera", holds(BINARY["cameras"], bytes(8)), ("cameras.bin",)),
     Fault("no photograph", holds(BINARY["images"], bytes(8)), ("images.bin",)),
-    Fault("a model that OpenCV has not", patch(BINARY["cameras"], 12, b"\x63"), ("cameras.bin",)),
-    Fault("NaN in one pose", patch(BINARY["images"], 12, struct.pack("<d", np.nan)), ("images.bin", "a.png")),
+    Fault("model unknown to OpenCV", patch(BINARY["cameras"], 12, b"\x63"), ("cameras.bin",)),
+    Fault("NaN in a pose", patch(BINARY["images"], 12, struct.pack("<d", np.nan)), ("images.bin", "a.png")),
     Fault(
-        "a quaternion of length 2", patch(BINARY["images"], 12, struct.pack("<d", 2)), ("images.bin", "a.png")
+        "quaternion not normalised",
+        patch(BINARY["images"], 12, struct.pack("<d", 2)),
+        ("images.bin", "a.png"),
     ),
-    Fault("a photograph is missing", gone("images/b.png"), ("DATA/images", "b.png")),
+    Fault("photograph missing", gone("images/b.png"), ("DATA/images", "b.png")),
 )
 
 
@@ -207,32 +205,32 @@ def mirror(rows: np.ndarray) -> np.ndarray:
 
 ROWS = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),
-    Fault("no array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
+    Fault("not an array", holds("poses_bounds.npy", "1 2 3\n"), ("poses_bounds.npy",)),
     Fault("pickled objects", array("poses_bounds.npy", lambda a: a.astype(object)), ("poses_bounds.npy",)),
-    Fault("another shape", array("poses_bounds.npy", lambda a: a[:, :16]), ("poses_bounds.npy",)),
+    Fault("wrong shape", array("poses_bounds.npy", lambda a: a[:, :16]), ("poses_bounds.npy",)),
     Fault("no row", array("poses_bounds.npy", lambda a: a[:0]), ("poses_bounds.npy",)),
     Fault(
         "NaN", array("poses_bounds.npy", lambda a: a * [1, np.nan, *[1] * 15]), ("poses_bounds.npy", "row 0")
     ),
-    Fault("a mirror image", array("poses_bounds.npy", mirror), ("row 1", "poses_bounds.npy")),
+    Fault("mirror image", array("poses_bounds.npy", mirror), ("row 1", "poses_bounds.npy")),
     Fault("no focal length", array("poses_bounds.npy", lambda a: a * [*[1] * 14, 0, 1, 1]), ("row 0",)),
 )
 LLFF = (
     *ROWS,
-    Fault("a photograph is missing", gone("images/b.png"), ("poses_bounds.npy", "DATA/images")),
-    Fault("a photograph is cut off", cut("images/b.png"), ("images/b.png",)),
+    Fault("photograph missing", gone("images/b.png"), ("poses_bounds.npy", "DATA/images")),
+    Fault("image cut off", cut("images/b.png"), ("images/b.png",)),
 )
 DYNERF = (
     Fault("cut off", cut("poses_bounds.npy"), ("poses_bounds.npy",)),
-    Fault("a video is missing", gone("cam01.mp4"), ("poses_bounds.npy", "cam*.mp4")),
-    Fault("a video that is none", holds("cam01.mp4", "text"), ("cam01.mp4",)),
+    Fault("video missing", gone("cam01.mp4"), ("poses_bounds.npy", "cam*.mp4")),
+    Fault("not a video", holds("cam01.mp4", "text"), ("cam01.mp4",)),
 )
 
 PHOTOGRAPHS = {
-    "nerfstudio, instant-ngp": Layout(build_transforms, lambda r: all_of(open_photographs(r)), TRANSFORMS),
-    "Blender": Layout(build_blender, lambda r: all_of(open_photographs(r)), BLENDER),
-    "COLMAP, text": Layout(build_colmap_text, lambda r: all_of(open_photographs(r)), COLMAP_TEXT),
-    "COLMAP, binary": Layout(build_colmap_binary, lambda r: all_of(open_photographs(r)), COLMAP_BINARY),
-    "LLFF, EndoNeRF": Layout(build_llff, lambda r: all_of(read_llff(r, "endonerf")), LLFF),
-    "DyNeRF": Layout(build_dynerf, lambda r: all_of(read_dynerf(r, "endonerf")), DYNERF),
+    "nerfstudio": Layout(build_transforms, lambda r: load_all(open_photographs(r)), TRANSFORMS),
+    "Blender": Layout(build_blender, lambda r: load_all(open_photographs(r)), BLENDER),
+    "COLMAP text": Layout(build_colmap_text, lambda r: load_all(open_photographs(r)), COLMAP_TEXT),
+    "COLMAP binary": Layout(build_colmap_binary, lambda r: load_all(open_photographs(r)), COLMAP_BINARY),
+    "LLFF": Layout(build_llff, lambda r: load_all(read_llff(r, "endonerf")), LLFF),
+    "DyNeRF": Layout(build_dynerf, lambda r: load_all(read_dynerf(r, "endonerf")), DYNERF),
 }

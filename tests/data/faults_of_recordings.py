@@ -1,4 +1,4 @@
-"""Recordings with depth of every layout, scenes of Gaussians, and what may be wrong with them."""
+"""Recordings with depth in every layout, scenes of Gaussians, and their faults."""
 
 from pathlib import Path
 
@@ -20,13 +20,13 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     change,
     cut,
     deep,
     drawn,
     gone,
     holds,
+    load_all,
     moved,
     picture,
     swap,
@@ -43,16 +43,16 @@ def build_open3d(root: Path) -> None:
 
 
 OPEN3D = (
-    Fault("the trajectory is cut off", cut("trajectory.log", 0.5), ("trajectory.log",)),
+    Fault("trajectory cut off", cut("trajectory.log", 0.5), ("trajectory.log",)),
     Fault("no numbers", holds("trajectory.log", "none\n"), ("trajectory.log",)),
     Fault("no pose", holds("trajectory.log", ""), ("trajectory.log",)),
-    Fault("NaN in one pose", swap("trajectory.log", "1.0", "nan"), ("00000.png",)),
-    Fault("a pose that is no rotation", swap("trajectory.log", "1.0", "3.0"), ("frame 0", "trajectory.log")),
+    Fault("NaN in a pose", swap("trajectory.log", "1.0", "nan"), ("00000.png",)),
+    Fault("pose is no rotation", swap("trajectory.log", "1.0", "3.0"), ("frame 0", "trajectory.log")),
     Fault("no image", gone(*(f"image/{i:05d}.png" for i in range(3))), ("DATA",)),
-    Fault("a depth image is missing", gone("depth/00001.png"), ("00001.png",)),
-    Fault("a depth image is cut off", cut("depth/00001.png"), ("depth/00001.png",)),
-    Fault("a depth image of 8 bits", drawn("depth/00001.png", picture(0)[..., 0]), ("depth/00001.png",)),
-    Fault("an image of another size", drawn("image/00001.png", picture(0, 16, 12)), ("image/00001.png",)),
+    Fault("depth image missing", gone("depth/00001.png"), ("00001.png",)),
+    Fault("depth image cut off", cut("depth/00001.png"), ("depth/00001.png",)),
+    Fault("8-bit depth", drawn("depth/00001.png", picture(0)[..., 0]), ("depth/00001.png",)),
+    Fault("wrong size", drawn("image/00001.png", picture(0, 16, 12)), ("image/00001.png",)),
 )
 
 
@@ -66,18 +66,18 @@ def build_tum(root: Path) -> None:
 
 
 TUM = (
-    Fault("a list is missing", gone("depth.txt"), ("depth.txt",)),
-    Fault("a line is cut off", cut("rgb.txt", 0.65), ("rgb.txt", "line 2")),
+    Fault("list missing", gone("depth.txt"), ("depth.txt",)),
+    Fault("line cut off", cut("rgb.txt", 0.65), ("rgb.txt", "line 2")),
     Fault("no text", holds("groundtruth.txt", b"\xff\xfe\x80"), ("groundtruth.txt",)),
     Fault("no pose", holds("groundtruth.txt", "# none\n"), ("groundtruth.txt",)),
-    Fault("NaN in one pose", swap("groundtruth.txt", "1.0 1", "1.0 nan"), ("groundtruth.txt",)),
-    Fault("a quaternion of length 2", swap("groundtruth.txt", " 1\n", " 2\n"), ("groundtruth.txt",)),
-    Fault("one stamp far from all others", swap("depth.txt", "0.0 ", "50.0 "), ("DATA",)),
-    Fault("clocks that never meet", holds("depth.txt", "50.0 depth/0.png\n51.0 depth/1.png\n"), ("DATA",)),
-    Fault("an image is missing", gone("rgb/1.png"), ("rgb.txt",)),
-    Fault("all images are missing", gone("rgb/0.png", "rgb/1.png"), ("rgb.txt",)),
-    Fault("an image is cut off", cut("rgb/1.png"), ("rgb/1.png",)),
-    Fault("an image of another size", drawn("rgb/0.png", picture(0)), ("rgb/0.png",)),
+    Fault("NaN in a pose", swap("groundtruth.txt", "1.0 1", "1.0 nan"), ("groundtruth.txt",)),
+    Fault("quaternion not normalised", swap("groundtruth.txt", " 1\n", " 2\n"), ("groundtruth.txt",)),
+    Fault("isolated stamp", swap("depth.txt", "0.0 ", "50.0 "), ("DATA",)),
+    Fault("clocks without overlap", holds("depth.txt", "50.0 depth/0.png\n51.0 depth/1.png\n"), ("DATA",)),
+    Fault("image missing", gone("rgb/1.png"), ("rgb.txt",)),
+    Fault("all images missing", gone("rgb/0.png", "rgb/1.png"), ("rgb.txt",)),
+    Fault("image cut off", cut("rgb/1.png"), ("rgb/1.png",)),
+    Fault("wrong size", drawn("rgb/0.png", picture(0)), ("rgb/0.png",)),
 )
 
 
@@ -92,15 +92,15 @@ def build_seven_scenes(root: Path) -> None:
 
 POSE = "frame-000001.pose.txt"
 SEVEN_SCENES = (
-    Fault("a pose is cut off", cut(POSE), (POSE,)),
-    Fault("a pose of words", holds(POSE, "one two\n"), (POSE,)),
-    Fault("NaN in one pose", lambda root: np.savetxt(root / POSE, NAN), ("frame-000001",)),
-    Fault("a pose that is no rotation", lambda root: np.savetxt(root / POSE, SKEW), (POSE,)),
-    Fault("an image is missing", gone("frame-000001.color.png"), ("frame-000001",)),
+    Fault("pose cut off", cut(POSE), (POSE,)),
+    Fault("pose of words", holds(POSE, "one two\n"), (POSE,)),
+    Fault("NaN in a pose", lambda root: np.savetxt(root / POSE, NAN), ("frame-000001",)),
+    Fault("pose is no rotation", lambda root: np.savetxt(root / POSE, SKEW), (POSE,)),
+    Fault("image missing", gone("frame-000001.color.png"), ("frame-000001",)),
     Fault("no pose", gone("frame-000000.pose.txt", POSE), ("DATA",)),
-    Fault("a depth image is cut off", cut("frame-000001.depth.png"), ("frame-000001.depth.png",)),
+    Fault("depth image cut off", cut("frame-000001.depth.png"), ("frame-000001.depth.png",)),
     Fault(
-        "intrinsics of another camera",
+        "wrong intrinsics",
         lambda root: np.savetxt(root / "camera-intrinsics.txt", np.eye(3)),
         ("camera-intrinsics.txt",),
     ),
@@ -121,16 +121,12 @@ def entry(key: str, value: object) -> Damage:
 PANOPTIC = (
     Fault("not JSON", holds("train_meta.json", b"\x80\x04"), ("train_meta.json",)),
     Fault("no camera", change("train_meta.json", lambda m: m.update(cam_id=[[], []])), ("train_meta.json",)),
-    Fault("NaN in one pose", entry("w2c", NAN), ("train_meta.json", "frame 1")),
-    Fault("a pose of another shape", entry("w2c", [1, 2]), ("train_meta.json",)),
-    Fault(
-        "K with a focal length of 0", entry("k", np.diag([0, 1, 1]).tolist()), ("train_meta.json", "frame 1")
-    ),
-    Fault("an image is missing", gone("ims/1/000001.png"), ("ims/1/000001.png",)),
-    Fault("an image is cut off", cut("ims/1/000001.png"), ("ims/1/000001.png",)),
-    Fault(
-        "a depth image of 8 bits", drawn("depth/1/000001.png", picture(0)[..., 0]), ("depth/1/000001.png",)
-    ),
+    Fault("NaN in a pose", entry("w2c", NAN), ("train_meta.json", "frame 1")),
+    Fault("wrong shape of a pose", entry("w2c", [1, 2]), ("train_meta.json",)),
+    Fault("focal length of 0", entry("k", np.diag([0, 1, 1]).tolist()), ("train_meta.json", "frame 1")),
+    Fault("image missing", gone("ims/1/000001.png"), ("ims/1/000001.png",)),
+    Fault("image cut off", cut("ims/1/000001.png"), ("ims/1/000001.png",)),
+    Fault("8-bit depth", drawn("depth/1/000001.png", picture(0)[..., 0]), ("depth/1/000001.png",)),
 )
 
 
@@ -144,10 +140,10 @@ def build_gaussians(root: Path) -> None:
 SCENE = "scene.ply"
 GAUSSIANS = (
     Fault("missing", gone(SCENE), (SCENE,)),
-    Fault("something else", holds(SCENE, b"PK\3\4"), (SCENE,)),
+    Fault("another format", holds(SCENE, b"PK\3\4"), (SCENE,)),
     Fault("cut off", cut(SCENE, 0.9), (SCENE,)),
     Fault(
-        "a cloud of points",
+        "point cloud",
         lambda root: build_transforms(root) or (root / "points.ply").rename(root / SCENE),
         (SCENE,),
     ),
@@ -155,9 +151,9 @@ GAUSSIANS = (
 )
 
 RECORDINGS = {
-    "Open3D RGB-D": Layout(build_open3d, lambda r: all_of(read_open3d(r, K)), OPEN3D),
-    "TUM RGB-D": Layout(build_tum, lambda r: all_of(open_sequence(r)), TUM),
-    "7-Scenes": Layout(build_seven_scenes, lambda r: all_of(open_sequence(r)), SEVEN_SCENES),
-    "Panoptic": Layout(build_panoptic, lambda r: all_of(open_sequence(r)), PANOPTIC),
+    "Open3D RGB-D": Layout(build_open3d, lambda r: load_all(read_open3d(r, K)), OPEN3D),
+    "TUM RGB-D": Layout(build_tum, lambda r: load_all(open_sequence(r)), TUM),
+    "7-Scenes": Layout(build_seven_scenes, lambda r: load_all(open_sequence(r)), SEVEN_SCENES),
+    "Panoptic": Layout(build_panoptic, lambda r: load_all(open_sequence(r)), PANOPTIC),
     "PLY of Gaussians": Layout(build_gaussians, lambda r: read_ply(r / SCENE), GAUSSIANS),
 }

@@ -1,4 +1,4 @@
-"""Recordings of surgery, and what may be wrong with them."""
+"""Recordings of surgery, and their faults."""
 
 import json
 import shutil
@@ -19,13 +19,13 @@ from tests.data.faulty import (
     Fault,
     K,
     Layout,
-    all_of,
     array,
     change,
     cut,
     drawn,
     gone,
     holds,
+    load_all,
     picture,
     swap,
 )
@@ -34,7 +34,7 @@ TOOL = np.where(np.arange(WIDTH) < WIDTH // 4, 255, 0).astype(np.uint8) * np.one
 
 
 def every(folder: str, edit: Callable[[np.ndarray], np.ndarray]) -> Damage:
-    """Changes each picture of a folder."""
+    """Edits each picture of a folder."""
 
     def damage(root: Path) -> None:
         for path in (root / folder).iterdir():
@@ -60,7 +60,7 @@ def build_endonerf(root: Path) -> None:
 
 
 ENDONERF = (
-    *(fault for fault in ROWS if fault.what in ("cut off", "another shape", "NaN", "a mirror image")),
+    *(fault for fault in ROWS if fault.what in ("cut off", "wrong shape", "NaN", "mirror image")),
     Fault(
         "poses in millimetres",
         array(
@@ -69,30 +69,30 @@ ENDONERF = (
         ),
         ("poses_bounds.npy", "pose_unit_m"),
     ),
-    Fault("a frame is missing", gone("images/001.png"), ("poses_bounds.npy", "DATA/images")),
-    Fault("a frame is cut off", cut("images/001.png"), ("images/001.png",)),
-    Fault("frames of differing size", drawn("images/001.png", picture(0, 16, 12)), ("images/001.png",)),
-    Fault("only one frame", only_one, ("images/000.png",)),
-    Fault("a mask is missing", gone("masks/001.png"), ("DATA/masks",)),
-    Fault("a mask in colour", drawn("masks/001.png", picture(0)), ("masks/001.png",)),
+    Fault("frame missing", gone("images/001.png"), ("poses_bounds.npy", "DATA/images")),
+    Fault("image cut off", cut("images/001.png"), ("images/001.png",)),
+    Fault("sizes differ", drawn("images/001.png", picture(0, 16, 12)), ("images/001.png",)),
+    Fault("single frame", only_one, ("images/000.png",)),
+    Fault("mask missing", gone("masks/001.png"), ("DATA/masks",)),
+    Fault("mask in colour", drawn("masks/001.png", picture(0)), ("masks/001.png",)),
     Fault("inverted masks", every("masks", lambda mask: 255 - mask), ("DATA/masks", "--read.tool black")),
-    Fault("masks of nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
-    Fault("a depth image is missing", gone("depth/001.png"), ("DATA/depth",)),
-    Fault("depth is 0 everywhere", every("depth", lambda depth: 0 * depth), ("DATA/depth",)),
-    Fault("depth of 8 bits", drawn("depth/000.png", TOOL), ("depth/000.png",)),
+    Fault("all masks nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
+    Fault("depth image missing", gone("depth/001.png"), ("DATA/depth",)),
+    Fault("depth all 0", every("depth", lambda depth: 0 * depth), ("DATA/depth",)),
+    Fault("8-bit depth", drawn("depth/000.png", TOOL), ("depth/000.png",)),
     Fault(
-        "a wrong unit of depth",
+        "wrong depth unit",
         change("meta.json", lambda m: m.update(depth_unit_m=1e-6)),
         ("depth/000.png",),
     ),
-    Fault("the right eye's frame is missing", gone("right/images/001.png"), ("right/images",)),
+    Fault("right frame missing", gone("right/images/001.png"), ("right/images",)),
     Fault(
         "no baseline", change("meta.json", lambda m: m.pop("baseline_m")), ("DATA/right", "--read.baseline-m")
     ),
-    Fault("a rate of 0", change("meta.json", lambda m: m.update(fps=0)), ("meta.json", "fps")),
-    Fault("a list as meta.json", holds("meta.json", "[]"), ("meta.json",)),
+    Fault("rate of 0", change("meta.json", lambda m: m.update(fps=0)), ("meta.json", "fps")),
+    Fault("list as meta.json", holds("meta.json", "[]"), ("meta.json",)),
     Fault(
-        "truth of fewer frames",
+        "truth too short",
         lambda r: np.savez(r / "truth.npz", verts=np.zeros((2, 5, 3))),
         ("truth.npz",),
     ),
@@ -112,14 +112,14 @@ def build_endovis17(root: Path) -> None:
 TRUE = "ground_truth/Left_Prograsp_Forceps_labels"
 ENDOVIS_17 = (
     Fault("no calibration", gone("camera_calibration.txt"), ("camera_calibration.txt", "--read.K")),
-    Fault("no text", holds("camera_calibration.txt", b"\xff\xfe\x80"), ("camera_calibration.txt",)),
+    Fault("binary data", holds("camera_calibration.txt", b"\xff\xfe\x80"), ("camera_calibration.txt",)),
     Fault(
         "NaN as focal length",
         swap("camera_calibration.txt", "F: 30", "F: nan"),
         ("camera_calibration.txt", "Camera-0-F"),
     ),
     Fault(
-        "no place of the right eye",
+        "right eye not placed",
         holds(
             "camera_calibration.txt",
             "Width: 32\nHeight: 24\nCamera-0-F: 9 9\nCamera-0-C: 1 1\nCamera-0-K: 0 0 0 0 0\n",
@@ -127,22 +127,22 @@ ENDOVIS_17 = (
         ("DATA/right_frames", "camera_calibration.txt"),
     ),
     Fault(
-        "a lens that distorts",
+        "distorting lens",
         swap("camera_calibration.txt", "Camera-0-K: 0", "Camera-0-K: -0.9"),
         ("camera_calibration.txt", "Camera-0-K"),
     ),
     Fault("no frames", gone(*(f"left_frames/frame00{t}.png" for t in range(3))), ("DATA/left_frames",)),
-    Fault("a frame is missing", gone("left_frames/frame001.png"), ("DATA/right_frames", "left_frames")),
-    Fault("a frame is cut off", cut("left_frames/frame001.png"), ("left_frames/frame001.png",)),
+    Fault("frame missing", gone("left_frames/frame001.png"), ("DATA/right_frames", "left_frames")),
+    Fault("image cut off", cut("left_frames/frame001.png"), ("left_frames/frame001.png",)),
     Fault(
-        "frames of differing size",
+        "sizes differ",
         drawn("right_frames/frame001.png", picture(0, 16, 12)),
         ("right_frames/frame001.png",),
     ),
-    Fault("a mask is missing", gone(f"{TRUE}/frame001.png"), (TRUE, "frame001.png")),
-    Fault("a mask of another size", drawn(f"{TRUE}/frame001.png", TOOL[:9]), (f"{TRUE}/frame001.png",)),
+    Fault("mask missing", gone(f"{TRUE}/frame001.png"), (TRUE, "frame001.png")),
+    Fault("wrong size", drawn(f"{TRUE}/frame001.png", TOOL[:9]), (f"{TRUE}/frame001.png",)),
     Fault(
-        "an instrument that is not of the challenge",
+        "unknown instrument",
         lambda root: (root / TRUE).rename(root / "ground_truth/Spoon_labels"),
         ("ground_truth/Spoon_labels",),
     ),
@@ -161,15 +161,15 @@ def build_endovis18(root: Path) -> None:
 
 
 ENDOVIS_18 = (
-    Fault("no names of colours", gone("labels.json"), ("labels.json",)),
+    Fault("no colour names", gone("labels.json"), ("labels.json",)),
     Fault("names without colours", holds("labels.json", '[{"name": "tissue"}]'), ("labels.json",)),
     Fault(
         "colours without names",
         drawn("labels/frame001.png", picture(0)),
         ("labels/frame001.png", "labels.json"),
     ),
-    Fault("labels of a frame are missing", gone("labels/frame001.png"), ("DATA/labels", "frame001.png")),
-    Fault("labels are cut off", cut("labels/frame001.png"), ("labels/frame001.png",)),
+    Fault("mask missing", gone("labels/frame001.png"), ("DATA/labels", "frame001.png")),
+    Fault("image cut off", cut("labels/frame001.png"), ("labels/frame001.png",)),
 )
 
 
@@ -180,16 +180,16 @@ def build_clip(root: Path) -> None:
 
 
 FRAMES_WITH_MASKS = (
-    Fault("frames of differing size", drawn("images/001.png", picture(0, 16, 12)), ("images/001.png",)),
+    Fault("sizes differ", drawn("images/001.png", picture(0, 16, 12)), ("images/001.png",)),
     Fault(
-        "numbers that are not padded",
+        "unpadded numbers",
         lambda root: [(root / f"images/00{i}.png").rename(root / f"images/{i * 5}.png") for i in (1, 2)],
         ("DATA/images", "5.png after 10.png"),
     ),
-    Fault("only one frame", lambda r: [p.unlink() for p in r.glob("*/00[12].png")], ("images/000.png",)),
-    Fault("a mask is missing", gone("masks/001.png"), ("DATA/masks",)),
+    Fault("single frame", lambda r: [p.unlink() for p in r.glob("*/00[12].png")], ("images/000.png",)),
+    Fault("mask missing", gone("masks/001.png"), ("DATA/masks",)),
     Fault("inverted masks", every("masks", lambda mask: 255 - mask), ("DATA/masks", "--read.tool black")),
-    Fault("masks of nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
+    Fault("all masks nothing but tool", every("masks", lambda mask: mask | 255), ("DATA/masks",)),
     Fault("depth, but no poses", lambda root: (root / "depth").mkdir(), ("DATA", "poses_bounds.npy")),
 )
 
@@ -201,15 +201,15 @@ def build_video(root: Path) -> None:
 
 
 VIDEO = (
-    Fault("a video that is none", holds("clip.mp4", "text"), ("clip.mp4",)),
+    Fault("not a video", holds("clip.mp4", "text"), ("clip.mp4",)),
     Fault("no video", gone("clip.mp4"), ("clip.mp4",)),
 )
 
-TOLD = ReadOptions(K=K)
+OPTIONS = ReadOptions(K=K)
 SURGERY = {
-    "EndoNeRF": Layout(build_endonerf, lambda r: all_of(open_sequence(r)), ENDONERF),
-    "EndoVis 2017": Layout(build_endovis17, lambda r: all_of(open_sequence(r)), ENDOVIS_17),
-    "EndoVis 2018": Layout(build_endovis18, lambda r: all_of(open_sequence(r)), ENDOVIS_18),
-    "frames with masks": Layout(build_clip, lambda r: all_of(open_sequence(r, TOLD)), FRAMES_WITH_MASKS),
-    "video": Layout(build_video, lambda r: all_of(open_sequence(r / "clip.mp4", TOLD)), VIDEO),
+    "EndoNeRF": Layout(build_endonerf, lambda r: load_all(open_sequence(r)), ENDONERF),
+    "EndoVis 2017": Layout(build_endovis17, lambda r: load_all(open_sequence(r)), ENDOVIS_17),
+    "EndoVis 2018": Layout(build_endovis18, lambda r: load_all(open_sequence(r)), ENDOVIS_18),
+    "frames with masks": Layout(build_clip, lambda r: load_all(open_sequence(r, OPTIONS)), FRAMES_WITH_MASKS),
+    "video": Layout(build_video, lambda r: load_all(open_sequence(r / "clip.mp4", OPTIONS)), VIDEO),
 }

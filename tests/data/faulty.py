@@ -1,4 +1,4 @@
-"""What may happen to the files of a recording: for test_reader_errors and its tables of faults."""
+"""Ways to damage the files of a recording, for the fault tables of test_reader_errors."""
 
 import json
 from collections.abc import Callable
@@ -17,12 +17,12 @@ Damage = Callable[[Path], None]
 
 
 class Fault(NamedTuple):
-    """What is done to a recording.
+    """One fault of a recording.
 
     Attributes:
-        what: in words.
-        damage: does it, to the folder.
-        names: what a message has to name: the file, and the photograph or frame within it.
+        what: description of the fault.
+        damage: introduces the fault into the folder.
+        names: names that the message must contain: the file, and the photograph or frame within it.
     """
 
     what: str
@@ -31,15 +31,15 @@ class Fault(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """A kind of data: how one is made in a folder, and how all of it is read."""
+    """A data layout: how to build an example in a folder, how to read all of it, and its faults."""
 
     build: Damage
     read: Damage
     faults: tuple[Fault, ...]
 
 
-def all_of(data: Photographs | Sequence) -> None:
-    """Opens every picture, as a run does."""
+def load_all(data: Photographs | Sequence) -> None:
+    """Loads every picture, as a run does."""
     if isinstance(data, Photographs):
         for i in range(data.num):
             data.image(i), data.depth(i), data.mask(i)
@@ -63,7 +63,7 @@ def moved(x: float) -> np.ndarray:
     return pose
 
 
-# What may happen to a file.
+# Damages to a file.
 
 
 def cut(name: str, keep: float = 0.6) -> Damage:

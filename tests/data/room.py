@@ -1,4 +1,4 @@
-"""Pictures of a textured corner of a room, drawn wall by wall: for tests that find where cameras stood."""
+"""Pictures of a textured corner of a room, drawn wall by wall, for tests of camera pose estimation."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from tests.data import dots
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 K = intrinsics(FOCAL, WIDTH, HEIGHT)
-_TEXELS = 256  # a side of each wall, 2 m
+_TEXELS = 256  # along each side of a wall, 2 m
 _WALLS = (  # a corner and two edges: the floor, and the walls at y = 1 and x = 1
     ((-1, -1, 0), (1, 0, 0), (0, 1, 0)),
     ((-1, 1, 0), (1, 0, 0), (0, 0, 1)),
@@ -17,14 +17,14 @@ _WALLS = (  # a corner and two edges: the floor, and the walls at y = 1 and x = 
 
 
 def viewmats(count):
-    """On an arc before the corner, up and down."""
+    """View matrices of cameras on an arc in front of the corner, at varying height."""
     angles = np.linspace(0.3, 1.3, count)
     eyes = (-2.2 * np.cos(angles), -2.2 * np.sin(angles), 1.2 + 0.2 * np.sin(9 * angles))
     return np.stack([look_at(eye, np.array([0.2, 0.2, 0.5])) for eye in np.stack(eyes, axis=-1)])
 
 
 def picture(viewmat, plain=False):
-    """RGB; `plain` walls have no texture."""
+    """RGB image of the corner; `plain` walls have no texture."""
     random = np.random.default_rng(0)
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     for corner, across, along in _WALLS:
@@ -45,7 +45,7 @@ def picture(viewmat, plain=False):
 
 
 def write(folder, count, plain=False):
-    """NUMBER.png of each; gives their view matrices."""
+    """Writes NUMBER.png for each camera; returns the view matrices."""
     cameras = viewmats(count)
     for i, viewmat in enumerate(cameras):
         dots.save(folder / f"{i}.png", picture(viewmat, plain))

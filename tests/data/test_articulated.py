@@ -1,4 +1,4 @@
-"""Furniture that opens, and what its joints say of it."""
+"""Furniture that opens, and its joints."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_not_all_begin_at_once_and_steps_are_small(seed):
 
 @pytest.mark.parametrize("t", [0, 39])
 def test_depth_labels_and_poses_agree(scene, t):
-    """What a part shows, taken back to its own frame, lies within its own size."""
+    """Visible points of a part, mapped back to its own frame, lie within its extent."""
     seen = set()
     for c in range(0, scene.num_cameras, 3):
         camera, mask, depth = scene.camera(t, c), scene.mask(t, c), scene.depth(t, c)
@@ -71,9 +71,9 @@ def test_depth_labels_and_poses_agree(scene, t):
         points = np.concatenate([rays * depth[y, x, None], np.ones((len(x), 1))], 1)
         world = points @ np.linalg.inv(np.asarray(camera.viewmat, np.float64)).T
         for k in range(len(NAMES)):
-            mine = mask[y, x] == scene.truth.label_ids[k]
-            local = world[mine] @ np.linalg.inv(scene.truth.poses[t, k]).T
-            if mine.any():
+            of_part = mask[y, x] == scene.truth.label_ids[k]
+            local = world[of_part] @ np.linalg.inv(scene.truth.poses[t, k]).T
+            if of_part.any():
                 seen.add(NAMES[k])
                 assert np.abs(local[:, :3]).max() < 0.27
         assert {6, 7} & set(np.unique(mask))
@@ -81,10 +81,10 @@ def test_depth_labels_and_poses_agree(scene, t):
 
 
 def test_parts_are_where_their_furniture_is(scene):
-    """Nothing that opens passes through another thing, so no camera sees less of the floor than there is."""
+    """The box stays in front of the furniture, and the door's hinge stays beside the chest."""
     truth = scene.truth
     box, chest_side = truth.poses[:, 3, :3, 3], 0.36 - 0.18
-    assert (box[:, 0] > 0.16 + 0.05).all()  # before the furniture
+    assert (box[:, 0] > 0.16 + 0.05).all()  # in front of the furniture
     assert (np.abs(truth.poses[0, :3, 1, 3] - [-0.22, -0.09, 0.36]) < 1e-9).all()
     assert chest_side > truth.poses[0, 1, 1, 3] + 0.13  # the door's hinge stays beside the chest
 
@@ -129,7 +129,7 @@ def test_it_is_opened_by_name():
 
 @pytest.fixture
 def saved(tmp_path):
-    """A Panoptic folder whose truth is of parts with a joint."""
+    """A Panoptic folder whose truth has parts, one of them with a joint."""
     frames, recording = 4, tmp_path / "door"
     write_panoptic(tabletop(frames=frames, width=16, height=12, cameras=1), recording)
     how = {"type": "hinge", "axis_world": [0.0, 0.0, 1.0], "point_world": [1.0, 0.0, 0.0]}

@@ -13,7 +13,7 @@ ROOT = Path("recording")
 
 
 def increasing(sizes):
-    """Times that increase, on a grid on which floats are exact, so that ties are too."""
+    """Increasing times on a grid of exactly representable floats, so that ties are exact too."""
     ticks = st.lists(st.integers(0, 400), min_size=1, max_size=sizes, unique=True)
     return ticks.map(lambda t: np.array(sorted(t)) / 64.0)
 
@@ -27,7 +27,7 @@ def test_nearest_is_what_a_search_of_all_finds(times, own):
 @given(increasing(12), increasing(12), st.integers(0, 60).map(lambda n: n / 64))
 def test_every_frame_is_kept_or_counted(first, other, limit):
     usable = np.abs(other[None] - first[:, None]).min(axis=1) <= limit
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if not usable.any():
             with pytest.raises(DataError, match="one clock"):
@@ -36,21 +36,21 @@ def test_every_frame_is_kept_or_counted(first, other, limit):
         pairs = associate(ROOT, {"a": first, "b": other}, limit)
     np.testing.assert_array_equal(pairs[:, 0], np.flatnonzero(usable))
     assert (np.abs(first[pairs[:, 0]] - other[pairs[:, 1]]) <= limit).all()
-    counted = [f"{np.sum(~usable)} of {len(first)} frames are left out" in str(w.message) for w in said]
+    counted = [f"{np.sum(~usable)} of {len(first)} frames are left out" in str(w.message) for w in caught]
     assert counted == [True] * (not usable.all())
 
 
 def test_the_warning_names_the_stream_that_was_missing():
     streams = {"a": np.arange(5.0), "b": np.arange(5.0), "c": np.array([0.0, 1.0, 4.0])}
     with pytest.warns(
-        DataWarning, match=r"2 of 5 frames are left out, 2 without c \(up to 1000 ms off\) within 30 ms"
+        DataWarning, match=r"2 of 5 frames are left out: 2 without c \(up to 1000 ms off\) within 30 ms"
     ):
         pairs = associate(ROOT, streams, 0.03)
     assert pairs.tolist() == [[0, 0, 0], [1, 1, 1], [4, 4, 2]]
 
 
 def test_clocks_that_never_meet():
-    with pytest.raises(DataError, match=r"no such frame: at 0.000 s the nearest b is 100 s away.*one clock"):
+    with pytest.raises(DataError, match=r"found none: at 0.000 s the nearest b is 100 s away.*one clock"):
         associate(ROOT, {"a": np.arange(3.0), "b": np.arange(3.0) + 100}, 0.02)
 
 
@@ -63,7 +63,7 @@ def test_clocks_that_never_meet():
         ([0.0, np.nan], r"frame 1 is at nan s"),
     ],
 )
-def test_times_that_are_none(times, says):
+def test_invalid_times_are_refused(times, says):
     with pytest.raises(DataError, match=says):
         associate(ROOT, {"a": np.arange(3.0), "b": np.array(times)}, 0.02)
 

@@ -1,4 +1,4 @@
-"""The built-in scene of a bar that twists and bends: pictures, depth, flow and tracks agree."""
+"""The built-in scene of a bar that twists and bends: images, depth, flow and tracks agree."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy.ndimage import binary_dilation
 
 from gsjax.data import Truth, open_sequence
 from gsjax.data.simulated import bar
-from tests.data.looks import between_pixels, looked_at, seconds_a_frame
+from tests.data.scene_helpers import interpolate, project_points, seconds_per_frame
 
 BAR, BASE, BLOCK = 1, 2, 3
 
@@ -17,12 +17,12 @@ def scene():
 
 
 def only_bar_around(sequence, t, c, pixels):
-    """Whether no pixel within two of each place shows anything but the bar."""
+    """Whether all pixels within two of each position show the bar."""
     other = binary_dilation(sequence.mask(t, c) != BAR, np.ones((5, 5)))
-    return between_pixels(other, pixels) == 0
+    return interpolate(other, pixels) == 0
 
 
-def test_it_is_what_its_description_says(scene):
+def test_it_is_as_documented(scene):
     assert (scene.num_frames, scene.num_cameras, scene.width, scene.height) == (30, 8, 320, 240)
     np.testing.assert_allclose(np.diff(scene.times), 1 / 15)
     assert scene.truth.names == ("base", "block")
@@ -42,11 +42,11 @@ def test_it_is_what_its_description_says(scene):
 
 @pytest.mark.parametrize("t", [0, 29])
 def test_depth_agrees_with_tracks(scene, t):
-    """Nothing of the bar is seen behind one of its points, and almost all of them are seen by some camera."""
+    """No depth of the bar lies behind one of its tracked points, and some camera sees almost all of them."""
     seen = np.zeros(scene.truth.tracks.shape[1], bool)
     for c in range(8):
-        pixels, depths = looked_at(scene, t, c, scene.truth.tracks[t])
-        behind = between_pixels(scene.depth(t, c), pixels) - depths
+        pixels, depths = project_points(scene, t, c, scene.truth.tracks[t])
+        behind = interpolate(scene.depth(t, c), pixels) - depths
         inner = only_bar_around(scene, t, c, pixels)
         assert inner.mean() > 0.35
         assert behind[inner].max() < 1e-3
@@ -58,11 +58,11 @@ def test_depth_agrees_with_tracks(scene, t):
 
 @pytest.mark.parametrize(("t", "c"), [(10, 1), (16, 4), (20, 6)])
 def test_flow_agrees_with_tracks(scene, t, c):
-    (now, depths), (then, _) = (looked_at(scene, u, c, scene.truth.tracks[u]) for u in (t, t + 1))
-    at = np.abs(between_pixels(scene.depth(t, c), now) - depths) < 5e-4
+    (now, depths), (then, _) = (project_points(scene, u, c, scene.truth.tracks[u]) for u in (t, t + 1))
+    at = np.abs(interpolate(scene.depth(t, c), now) - depths) < 5e-4
     at &= only_bar_around(scene, t, c, now)
     assert at.sum() > 50
-    flow = np.stack([between_pixels(scene.flow(t, c)[..., i], now) for i in range(2)], 1)
+    flow = np.stack([interpolate(scene.flow(t, c)[..., i], now) for i in range(2)], 1)
     assert np.linalg.norm((then - now)[at], axis=1).max() > 1
     error = np.linalg.norm(flow - (then - now), axis=1)[at]
     assert np.median(error) < 0.01
@@ -70,12 +70,12 @@ def test_flow_agrees_with_tracks(scene, t, c):
 
 
 def test_the_pattern_sticks_to_the_bar(scene):
-    """Brightness moves with the flow: far better explained by it than by a bar that stays."""
+    """Brightness moves with the flow, which explains it far better than no motion."""
     t, c = 12, 1
     first, second = scene.image(t, c).astype(float).mean(-1), scene.image(t + 1, c).astype(float).mean(-1)
     y, x = np.nonzero((scene.mask(t, c) == BAR) & (scene.mask(t + 1, c) == BAR))
     places = np.stack([x + 0.5, y + 0.5], 1)
-    warped = np.abs(between_pixels(second, places + scene.flow(t, c)[y, x]) - first[y, x])
+    warped = np.abs(interpolate(second, places + scene.flow(t, c)[y, x]) - first[y, x])
     unmoved = np.abs(second[y, x] - first[y, x])
     assert np.mean(warped) < 0.35 * np.mean(unmoved)
 
@@ -136,6 +136,6 @@ def test_tracks_that_do_not_fit_their_poses(shape):
 
 
 def test_a_frame_is_drawn_fast(scene):
-    scene.image(29, 0)  # the noise is made once
-    # It is 0.3 s without the checks of annotations.
-    assert seconds_a_frame(scene, ((29, 1), (29, 2), (29, 3))) < 1.5
+    scene.image(29, 0)  # generates the noise once
+    # It takes 0.3 s without annotation checks.
+    assert seconds_per_frame(scene, ((29, 1), (29, 2), (29, 3))) < 1.5

@@ -1,4 +1,4 @@
-"""A box that twists and bends: the laws of its map, and rays that meet it."""
+"""A box that twists and bends: properties of its map, and ray intersections."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ seeds = st.integers(0, 10_000)
 
 
 def bent(seed):
-    """Some bent box, and random numbers to go on with."""
+    """A random bent box, and the random generator."""
     rng = np.random.default_rng(seed)
     half = rng.uniform([0.02, 0.02, 0.15], [0.06, 0.06, 0.30])
     return BentBox(*half, rng.uniform(-2.5, 2.5), rng.uniform(0, 1.5), rng.uniform(-4, 4)), rng
@@ -36,7 +36,7 @@ def inside(box, rng, count=200):
 
 
 def beyond(box, points):
-    """How far points [...,3,n] lie outside of the body, in coordinates at rest; negative inside."""
+    """Distance of points [...,3,n] outside the body, in rest coordinates; negative inside."""
     rest = np.moveaxis(points, -2, 0)
     return (np.abs(box.undo(rest.reshape(3, -1))) - edges(box)).max(0).reshape(rest.shape[1:])
 
@@ -129,7 +129,7 @@ def test_the_volume_stays(seed):
 
 
 @given(seeds)
-def test_normals_are_perpendicular_to_what_lies_in_the_surface(seed):
+def test_normals_are_perpendicular_to_the_surface(seed):
     box, rng = bent(seed)
     solid = Primitive("bent box", (*edges(box)[:, 0], box.twist, box.bend, box.azimuth), CHECKED)
     rest = on_surface(box, rng, 60)
@@ -159,7 +159,7 @@ def test_a_ray_that_advances_does_not_enter(seed):
     np.testing.assert_array_equal(steps > 0, beyond(box, points) > 0)
     along = np.linspace(0, 1, 50)[:, None, None]
     assert beyond(box, points + along * (steps * directions))[:, steps > 0].min() > -1e-12
-    assert (steps > 0.005)[beyond(box, points) > 0.01].mean() > 0.7  # so they are not needlessly short
+    assert (steps > 0.005)[beyond(box, points) > 0.01].mean() > 0.7  # the steps are not needlessly short
     assert box.advance(1.5 * directions, directions).min() > 0.1
 
 
@@ -171,9 +171,9 @@ def test_its_extents_hold_it(seed):
 
 
 @pytest.mark.parametrize(
-    ("bend", "says"), [(-0.1, "turn the azimuth"), (3.2, "got 3.2"), (np.nan, "got nan")]
+    ("bend", "says"), [(-0.1, "rotate the azimuth"), (3.2, "got 3.2"), (np.nan, "got nan")]
 )
-def test_bends_that_cannot_be(bend, says):
+def test_impossible_bends_are_refused(bend, says):
     with pytest.raises(ValueError, match=f"bend must be from 0 to 3.14 .*{says}"):
         BentBox(*SIZE, 0.0, bend, 0.0)
     with pytest.raises(ValueError, match=r"bend must be from 0 to 1.33 for this box, got 1.5"):
@@ -205,7 +205,7 @@ def test_a_ray_from_inside_meets_nothing():
 
 
 def beside(solid, sizes=None, ball=0.06):
-    """Two frames in which `solid` stands on a floor and casts a shadow on it and on a ball of that radius."""
+    """Two frames in which `solid` on a floor casts a shadow on it and on a ball of radius `ball`."""
     things = Primitive("plane", (), CHECKED), solid, Primitive("sphere", (ball,), CHECKED, 2)
     poses = np.tile(rigid(None, np.array([[0.0, 0, 0], [0, 0, 0.25], [-0.2, 0.1, 0.06]])), (2, 1, 1, 1))
     scene = Scene(
@@ -229,10 +229,10 @@ def test_a_box_that_is_not_deformed_is_drawn_as_a_box():
     np.testing.assert_allclose(straight.depth(0, 0), box.depth(0, 0), atol=1e-6)
     differ = (straight.image(0, 0) != box.image(0, 0)).any(-1)
     assert (box.mask(0, 0) == 1).sum() > 900
-    assert differ.mean() < 1e-3  # a sample of an edge may fall to the other side
+    assert differ.mean() < 1e-3  # a sample at an edge may fall on the other side
 
 
-def test_sizes_of_frames_take_the_place_of_a_primitives_own():
+def test_sizes_per_frame_replace_the_size_of_the_primitive():
     straight, twisted = (*SIZE, 0.0, 0.0, 0.0), (*SIZE, 1.0, 0.8, 0.5)
     changing = beside(Primitive("bent box", straight, CHECKED, 1), {1: np.array([straight, twisted])})
     for t, size in enumerate((straight, twisted)):
@@ -241,7 +241,7 @@ def test_sizes_of_frames_take_the_place_of_a_primitives_own():
         np.testing.assert_array_equal(changing.depth(t, 0), own.depth(t, 0))
 
 
-def test_what_is_bent_casts_its_shadow():
+def test_a_bent_box_casts_its_shadow():
     """A point of the floor is darker exactly where the line to the lamp passes through the body."""
     box, nothing = BentBox(0.10, 0.05, 0.25, 1.2, 1.0, 2.0), Primitive("sphere", (1e-3,), CHECKED, 1)
     size = (*edges(box)[:, 0], box.twist, box.bend, box.azimuth)
@@ -252,8 +252,8 @@ def test_what_is_bent_casts_its_shadow():
     rays = camera[:3, :3] @ np.linalg.inv(empty.Ks[0, 0]) @ np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
     middle = np.array([[0.0], [0.0], [box.half_z]])  # of the body's frame
     points = camera[:3, 3:] + rays * empty.depth(0, 0)[y, x] - middle
-    way = np.array(LAMP)[:, None] - middle - points
-    nearest = np.min([beyond(box, points + share * way) for share in np.linspace(0, 1, 400)], axis=0)
+    to_lamp = np.array(LAMP)[:, None] - middle - points
+    nearest = np.min([beyond(box, points + share * to_lamp) for share in np.linspace(0, 1, 400)], axis=0)
     images = [s.image(0, 0)[y, x].astype(float).mean(-1) for s in (empty, sequence)]
     clear = np.abs(nearest) > 0.012  # away from the shadow's edge
     assert (clear & (nearest < 0)).sum() > 150

@@ -1,4 +1,4 @@
-"""A video, or frames in a folder, by a camera that stands still, with masks of tools."""
+"""A video, or frames in a folder, of a static camera, with tool masks."""
 
 import warnings
 
@@ -61,7 +61,7 @@ def test_masks_beside_a_video(video):
     np.testing.assert_array_equal(sequence.mask(2, 0), MASKS[2] > 0)
     assert sequence.label_names == {1: "tool"}
     (video.parent / "tools/000.png").unlink()
-    with pytest.raises(DataError, match=r"tools: expected 5 pictures, one a frame of clip.mp4, found 4"):
+    with pytest.raises(DataError, match=r"tools: expected 5 pictures, one per frame of clip.mp4, found 4"):
         read_clip(video, K=K, masks="tools")
     with pytest.raises(DataError, match=r"nowhere: expected 5 pictures, .* found 0"):
         read_clip(video, K=K, masks="nowhere")
@@ -84,14 +84,14 @@ def test_frames_in_the_folder_itself(folder):
         path.rename(folder / path.name)
     (folder / "gt_masks").rename(folder / "tools")
     with pytest.raises(DataError, match="found 5 photographs without poses"):
-        open_sequence(folder)  # photographs, as far as anyone can tell
+        open_sequence(folder)  # they cannot be told from photographs
     sequence = open_sequence(folder, ReadOptions(K=K, masks="tools"))
     np.testing.assert_array_equal(sequence.image(4, 0), grey(4))
     assert sequence.mask(4, 0).any()
 
 
-def test_the_camera_is_assumed_where_nothing_is_known_of_it(video):
-    with pytest.warns(DataWarning, match=r"clip.mp4: no intrinsics: 60 degrees .* assumed; give K"):
+def test_intrinsics_are_assumed_if_unknown(video):
+    with pytest.warns(DataWarning, match=r"clip.mp4: no intrinsics: assuming .* of 60 degrees; give K"):
         sequence = open_sequence(video)
     focal, _, cx = sequence.Ks[0, 0, 0]
     assert np.degrees(2 * np.arctan(WIDTH / 2 / focal)) == pytest.approx(60)
@@ -106,28 +106,28 @@ def test_masks_that_look_inverted(folder):
         open_sequence(folder, ReadOptions(K=K))
 
 
-def test_many_frames_are_looked_at_here_and_there():
-    seen = []
-    check_tool(lambda t: seen.append(t) or np.array([[0, 1, 0]]), 1000, "white", "masks")
-    assert (len(seen), seen[0], seen[-1]) == (64, 0, 999)
+def test_of_many_frames_a_sample_is_checked():
+    checked = []
+    check_tool(lambda t: checked.append(t) or np.array([[0, 1, 0]]), 1000, "white", "masks")
+    assert (len(checked), checked[0], checked[-1]) == (64, 0, 999)
 
 
 def test_a_tool_is_white_or_black():
     with pytest.raises(ValueError, match="tool: expected 'white' or 'black', found 'grey'"):
-        tool_labels(np.zeros((2, 2), int), "grey")  # a type checker stops it before, as do tests
+        tool_labels(np.zeros((2, 2), int), "grey")  # type checkers reject it, as do annotations under test
 
 
 def test_depth_without_poses_is_not_dropped_in_silence(folder):
     (folder / "depth").mkdir()
-    with pytest.raises(DataError, match=r"expected poses_bounds.npy, where there is depth/, found no such"):
+    with pytest.raises(DataError, match=r"expected poses_bounds.npy beside depth/, found no such"):
         open_sequence(folder)
 
 
-def test_frames_that_are_none(folder, tmp_path):
+def test_invalid_frames_are_refused(folder, tmp_path):
     dots.save(folder / "images/f08.png", np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(DataError, match=r"f08.png: expected 64x48 pixels as in f07.png, found 10x10"):
         open_sequence(folder, ReadOptions(K=K))
-    with pytest.raises(DataError, match=r"expected frames, in images/ or right here, found none"):
+    with pytest.raises(DataError, match=r"expected frames, in images/ or directly in it, found none"):
         read_clip(tmp_path)
 
 

@@ -33,7 +33,7 @@ MODELS = {
 
 
 def build(root, form="bin", model="PINHOLE", params=None, place="sparse/0", points=POINTS, scale=1):
-    """Three photographs of some dots by one camera, as COLMAP writes them and projects them."""
+    """Three photographs of some dots by one camera, written and projected by COLMAP."""
     camera = pycolmap.Camera(
         model=model, width=WIDTH, height=HEIGHT, params=params or MODELS[model], camera_id=3
     )
@@ -51,7 +51,7 @@ def build(root, form="bin", model="PINHOLE", params=None, place="sparse/0", poin
         track = pycolmap.Track()
         track.add_element(7, i)
         made.add_point3D(point, track, COLORS[i])
-    if scale > 1:  # as if the photographs had been made smaller afterwards
+    if scale > 1:  # as if the photographs had been downscaled after the reconstruction
         camera = made.cameras[3]
         camera.width, camera.height, camera.params = scale * WIDTH, scale * HEIGHT, scale * camera.params
     folder = root / place
@@ -95,11 +95,13 @@ def test_photographs_may_be_smaller_and_elsewhere(tmp_path, form):
     np.testing.assert_allclose(scene.Ks[0], [[90, 0, 49], [0, 94, 35], [0, 0, 1]])
     assert dots.offset(scene.image(0), dots.project(scene.Ks[0], scene.viewmats[0], POINTS[0])) < 0.06
     with pytest.raises(
-        DataError, match=r"0: expected registered photographs, found 3 registered, 3 that are not"
+        DataError, match=r"0: expected registered photographs that .*, found 3 registered, 3 not in"
     ):
         read_colmap(tmp_path)
     dots.save(tmp_path / "images_4/a.png", np.zeros((96, 72, 3), np.uint8))
-    with pytest.raises(DataError, match=r"a.png: expected 384x288 pixels .*found 72x96.*on its side"):
+    with pytest.raises(
+        DataError, match=r"a.png: expected 384x288 pixels .*found 72x96.*rotated by 90 degrees"
+    ):
         read_colmap(tmp_path, "images_4")
 
 
@@ -138,7 +140,7 @@ def test_photographs_without_file_or_pose_are_counted(tmp_path):
     images.write_text("\n".join(lines))
     (tmp_path / "images/a.png").unlink()
     with pytest.warns(
-        DataWarning, match=r"of 3 .* 1 that are not in .* and 1 without a finite pose in images.txt \(c.png\)"
+        DataWarning, match=r"of 3 .* 1 not in .* and 1 without a finite pose in images.txt \(c.png\)"
     ):
         assert read_colmap(tmp_path).names == ("day/b 2.png",)
     start = next(i for i, line in enumerate(lines) if line.endswith(" c.png"))
@@ -165,19 +167,19 @@ def test_binary_files_that_are_cut_off_anywhere(tmp_path, name):
     for length in range(len(content)):
         file.write_bytes(content[:length])
         with pytest.raises(
-            DataError, match=rf"{name}.bin: expected a (whole )?file of COLMAP, found .*cut off"
+            DataError, match=rf"{name}.bin: expected a (complete )?COLMAP file, found .*cut off"
         ):
             read_colmap(tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore::gsjax.data.DataWarning")
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_damaged_files_are_told_or_read(tmp_path, form, name):
-    """Whatever byte changes: the reader reads something of the right shape, or names the file."""
+def test_damaged_files_are_reported_or_read(tmp_path, form, name):
+    """Whichever byte changes, the reader returns something of the right shape, or names the file."""
     build(tmp_path, form, "OPENCV")
     file = tmp_path / f"sparse/0/{name}.{form}"
     content, dice = file.read_bytes(), random.Random(0)
-    told = []
+    messages = []
     for _ in range(150):
         damaged = bytearray(content)
         damaged[dice.randrange(len(content))] = dice.randrange(256)
@@ -186,9 +188,9 @@ def test_damaged_files_are_told_or_read(tmp_path, form, name):
         try:
             assert 1 <= read_colmap(tmp_path).num <= 3
         except ValueError as error:
-            told.append(str(error))
-    assert 5 <= len(told) < 150
-    assert all(str(tmp_path) in text or text.startswith(("viewmat of ", "K of ")) for text in told)
+            messages.append(str(error))
+    assert 5 <= len(messages) < 150
+    assert all(str(tmp_path) in text or text.startswith(("viewmat of ", "K of ")) for text in messages)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +198,7 @@ def test_damaged_files_are_told_or_read(tmp_path, form, name):
     [
         ("FOV", (90, 94, *CENTER, 0.5), "FOV"),
         ("THIN_PRISM_FISHEYE", (90, 94, *CENTER, *[0.01] * 8), "THIN_PRISM_FISHEYE"),
-        ("EUCM", (90, 94, *CENTER, 0.5, 1.0), "number 16"),
+        ("EUCM", (90, 94, *CENTER, 0.5, 1.0), "id 16"),
     ],
 )
 def test_models_that_opencv_does_not_have(tmp_path, form, model, params, number):
@@ -238,11 +240,11 @@ def swap(old, new, count=1):
             swap("3 PINHOLE", "4 PINHOLE"),
             r"images.txt: expected one of the cameras \[4\], found 3 for a.png",
         ),
-        ("cameras", lambda text: "", r"cameras.txt: expected at least one of its cameras, found none"),
+        ("cameras", lambda text: "", r"cameras.txt: expected at least one entry, found none"),
         (
             "images",
             lambda text: "# none\n",
-            r"images.txt: expected at least one of its images, found none. Did it fail",
+            r"images.txt: expected at least one entry, found none. Did the reconstruction fail",
         ),
         ("images", swap(" a.png", ""), r"images.txt, line 7: expected IMAGE_ID QW .*NAME, found '8 "),
         ("images", swap(" 3 a.png", " x a.png"), r"images.txt, line 7: expected IMAGE_ID"),
@@ -274,12 +276,12 @@ def test_what_is_wrong_with_text(tmp_path, name, change, says):
             "cameras",
             12,
             b"\x63",
-            r"cameras.bin: expected one of the camera models \[0, 1, .*found number 99\. It may",
+            r"cameras.bin: expected one of the camera model ids \[0, 1, .*found id 99\. It may",
         ),
         ("cameras", 0, b"\xff" * 8, r"cameras.bin: .*found 18446744073709551615 items announced in 64 bytes"),
         ("cameras", 16, b"\0" * 8, r"a.png: expected a width and a height above 0, found 0x72"),
         ("images", 0, b"\xff" * 7, r"images.bin: .*items announced in \d+ bytes"),
-        ("images", 0, b"\0", r"images.bin: expected at least one of its images, found none"),
+        ("images", 0, b"\0", r"images.bin: expected at least one entry, found none"),
         ("points3D", 6, b"\x01", r"points3D.bin: .*items announced"),
     ],
 )

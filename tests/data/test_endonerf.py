@@ -1,4 +1,4 @@
-"""EndoNeRF's layout: a stereo endoscope that moves before three dots, drawn from the words of the format."""
+"""EndoNeRF's layout: a moving stereo endoscope and three dots, drawn by the definition of the format."""
 
 import json
 import warnings
@@ -23,14 +23,14 @@ from tests.data.test_poses_bounds import HEIGHT, WIDTH, K, row
 FRAMES, BASELINE_M, UNIT_M = 4, 0.01, 0.0001
 POINTS = np.array([[0.01, 0.005, 0.0], [-0.012, 0.006, 0.008], [0.004, -0.01, -0.01]])
 LEFT = [look_at(np.array([0.004 * t, -0.08, 0.01 + 0.004 * t]), np.zeros(3)) for t in range(FRAMES)]
-# The other eye is to the right: seen from it, all lies further left.
+# The other eye is to the right: in its view everything lies further left.
 RIGHT = [np.array([[1, 0, 0, -BASELINE_M], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ v for v in LEFT]
 DEPTH = np.linspace(500, 1000, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
 META = {"fps": 25, "baseline_m": BASELINE_M, "depth_unit_m": UNIT_M}
 
 
 def tool_mask(t):
-    """Where the tool is: a column that moves."""
+    """The tool, a moving column."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[:, 10 * t : 10 * t + 8] = True
     return mask
@@ -55,13 +55,13 @@ def folder(tmp_path):
     return root
 
 
-def tell(root, **changes):
+def write_meta(root, **changes):
     meta = {key: value for key, value in (META | changes).items() if value is not None}
     (root / "meta.json").write_text(json.dumps(meta))
 
 
 def each(root, name, edit):
-    """Changes every picture of a folder."""
+    """Edits every picture of a folder."""
     for path in (root / name).iterdir():
         dots.save(path, edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
 
@@ -84,7 +84,7 @@ def test_both_eyes_see_what_was_drawn(folder):
     assert sequence.where("mask", 2, 1) == str(folder / "right/masks/frame-000005.mask.png")
 
 
-def test_what_masks_say_has_a_name(folder):
+def test_the_tool_label_has_a_name(folder):
     assert photographs_of(read_endonerf(folder)).label_names == {1: "tool"}
 
 
@@ -98,7 +98,7 @@ def test_names_that_releases_use(folder, name):
     (folder / "masks").rmdir()
     (folder / "poses_bounds.npy").rename(folder / name)
     sequence = read_endonerf(folder)
-    np.testing.assert_array_equal(sequence.mask(1, 0), tool_mask(1))  # black of a JPEG is not quite 0
+    np.testing.assert_array_equal(sequence.mask(1, 0), tool_mask(1))  # black in a JPEG is not exactly 0
 
 
 def test_masks_of_either_polarity(folder):
@@ -126,10 +126,10 @@ def test_a_tool_that_is_near_in_a_few_frames_is_no_inverted_mask(folder):
 
 
 @pytest.mark.parametrize(("tool", "value"), [("white", 255), ("black", 0)])
-def test_nothing_but_tool(folder, tool, value):
+def test_masks_with_only_tool_are_refused(folder, tool, value):
     each(folder, "masks", lambda mask: np.full_like(mask, value))
     other = {"white": "black", "black": "white"}[tool]
-    says = rf"masks: expected masks with the tool {tool} .*nothing but tool in all 4 .*--read.tool {other}"
+    says = rf"masks: expected masks with the tool {tool} .*only tool in all 4 .*--read.tool {other}"
     with pytest.raises(DataError, match=says):
         read_endonerf(folder, tool=tool)
 
@@ -140,21 +140,23 @@ def test_depth_percentiles(folder):
     assert abs(kept.mean() - 0.5) < 0.01
     assert (DEPTH[kept].min(), DEPTH[kept].max()) == pytest.approx((550, 800), abs=1)
     each(folder, "depth", lambda image: np.where(image < 900, 0, image))
-    few = read_endonerf(folder, depth_percentiles=(50, 100)).depth(0, 0)  # 0 is no depth, so no percentile
+    few = read_endonerf(folder, depth_percentiles=(50, 100)).depth(0, 0)  # 0 is invalid, so it is not counted
     assert few[few > 0].min() == pytest.approx(950 * UNIT_M, rel=1e-3)
 
 
-def test_where_the_unit_of_depth_stands(folder):
-    """An option before truth.npz before meta.json before millimetres."""
+def test_the_sources_of_the_depth_unit(folder):
+    """An option takes precedence over truth.npz, over meta.json, over millimetres."""
     for written, given, unit in ((None, None, 0.001), (2e-4, None, 2e-4), (2e-4, 3e-4, 3e-4)):
-        tell(folder, depth_unit_m=written)
+        write_meta(folder, depth_unit_m=written)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             assert read_endonerf(folder, depth_unit_m=given).depth(0, 0)[0, 0] == pytest.approx(500 * unit)
     np.savez(folder / "truth.npz", depth_unit_m=1e-4)
     assert read_endonerf(folder).depth(0, 0)[0, 0] == pytest.approx(0.05)
     np.savez(folder / "truth.npz", depth_unit_m=[1e-4, 1.0])
-    with pytest.raises(DataError, match=r"truth.npz: expected one number above 0 as depth_unit_m, found \["):
+    with pytest.raises(
+        DataError, match=r"truth.npz: expected depth_unit_m to be one number above 0, found \["
+    ):
         read_endonerf(folder)
 
 
@@ -169,18 +171,18 @@ def test_poses_in_another_unit_than_depth(folder):
         sequence = read_endonerf(folder, pose_unit_m=0.001)
     np.testing.assert_allclose(sequence.viewmats[:, 0], LEFT, atol=1e-12)
     rows[:] = rows[0]
-    np.save(folder / "poses_bounds.npy", rows)  # it stands still, as EndoNeRF's own do
+    np.save(folder / "poses_bounds.npy", rows)  # a static camera, as in EndoNeRF's own recordings
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read_endonerf(folder)
 
 
-def test_the_baseline_of_an_option_goes_first(folder):
+def test_the_baseline_option_takes_precedence(folder):
     sequence = read_endonerf(folder, baseline_m=0.02)
     eyes = -np.swapaxes(sequence.viewmats[..., :3, :3], -1, -2) @ sequence.viewmats[..., :3, 3:]
     x_axes = sequence.viewmats[:, 0, 0, :3]
     np.testing.assert_allclose((eyes[:, 1] - eyes[:, 0])[..., 0], 0.02 * x_axes, atol=1e-15)
-    tell(folder, baseline_m=None)
+    write_meta(folder, baseline_m=None)
     with pytest.warns(DataWarning, match=r"right: the right eye is left out: .*--read.baseline-m"):
         assert read_endonerf(folder).camera_ids == (0,)
 
@@ -211,7 +213,7 @@ def test_truth(folder):
     np.testing.assert_array_equal(truth.tracks, vertices[1:3])
     for arrays in ({"verts": vertices[:2]}, {"verts": vertices, "T_w_tool": tool[:2]}):
         np.savez(folder / "truth.npz", **arrays)
-        with pytest.raises(DataError, match=r"truth.npz: expected .* of shape \(4, .*Make the truth again"):
+        with pytest.raises(DataError, match=r"truth.npz: expected .* of shape \(4, .*Regenerate the truth"):
             read_endonerf(folder)
 
 
@@ -221,41 +223,41 @@ def test_truth(folder):
         ({"depth_unit_m": 0}, "depth_unit_m: expected metres above 0, found 0"),
         ({"pose_unit_m": -1}, "pose_unit_m: expected metres above 0, found -1"),
         ({"baseline_m": np.inf}, "baseline_m: expected metres above 0, found inf"),
-        ({"depth_percentiles": (9, 3)}, "depth_percentiles: expected two from 0 to 100.* found 9 and 3"),
+        ({"depth_percentiles": (9, 3)}, "depth_percentiles: expected two in 0 to 100.* found 9 and 3"),
         ({"depth_percentiles": (0, 101)}, "found 0 and 101"),
     ],
 )
-def test_options_that_are_none(folder, options, says):
+def test_invalid_options_are_refused(folder, options, says):
     with pytest.raises(ValueError, match=says):
         read_endonerf(folder, **options)
 
 
 def test_it_is_a_recording_and_photographs_too(folder):
-    """`gsjax fit` takes the left eye's frames as photographs; what runs over time is opened as a sequence."""
+    """`gsjax fit` reads the left eye's frames as photographs; other commands open it as a sequence."""
     assert open_sequence(folder).num_cameras == 2
     assert open_photographs(folder).num == FRAMES
     wrong = open_sequence(folder, ReadOptions(axes="llff"))
     assert np.abs(wrong.viewmats[0, 0] - LEFT[0]).max() > 0.5
     options = ReadOptions(tool="black", depth_percentiles=(10, 60), pose_unit_m=1.0, baseline_m=0.02)
     with pytest.warns(DataWarning, match="inverted"):
-        told = open_sequence(folder, options)
-    assert np.mean(told.depth(0, 0) > 0) < 0.6
-    assert told.viewmats[0, 1, 0, 3] - told.viewmats[0, 0, 0, 3] == pytest.approx(-0.02)
+        sequence = open_sequence(folder, options)
+    assert np.mean(sequence.depth(0, 0) > 0) < 0.6
+    assert sequence.viewmats[0, 1, 0, 3] - sequence.viewmats[0, 0, 0, 3] == pytest.approx(-0.02)
 
 
-def test_axes_are_asked_for_where_other_layouts_could_have_written_it(folder):
+def test_axes_are_required_for_an_ambiguous_layout(folder):
     for path in (folder / "depth").iterdir():
         path.unlink()
     (folder / "depth").rmdir()
-    with pytest.raises(ValueError, match=r"does not say how its columns are meant; give axes"):
+    with pytest.raises(ValueError, match=r"does not state the meaning of its columns; give axes"):
         open_sequence(folder)
     sequence = open_sequence(folder, ReadOptions(axes="endonerf"))
     assert (sequence.depth(0, 0), sequence.has_masks) == (None, True)
 
 
 def test_the_tissue(shared_data):
-    """Vertices that both eyes see lie at the depth that their files have; the right eye's own file of poses
-    says where the baseline puts it."""
+    """Vertices visible to either eye lie at the depth in its files; the right eye's own pose file agrees with
+    the baseline."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sequence = open_sequence(shared_data / "tissue_0")

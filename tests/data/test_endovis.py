@@ -1,4 +1,4 @@
-"""EndoVis 2017 and 2018: a stereo pair before three dots, drawn from the words of the calibration."""
+"""EndoVis 2017 and 2018: a stereo pair and three dots, drawn by the definition of the calibration."""
 
 import json
 import warnings
@@ -13,7 +13,7 @@ from tests.data import dots
 
 WIDTH, HEIGHT, FRAMES = 96, 72, 3
 POINTS = np.array([[0.01, 0.005, 0.12], [-0.012, 0.006, 0.10], [0.004, -0.01, 0.14]])
-F, C = (100.0, 102.0), ((46.5, 35.5), (49.5, 36.5))  # centres as the calibration counts them, at integers
+F, C = (100.0, 102.0), ((46.5, 35.5), (49.5, 36.5))  # pixel centres at integers, as in the calibration
 OMEGA, T_MM = (0.01, -0.02, 0.005), (-4.5, 0.1, 0.05)
 CALIBRATION = f"""Width: {WIDTH}\t// pixels
 Height: {HEIGHT}
@@ -53,7 +53,7 @@ def folder(tmp_path):
 
 
 def add_instruments(root):
-    """A needle driver to the left with all its parts, and forceps to the right in the last frame."""
+    """A needle driver on the left with all its parts, and forceps on the right in the last frame."""
     left = np.zeros((HEIGHT, WIDTH), np.uint8)
     left[:10, :20], left[10:20, :20], left[20:30, :20] = 10, 20, 30
     right = np.zeros_like(left)
@@ -99,7 +99,7 @@ def test_black_borders_stay_and_move_the_principal_point(folder):
     assert farthest(sequence) < 0.06
 
 
-def test_frames_that_were_made_smaller(folder):
+def test_downscaled_frames(folder):
     text = CALIBRATION.replace(f"Width: {WIDTH}", f"Width: {2 * WIDTH}").replace(
         f"Height: {HEIGHT}", f"Height: {2 * HEIGHT}"
     )
@@ -136,19 +136,21 @@ def test_colours_have_the_numbers_and_names_of_labels_json(folder):
     np.testing.assert_array_equal(sequence.mask(2, 0)[[0, 30, 60], 7], [1, 0, 2])
     assert sequence.label_names == {1: "instrument-shaft", 2: "covered-kidney"}
     with_alpha = [{"name": c["name"], "color": [*c["color"], 255]} for c in CLASSES]
-    (folder / "labels.json").write_text(json.dumps({"classes": with_alpha}))  # as the test data have it
+    (folder / "labels.json").write_text(
+        json.dumps({"classes": with_alpha})
+    )  # as in the challenge's test data
     (folder.parent / "labels.json").unlink()
     np.testing.assert_array_equal(read_endovis(folder).mask(2, 0)[[0, 30, 60], 7], [1, 0, 2])
 
 
-def test_colours_that_nothing_names_are_counted(folder):
+def test_colours_without_a_name_are_counted(folder):
     add_colors(folder)
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[0, :9], image[1] = (1, 2, 3), COLORS["covered-kidney"]
     dots.save(folder / "labels/frame001.png", image)
     sequence = read_endovis(folder)
     with pytest.warns(
-        DataWarning, match=r"frame001.png: 9 pixels of colours that labels.json has not are left"
+        DataWarning, match=r"frame001.png: 9 pixels in colours not listed in labels.json are left"
     ):
         mask = sequence.mask(1, 0)
     assert (mask[0, 0], mask[1, 0]) == (0, 2)
@@ -157,7 +159,9 @@ def test_colours_that_nothing_names_are_counted(folder):
 def test_frames_without_labels_are_counted(folder):
     add_colors(folder)
     (folder / "labels/frame001.png").unlink()
-    with pytest.warns(DataWarning, match=r"labels: labels of 1 of 3 frames are left out: .* frame001.png"):
+    with pytest.warns(
+        DataWarning, match=r"labels: 1 of 3 frames are left out of the labels: .* frame001.png"
+    ):
         sequence = read_endovis(folder)
     assert sequence.mask(1, 0) is None
     assert sequence.mask(2, 0) is not None
@@ -181,21 +185,23 @@ def test_without_a_calibration(folder):
 def test_a_lens_that_distorts(folder):
     text = CALIBRATION.replace("Camera-0-K: -0.0001", "Camera-0-K: -0.25")
     (folder / "camera_calibration.txt").write_text(text)
-    with pytest.warns(DataWarning, match=r"camera_calibration.txt: the lens moves corners by 4.* not undone"):
+    with pytest.warns(
+        DataWarning, match=r"camera_calibration.txt: lens distortion of 4.* pixels .* not corrected"
+    ):
         read_endovis(folder)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("Camera-0-F: 100.0 102.0", "Camera-0-F: 100.0", r"2 numbers behind Camera-0-F:, found '100.0'"),
-        ("Camera-1-C: 49.5", "Camera-1-C: left", r"2 numbers behind Camera-1-C:, found 'left 36.5'"),
-        ("Extrinsic-T: -4.5", "Extrinsic-T: nan", r"3 numbers behind Extrinsic-T:, found 'nan 0.1 0.05'"),
-        ("Height: 72", "", r"1 numbers behind Height:, found no such line"),
-        ("Extrinsic-Omega: 0.01", "Extrinsic-Omega: 0.01 0", r"3 numbers behind Extrinsic-Omega:"),
+        ("Camera-0-F: 100.0 102.0", "Camera-0-F: 100.0", r"2 numbers after Camera-0-F:, found '100.0'"),
+        ("Camera-1-C: 49.5", "Camera-1-C: left", r"2 numbers after Camera-1-C:, found 'left 36.5'"),
+        ("Extrinsic-T: -4.5", "Extrinsic-T: nan", r"3 numbers after Extrinsic-T:, found 'nan 0.1 0.05'"),
+        ("Height: 72", "", r"1 number after Height:, found no such line"),
+        ("Extrinsic-Omega: 0.01", "Extrinsic-Omega: 0.01 0", r"3 numbers after Extrinsic-Omega:"),
     ],
 )
-def test_what_is_wrong_with_a_calibration(folder, old, new, says):
+def test_faults_of_a_calibration(folder, old, new, says):
     assert old in CALIBRATION
     (folder / "camera_calibration.txt").write_text(CALIBRATION.replace(old, new))
     with pytest.raises(DataError, match=rf"camera_calibration.txt: expected {says}"):
@@ -211,7 +217,7 @@ def test_a_calibration_of_one_eye(folder):
 
 def test_labels_must_be_instruments_or_parts(folder):
     with pytest.raises(ValueError, match="labels: expected 'instruments' or 'parts', found 'tools'"):
-        _find_labels(folder, [], (1, 1), "tools")  # a type checker stops it before, as do tests
+        _find_labels(folder, [], (1, 1), "tools")  # type checkers reject it, as do annotations under test
 
 
 def test_it_is_recognised_and_a_folder_of_several_is_refused(folder):

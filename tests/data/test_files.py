@@ -1,4 +1,4 @@
-"""Single pictures of every kind that programs save."""
+"""Single pictures in all formats that programs save."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ def write(path, bgr):
 
 
 def test_sixteen_bits_become_eight(tmp_path):
-    """65535 / 255 is 257: full stays full, and half a step is rounded."""
+    """65535 / 255 is 257: full scale stays full scale, and half steps are rounded."""
     raw = (RAMP * 200).astype(np.uint16)
     raw[0, 0] = 65535, 257 * 100 + 128, 257 * 100 + 129
     read = read_rgba(write(tmp_path / "a.png", raw[..., ::-1]), WIDTH, HEIGHT)
@@ -75,13 +75,13 @@ def test_a_truncated_picture_is_refused(tmp_path, ending, keep):
             read(path, 200, 100)
 
 
-def test_pictures_of_numbers_that_are_no_colours(tmp_path):
+def test_pictures_of_floats_are_refused(tmp_path):
     path = write(tmp_path / "a.tif", np.zeros((HEIGHT, WIDTH, 3), np.float32))
     with pytest.raises(DataError, match=r"an image of 8 or 16 bits, found float32. Save it as PNG"):
         read_rgba(path, WIDTH, HEIGHT)
 
 
-def test_the_size_comes_from_the_head_of_a_file(tmp_path):
+def test_the_size_comes_from_the_file_header(tmp_path):
     path = write(tmp_path / "a.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     assert picture_size(path) == (WIDTH, HEIGHT)
     with pytest.raises(DataError, match=r"b.png: expected an image, found no such file"):

@@ -1,4 +1,4 @@
-"""Flaws of masks are of the kind and number that was asked for, and the same for the same seed."""
+"""Flaws of masks have the requested kind and frequency, and are the same for the same seed."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_no_flaws_is_the_truth():
         np.testing.assert_array_equal(label, true)
     for rows in found.embeddings:
         np.testing.assert_allclose(rows, CODES)
-    assert not found.said
+    assert not found.notes
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -34,7 +34,7 @@ def test_the_same_seed_has_the_same_flaws(seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_third_of_the_views_overlooks_each_thing_and_all_of_them_a_speck(seed):
+def test_each_thing_is_missing_in_a_third_of_the_views_and_a_speck_in_all(seed):
     found = flawed_masks(masks(), CODES, seed, Flaws(outline=0, merged=0.0, split=0.0))
     for k in (1, 2, 3):
         assert sum((label == k).any() for label in found.labels) == 8
@@ -44,32 +44,32 @@ def test_a_third_of_the_views_overlooks_each_thing_and_all_of_them_a_speck(seed)
         np.testing.assert_array_equal(label[true == 0], 0)
 
 
-def test_of_few_views_flaws_come_by_chance_as_often_as_asked():
+def test_flaws_have_the_requested_frequency_even_for_few_views():
     counts = np.zeros(2)
     for seed in range(100):
-        said = " ".join(flawed_masks(masks(2), CODES, seed, Flaws(outline=0, missing=0.0)).said)
-        counts += said.count("are one"), said.count("is two")
+        notes = " ".join(flawed_masks(masks(2), CODES, seed, Flaws(outline=0, missing=0.0)).notes)
+        counts += notes.count("merged"), notes.count("split")
     assert (np.abs(counts / 200 - 0.2) < 0.08).all()  # standard deviation 0.03
 
 
-def test_nothing_is_overlooked_everywhere():
+def test_nothing_is_missing_everywhere():
     found = flawed_masks(masks(2), CODES, 0, Flaws(outline=0, merged=0.0, split=0.0, missing=1.0))
     for k in (1, 2, 3):
         assert any((label == k).any() for label in found.labels)
 
 
-def test_merged_things_are_one_with_both_meanings():
+def test_merged_things_share_a_mask_and_a_mixed_embedding():
     found = flawed_masks(masks(10), CODES, 3, Flaws(outline=0, merged=0.2, split=0.0, missing=0.0))
     merged = [v for v, label in enumerate(found.labels) if len(np.unique(label[label > 0])) < 3]
-    assert len(merged) == 2  # of ten; the speck is overlooked in all
+    assert len(merged) == 2  # of ten; the speck is missing in all
     for v in merged:
-        rows, there = found.embeddings[v], np.unique(found.labels[v])
-        mixed = [k for k in there if k > 0 and 0.1 < (rows[k] @ CODES.T).max() < 0.99]
+        rows, present = found.embeddings[v], np.unique(found.labels[v])
+        mixed = [k for k in present if k > 0 and 0.1 < (rows[k] @ CODES.T).max() < 0.99]
         assert len(mixed) == 1
         np.testing.assert_allclose(np.linalg.norm(rows[mixed[0]]), 1, rtol=1e-5)
 
 
-def test_a_split_thing_has_a_piece_that_looks_half_like_another():
+def test_a_split_thing_has_a_piece_that_resembles_another():
     found = flawed_masks(
         masks(10), CODES, 1, Flaws(outline=0, merged=0.0, split=0.2, missing=0.0, smallest=0)
     )
@@ -81,7 +81,7 @@ def test_a_split_thing_has_a_piece_that_looks_half_like_another():
         assert (found.labels[v] == 5).any()
 
 
-def test_outlines_are_off_by_no_more_than_told():
+def test_outlines_are_off_by_no_more_than_the_limit():
     import cv2
 
     found = flawed_masks(masks(), CODES, 0, Flaws(outline=3, merged=0.0, split=0.0, missing=0.0))

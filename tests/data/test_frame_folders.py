@@ -1,4 +1,4 @@
-"""Frames in a folder: their order, their numbers, their sizes, and what lies beside them."""
+"""Frames in a folder: their order, numbers and sizes, and the pictures that belong to them."""
 
 import warnings
 
@@ -7,11 +7,11 @@ import pytest
 
 from gsjax.data import DataError, DataWarning
 from gsjax.data.frame_folders import (
-    expect_one_size,
+    check_one_size,
     frame_numbers,
     pictures,
     pictures_beside,
-    warn_of_single_frame,
+    warn_about_single_frame,
 )
 from tests.data import dots
 
@@ -38,11 +38,11 @@ def test_pictures_come_in_order_of_name_and_nothing_else_does(tmp_path):
         (("f1_left.png", "f1_right.png"), (0, 1)),
     ],
 )
-def test_the_last_number_in_a_name_is_the_frames(tmp_path, names, numbers):
+def test_the_frame_number_is_the_last_number_in_the_name(tmp_path, names, numbers):
     assert frame_numbers([tmp_path / name for name in names]) == numbers
 
 
-def test_numbers_that_were_not_padded_would_shuffle_frames(tmp_path):
+def test_numbers_without_padding_are_refused(tmp_path):
     frames = sorted(tmp_path / f"{i}.png" for i in (1, 2, 10))
     with pytest.raises(DataError, match=r"found 2.png after 10.png. Pad the numbers with zeros"):
         frame_numbers(frames)
@@ -50,15 +50,15 @@ def test_numbers_that_were_not_padded_would_shuffle_frames(tmp_path):
 
 def test_one_size(tmp_path):
     save(tmp_path, "0.png", "1.png")
-    assert expect_one_size(pictures(tmp_path)) == (8, 6)
+    assert check_one_size(pictures(tmp_path)) == (8, 6)
     save(tmp_path, "2.png", size=(6, 8))
     with pytest.raises(DataError, match=r"2.png: expected 8x6 pixels as in 0.png, found 6x8"):
-        expect_one_size(pictures(tmp_path))
+        check_one_size(pictures(tmp_path))
 
 
-def test_as_many_beside_as_there_are_frames(tmp_path):
+def test_there_must_be_one_picture_per_frame(tmp_path):
     save(tmp_path, "masks/0.png")
-    with pytest.raises(DataError, match=r"masks: expected 2 pictures, one a frame of clip.mp4, found 1"):
+    with pytest.raises(DataError, match=r"masks: expected 2 pictures, one per frame of clip.mp4, found 1"):
         pictures_beside(tmp_path / "masks", 2, "clip.mp4")
     save(tmp_path, "masks/1.jpg")
     assert len(pictures_beside(tmp_path / "masks", 2, "images")) == 2
@@ -66,7 +66,7 @@ def test_as_many_beside_as_there_are_frames(tmp_path):
 
 def test_a_single_frame_shows_no_motion(tmp_path):
     with pytest.warns(DataWarning, match=r"0.png: it is the only frame"):
-        warn_of_single_frame([tmp_path / "0.png"])
+        warn_about_single_frame([tmp_path / "0.png"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_single_frame([tmp_path / "0.png", tmp_path / "1.png"])
+        warn_about_single_frame([tmp_path / "0.png", tmp_path / "1.png"])

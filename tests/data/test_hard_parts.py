@@ -1,4 +1,4 @@
-"""Parts that are hard to find: their truth, what is seen of them, and what is refused."""
+"""Parts that are hard to find: their truth, their visibility, and invalid arguments."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_part_and_box_are_seen_to_move_and_the_rest_is_not(case):
     np.testing.assert_array_equal(*(sequence.depth(t, 1)[stays] for t in (0, 15)))
 
 
-def test_the_amount_is_how_hard_it_is():
+def test_the_amount_controls_the_difficulty():
     few, many = (hard_parts("wheel", spokes, width=160, height=120, cameras=3) for spokes in (3, 12))
     assert (many.mask(0, 1) == 1).sum() > 1.15 * (few.mask(0, 1) == 1).sum()
     thick, thin = (hard_parts("thin", wide, **SMALL) for wide in (0.04, 0.01))
@@ -66,7 +66,7 @@ def test_it_is_opened_by_name():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"case": "square"}, "case: expected one of wheel, small, thin, flush, found 'square'"),
         ({"case": "wheel", "amount": 1.0}, "amount: expected 2 or more spokes, found 1.0"),
@@ -74,6 +74,6 @@ def test_it_is_opened_by_name():
         ({"cameras": 0}, "cameras must be at least 1, got 0"),
     ],
 )
-def test_what_makes_no_sense_is_refused(arguments, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
         hard_parts(**arguments)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError
-from gsjax.data.lens import Lens, matrix_of, shrunk, straighten
+from gsjax.data.lens import Lens, intrinsics_matrix, scaled_intrinsics, undistort
 from tests.data.dots import draw, inside, offset
 
 WIDTH, HEIGHT = 240, 180
@@ -23,7 +23,7 @@ each_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 
 
 def photographed(lens, rays):
-    """Pixels of points (x, y, 1) in the distorted photograph by OpenCV, which counts centres at integers."""
+    """Pixels of points (x, y, 1) in the distorted photograph, by OpenCV, with its centres at integers."""
     own, coeffs = lens.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), np.array(lens.coeffs)
     rays, still = np.array(rays, float).reshape(-1, 1, 3), np.zeros(3)
     if lens.fisheye:
@@ -34,11 +34,11 @@ def photographed(lens, rays):
 
 
 @each_lens
-def test_dots_of_a_distorted_photograph_are_where_the_pinhole_says(lens):
-    ideal, straightened = straighten(lens, WIDTH, HEIGHT)
+def test_dots_of_a_distorted_photograph_are_where_the_pinhole_camera_sees_them(lens):
+    ideal, undistorted = undistort(lens, WIDTH, HEIGHT)
     targets = [(x, y) for x in range(15, WIDTH, 30) for y in range(15, HEIGHT, 30)]
     rays = [np.linalg.inv(ideal) @ [x, y, 1] for x, y in targets]
-    picture = straightened(draw(WIDTH, HEIGHT, photographed(lens, rays)), cv2.INTER_LINEAR)
+    picture = undistorted(draw(WIDTH, HEIGHT, photographed(lens, rays)), cv2.INTER_LINEAR)
     assert picture.shape == (HEIGHT, WIDTH, 3)
     assert max(offset(picture, target) for target in targets) < 0.2  # wide lenses stretch dots
     assert np.median([offset(picture, target) for target in targets]) < 0.13
@@ -46,8 +46,8 @@ def test_dots_of_a_distorted_photograph_are_where_the_pinhole_says(lens):
 
 @each_lens
 def test_the_view_has_no_blank_pixels_and_is_the_largest_such(lens):
-    ideal, straightened = straighten(lens, WIDTH, HEIGHT)
-    assert (straightened(np.full((HEIGHT, WIDTH), 255, np.uint8), cv2.INTER_LINEAR) == 255).all()
+    ideal, undistorted = undistort(lens, WIDTH, HEIGHT)
+    assert (undistorted(np.full((HEIGHT, WIDTH), 255, np.uint8), cv2.INTER_LINEAR) == 255).all()
     x, y = np.linspace(0.5, WIDTH - 0.5, 41), np.linspace(0.5, HEIGHT - 0.5, 31)
     border = [(a, b) for a in x for b in y if a in x[[0, -1]] or b in y[[0, -1]]]
     pixels = photographed(lens, [np.linalg.inv(ideal) @ [a, b, 1] for a, b in border])
@@ -59,7 +59,7 @@ def test_the_view_has_no_blank_pixels_and_is_the_largest_such(lens):
 
 def test_a_lens_that_sees_more_than_a_right_angle_keeps_its_axis():
     lens = Lens(np.array([[60.0, 0, 110], [0, 60, 95], [0, 0, 1]]), (0.01, 0, 0, 0), fisheye=True)
-    ideal, _ = straighten(lens, WIDTH, HEIGHT)
+    ideal, _ = undistort(lens, WIDTH, HEIGHT)
     np.testing.assert_allclose(ideal[:2, 2], [110, 95], atol=1e-9)
     seen = np.rad2deg(np.arctan((WIDTH - 110) / ideal[0, 0]))
     assert 60 < seen < 70.5
@@ -68,53 +68,57 @@ def test_a_lens_that_sees_more_than_a_right_angle_keeps_its_axis():
 
 @each_lens
 def test_masks_and_depths_are_not_mixed(lens):
-    _, straightened = straighten(lens, WIDTH, HEIGHT)
+    _, undistorted = undistort(lens, WIDTH, HEIGHT)
     depth = np.where(np.arange(WIDTH) < 124, 1.0, 3.0) * np.ones((HEIGHT, 1))
-    moved = straightened(depth.astype(np.float32), cv2.INTER_NEAREST)
+    moved = undistorted(depth.astype(np.float32), cv2.INTER_NEAREST)
     assert set(np.unique(moved)) == {1.0, 3.0}
 
 
 def test_nearest_takes_the_nearest():
-    """Depth that rises by 1 a column tells which pixel was taken: never one farther than half a pixel."""
+    """Depth that rises by 1 per column reveals which pixel was taken: never one farther than half a pixel."""
     lens = LENSES["barrel"]
-    ideal, straightened = straighten(lens, WIDTH, HEIGHT)
-    taken = straightened(
+    ideal, undistorted = undistort(lens, WIDTH, HEIGHT)
+    taken = undistorted(
         np.arange(WIDTH, dtype=np.float32) * np.ones((HEIGHT, 1), np.float32), cv2.INTER_NEAREST
     )
     targets = [(x + 0.5, y + 0.5) for x in range(10, WIDTH, 13) for y in range(10, HEIGHT, 13)]
-    wanted = photographed(lens, [np.linalg.inv(ideal) @ [x, y, 1] for x, y in targets])[:, 0]
+    expected = photographed(lens, [np.linalg.inv(ideal) @ [x, y, 1] for x, y in targets])[:, 0]
     found = np.array([taken[int(y), int(x)] + 0.5 for x, y in targets])
-    assert np.abs(found - wanted).max() < 0.55
+    assert np.abs(found - expected).max() < 0.55
 
 
 @pytest.mark.parametrize("coeffs", [(), (0.0, 0.0, 0.0, 0.0)])
 def test_a_pinhole_camera_is_left_alone(coeffs):
-    ideal, straightened = straighten(Lens(K, coeffs), WIDTH, HEIGHT)
+    ideal, undistorted = undistort(Lens(K, coeffs), WIDTH, HEIGHT)
     picture = draw(WIDTH, HEIGHT, [(30, 40)])
-    assert straightened(picture, cv2.INTER_LINEAR) is picture
+    assert undistorted(picture, cv2.INTER_LINEAR) is picture
     np.testing.assert_array_equal(ideal, K)
 
 
 def test_a_smaller_copy_has_the_same_rays():
-    half = shrunk(K, (WIDTH, HEIGHT), (120, 90), "a.png")
+    half = scaled_intrinsics(K, (WIDTH, HEIGHT), (120, 90), "a.png")
     np.testing.assert_allclose(half @ [0.1, -0.2, 1], np.array([0.5, 0.5, 1]) * (K @ [0.1, -0.2, 1]))
-    odd = shrunk(K, (WIDTH, HEIGHT), (80, 59), "a.png")  # rounding a size is no other shape
+    odd = scaled_intrinsics(K, (WIDTH, HEIGHT), (80, 59), "a.png")  # a rounded size is not another shape
     np.testing.assert_allclose(odd[1] / K[1].clip(1e-9), [0, 59 / 180, 59 / 180], atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("said", "actual", "says"),
+    ("calibrated", "actual", "says"),
     [
-        ((240, 180), (240, 160), r"a.png: expected 240x180 pixels or a smaller copy, found 240x160\. Give"),
-        ((240, 180), (90, 120), r"found 90x120\. .*turned on its side"),
+        (
+            (240, 180),
+            (240, 160),
+            r"a.png: expected 240x180 pixels or a downscaled copy, found 240x160\. Give",
+        ),
+        ((240, 180), (90, 120), r"found 90x120\. .*rotated by 90 degrees"),
         ((0, 180), (240, 180), r"a.png: expected a width and a height above 0, found 0x180"),
         ((-240, -180), (240, 180), r"found -240x-180"),
     ],
 )
-def test_photographs_of_another_shape(said, actual, says):
+def test_photographs_of_another_shape(calibrated, actual, says):
     with pytest.raises(DataError, match=says) as raised:
-        shrunk(K, said, actual, "a.png")
-    assert ("turned" in str(raised.value)) == (actual == (90, 120))
+        scaled_intrinsics(K, calibrated, actual, "a.png")
+    assert ("rotated" in str(raised.value)) == (actual == (90, 120))
 
 
 def test_dots_know_where_they_are():
@@ -128,7 +132,7 @@ def test_dots_know_where_they_are():
 
 def test_intrinsics_as_a_matrix_or_as_four_numbers():
     K = [[60.0, 0, 32], [0, 61, 24], [0, 0, 1]]
-    np.testing.assert_array_equal(matrix_of((60, 61, 32, 24)), K)
-    np.testing.assert_array_equal(matrix_of(np.array(K)), K)
+    np.testing.assert_array_equal(intrinsics_matrix((60, 61, 32, 24)), K)
+    np.testing.assert_array_equal(intrinsics_matrix(np.array(K)), K)
     with pytest.raises(ValueError, match=r"K must be 3x3 or fx, fy, cx, cy; got shape \(2,\)"):
-        matrix_of(np.zeros(2))
+        intrinsics_matrix(np.zeros(2))

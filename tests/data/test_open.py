@@ -20,7 +20,7 @@ def test_built_in_scenes_take_arguments():
 @pytest.mark.parametrize(
     ("path", "says"),
     [
-        ("simulated:kitchen", "no built-in scene 'kitchen'; there are: tabletop, articulated"),
+        ("simulated:kitchen", "no built-in scene 'kitchen'; available: tabletop, articulated"),
         ("simulated:tabletop?sed=3", "no argument 'sed'; it has: seed, frames"),
         ("simulated:tabletop?seed=x", "seed must be an integer, got 'x'"),
         ("simulated:tabletop?seed=", "seed must be an integer, got ''"),
@@ -29,7 +29,7 @@ def test_built_in_scenes_take_arguments():
         ("simulated:tabletop?hide=1&leave=1", "at most one"),
     ],
 )
-def test_what_is_wrong_with_a_built_in_scene(path, says):
+def test_invalid_built_in_scenes_are_refused(path, says):
     with pytest.raises(ValueError, match=says):
         open_sequence(path)
 
@@ -101,10 +101,10 @@ def test_photographs_are_no_recording(tmp_path, write, layout):
         open_sequence(tmp_path)
 
 
-def test_what_a_folder_leaves_open_is_asked_for(tmp_path):
+def test_options_for_what_a_folder_leaves_open_are_required(tmp_path):
     llff(tmp_path)
     with pytest.raises(
-        ValueError, match=r"does not say how its columns are meant; give axes \(--read.axes\)"
+        ValueError, match=r"does not state the meaning of its columns; give axes \(--read.axes\)"
     ):
         open_photographs(tmp_path)
     (tmp_path / "images").rename(tmp_path / "images_8")
@@ -129,12 +129,12 @@ def test_folders_without_photographs(tmp_path):
     with pytest.raises(DataError, match=r"found cam00.mp4"):
         open_photographs(tmp_path)
     (tmp_path / "transforms_train.json").write_text('{"frames": [{"file_path": "gone.png"}]}')
-    with pytest.raises(DataError, match=r"of 1 listed 1 that have no file \(gone.png\)"):
+    with pytest.raises(DataError, match=r"found 1 listed, 1 with no file \(gone.png\)"):
         open_photographs(tmp_path)
 
 
 @pytest.mark.parametrize("place", ["", "images", "photos"])
-def test_photographs_without_poses_are_told_how_to_get_them(tmp_path, place):
+def test_the_error_for_photographs_without_poses_says_how_to_find_them(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     for name in ("a.png", "b.JPG"):
         (tmp_path / place / name).write_bytes(ONE_PIXEL)
@@ -145,7 +145,7 @@ def test_photographs_without_poses_are_told_how_to_get_them(tmp_path, place):
             opened(tmp_path, ReadOptions(images=place or "images"))
 
 
-def test_a_video_is_told_how_to_get_poses(tmp_path):
+def test_the_error_for_a_video_says_how_to_find_poses(tmp_path):
     (tmp_path / "walk.MOV").write_bytes(b"any")
     with pytest.raises(DataError, match=r"found a video, which has no poses. .*gsjax poses .*walk.MOV --out"):
         open_photographs(tmp_path / "walk.MOV")

@@ -3,7 +3,7 @@ import pytest
 
 from gsjax.data import DataError, DataWarning, ReadOptions, open_sequence, read_open3d
 from tests.data import dots
-from tests.data.looks import depths_from_another_frame
+from tests.data.scene_helpers import depths_from_another_frame
 
 WIDTH, HEIGHT, NUMBERS = 96, 72, (0, 3, 6, 12)
 INTRINSICS = (100.0, 90.0, 50.0, 35.0)
@@ -11,7 +11,7 @@ POINT = np.array([0.3, 0.2, 4.0])
 
 
 def pose(number):
-    """It goes right by 0.05 a frame, and looks along +z, with y down."""
+    """The camera moves right by 0.05 per frame and looks along +z, with y down."""
     matrix = np.eye(4)
     matrix[0, 3] = 0.05 * number
     return matrix
@@ -23,13 +23,13 @@ def pixel(number):
 
 
 def log(poses):
-    """As Open3D writes it."""
+    """A trajectory file as Open3D writes it."""
     blocks = (f"{n} {n} {n + 1}\n" + "\n".join(" ".join(map(str, r)) for r in p) for n, p in poses.items())
     return "\n".join(blocks) + "\n"
 
 
 class Folder:
-    """Every third frame of those that the trajectory has."""
+    """A recording with only some of the frames in its trajectory."""
 
     def __init__(self, root):
         self.root, self.poses = root, {n: pose(n) for n in range(15)}
@@ -103,23 +103,23 @@ def test_another_trajectory(folder):
 def test_frames_without_depth_or_pose_are_counted(folder):
     (folder.root / "depth/00003.png").unlink()
     folder.poses[6] = np.full((4, 4), np.nan)
-    with pytest.warns(DataWarning, match="room: 2 of 4 frames are left out, without depth or a pose"):
+    with pytest.warns(DataWarning, match="room: 2 of 4 frames without depth or a pose are left out"):
         assert folder.read().frame_ids == (0, 12)
     folder.poses = {1: pose(1)}
-    with pytest.raises(DataError, match="found 4 images, 3 depths and 1 poses without one number in common"):
+    with pytest.raises(DataError, match="found 4 images, 3 depths and 1 poses with no number in common"):
         folder.read()
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", r"blocks of a line of three integers and four of four numbers, found 0 numbers"),
-        (log({0: pose(0)})[:-5], r"found 18 numbers, which are not so many blocks of 19. Is it cut off\?"),
+        ("", r"blocks of one line of three integers and four lines of four numbers, found 0 numbers"),
+        (log({0: pose(0)})[:-5], r"found 18 numbers, not one or more blocks of 19. Is it cut off\?"),
         (log({0: pose(0)}).replace("0.0", "zero", 1), r"found something else \(could not convert .*'zero'"),
         (b"\xff\xfe\x00", r"found something else \("),
     ],
 )
-def test_trajectories_that_are_none(folder, text, says):
+def test_invalid_trajectories_are_refused(folder, text, says):
     file = folder.root / "test_scene/trajectory.log"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DataError, match=f"trajectory.log: expected .*{says}"):
@@ -137,11 +137,11 @@ def test_trajectories_that_are_none(folder, text, says):
     ("matrix", "says"),
     [
         (np.zeros((4, 4)), "its last row is"),
-        (np.diag([0.0, 0, 0, 1]), "R is no rotation"),
-        (np.diag([1.0, 1, -1, 1]), "R is a mirror image"),
+        (np.diag([0.0, 0, 0, 1]), "R is not a rotation"),
+        (np.diag([1.0, 1, -1, 1]), "R is a reflection"),
     ],
 )
-def test_poses_that_are_none(folder, matrix, says):
+def test_invalid_poses_are_refused(folder, matrix, says):
     folder.poses[6] = matrix
     with pytest.raises(ValueError, match=f"pose of frame 6 in .*test_scene/trajectory.log: {says}"):
         folder.read()
@@ -161,7 +161,7 @@ def test_pictures_of_another_kind(folder):
 
 
 def test_the_living_room(shared_data):
-    """Points of one frame lie on the depth of another, by the poses of the numbers in their names."""
+    """Points of one frame, moved by the poses, lie on the depth of another."""
     sequence = open_sequence(shared_data / "icl_living_room", ReadOptions(K=(525, 525, 320, 240)))
     assert sequence.frame_ids[:3] == (0, 3, 6)
     measured, expected = depths_from_another_frame(sequence, 0, 10)

@@ -19,7 +19,7 @@ def save(path, image):
 
 
 class Folder:
-    """A small recording on disk, whose meta tests change before they write it."""
+    """A small recording on disk; tests change its meta before they write it."""
 
     def __init__(self, root, cameras=(0, 1), name="train_meta.json"):
         self.root, self.name = root, name
@@ -78,7 +78,7 @@ def test_depth_masks_and_times(folder):
     assert sequence.mask(0, 1).dtype == np.int32
 
 
-def test_depth_is_in_millimetres_unless_told(folder):
+def test_depth_is_in_millimetres_by_default(folder):
     folder.add("depth", 0, np.uint16, 1500)
     assert (folder.read().depth(0, 0) == 1.5).all()
 
@@ -109,9 +109,9 @@ def test_frames_without_files_are_counted_and_left_out(folder):
     assert sequence.image(1, 0)[0, -1, 0] == pytest.approx(80, abs=3)
 
 
-def test_an_image_that_others_have_is_missed_at_once(folder):
+def test_a_single_missing_image_is_reported_at_once(folder):
     (folder.root / "ims/1/000001.jpg").unlink()
-    with pytest.raises(DataError, match=r"ims/1/000001.jpg: expected an image of all 2 cameras in frame 1"):
+    with pytest.raises(DataError, match=r"ims/1/000001.jpg: expected images of all 2 cameras in frame 1"):
         folder.read()
 
 
@@ -135,8 +135,8 @@ def test_a_camera_count_that_differs_names_the_frame(folder):
         (lambda m: m.pop("w2c"), "no w2c"),
         (lambda m: m["k"].pop(), "3 frames in k"),
         (lambda m: m["cam_id"][1].reverse(), r"found \[1, 0\] in frame 1"),
-        (lambda m: m["w2c"][1][1].pop(), r"found shape \(3, 4\) in frame 1, camera number 1"),
-        (lambda m: m.update(time=[0.0, 1.0]), "3 numbers as time"),
+        (lambda m: m["w2c"][1][1].pop(), r"found shape \(3, 4\) in frame 1, camera position 1"),
+        (lambda m: m.update(time=[0.0, 1.0]), "time to be 3 numbers"),
         (lambda m: m.update(fn=[]), "at least one frame"),
     ],
 )
@@ -158,9 +158,9 @@ def test_metas_that_disagree_with_each_other(folder):
         folder.read()
 
 
-def test_a_pose_that_is_no_rotation(folder):
+def test_a_pose_that_is_not_a_rotation(folder):
     folder.meta["w2c"][1][0][0][0] = 3.0
-    with pytest.raises(ValueError, match="camera 0 in frame 1: R is no rotation"):
+    with pytest.raises(ValueError, match="camera 0 in frame 1: R is not a rotation"):
         folder.read()
 
 
@@ -228,7 +228,7 @@ def test_a_mask_in_colour(folder):
     save(folder.root / "seg/0/000000.png", np.full((HEIGHT, WIDTH, 3), 4, np.uint8))
     assert (sequence.mask(0, 0) == 4).all()
     save(folder.root / "seg/0/000000.png", np.full((HEIGHT, WIDTH, 3), [1, 2, 3], np.uint8))
-    with pytest.raises(DataError, match="one label a pixel"):
+    with pytest.raises(DataError, match="one label per pixel"):
         sequence.mask(0, 0)
 
 
@@ -307,7 +307,7 @@ def test_simulated_recordings(shared_data, name):
 
 
 def test_truth_of_a_recording_agrees_with_its_depth(shared_data):
-    """Pixels of an object, carried by its pose to another frame, lie on its depth there."""
+    """Points of an object, moved by its pose to another frame, lie on its depth there."""
     sequence = read_panoptic(shared_data / "tabletop_0")
     k = sequence.truth.names.index("Can")
     y, x = np.nonzero(sequence.mask(0, 1) == sequence.truth.label_ids[k])
@@ -352,7 +352,7 @@ def test_frames_without_a_number_are_counted(folder):
 
 
 def _labelled(mask_value, depth=1.0):
-    """A sequence whose masks and depths are all of one value."""
+    """A sequence whose masks and depths are constant."""
     sequence = replace(tabletop(frames=1, width=WIDTH, height=HEIGHT), truth=None)
     shape = (HEIGHT, WIDTH)
     return replace(
@@ -370,5 +370,7 @@ def test_large_labels_survive_the_disk_and_negative_ones_are_refused(tmp_path):
 
 
 def test_depth_too_far_to_be_saved_is_counted(tmp_path):
-    with pytest.warns(DataWarning, match=rf"{3 * WIDTH * HEIGHT} pixels farther than 6.553 m"):
+    with pytest.warns(
+        DataWarning, match=rf"depth of {3 * WIDTH * HEIGHT} pixels farther than 6.553 m is lost"
+    ):
         write_panoptic(_labelled(1, depth=8.0), tmp_path)

@@ -46,7 +46,7 @@ def test_a_point_is_where_the_camera_says():
             assert dots.offset(scene.image(i), np.asarray(pixel)) < 0.05
 
 
-def test_some_of_them_in_another_order():
+def test_a_selection_in_another_order():
     some = photographs().select([2, 1])
     assert (some.num, some.names, some.splits) == (2, ("c", "b"), ("val", "test"))
     assert some.times.tolist() == [2.0, 0.5]
@@ -84,12 +84,12 @@ def test_smaller_colours_are_means_and_depths_and_masks_are_not():
 
 
 @pytest.mark.parametrize("scale", [0.0, -0.5, 1.5, float("nan")])
-def test_scales_that_make_no_smaller_photograph(scale):
+def test_invalid_scales_are_refused(scale):
     with pytest.raises(ValueError, match="scale must be above 0 and at most 1, got"):
         photographs().scaled(scale)
 
 
-def test_depth_that_is_no_number_is_invalid():
+def test_depth_that_is_not_finite_is_invalid():
     bad = np.full((48, 64), 2.0, np.float32)
     bad[0, :3] = np.nan, np.inf, -1
     depth = photographs(load_depth=lambda i: bad).depth(0)
@@ -126,7 +126,7 @@ def test_loaders_that_give_something_else(kind, loaded, says):
         ("Ks", np.eye(3), r"Ks must have shape \(3, 3, 3\)"),
         ("Ks", np.full((3, 3, 3), np.nan), "K of a is .*must be finite"),
         ("viewmats", np.eye(4), r"viewmats must have shape \(3, 4, 4\)"),
-        ("viewmats", np.stack([np.eye(4), np.diag([1, 1, -1, 1]), np.eye(4)]), "viewmat of b: .*mirror"),
+        ("viewmats", np.stack([np.eye(4), np.diag([1, 1, -1, 1]), np.eye(4)]), "viewmat of b: .*reflection"),
         ("viewmats", np.tile(2 * np.eye(4), (3, 1, 1)), "viewmat of a: its last row is"),
         ("times", np.zeros(2), r"times must have shape \(3,\)"),
         ("splits", ("train",), r"splits must have shape \(3,\)"),
@@ -137,7 +137,7 @@ def test_fields_that_do_not_fit(field, value, says):
         replace(photographs(), **{field: value})
 
 
-def test_clouds_have_a_colour_a_point():
+def test_clouds_have_one_colour_per_point():
     assert Cloud(np.zeros((0, 3)), np.zeros((0, 3))).points.shape == (0, 3)
     with pytest.raises(ValueError, match=r"colors must have shape \(2, 3\), got \(1, 3\)"):
         Cloud(np.zeros((2, 3)), np.zeros((1, 3)))
@@ -158,7 +158,7 @@ def test_a_recording_as_photographs():
     assert photographs_of(sequence.select([0])).times is None
 
 
-def test_labels_are_read_selected_and_shrunk_as_they_are():
+def test_labels_are_read_selected_and_downscaled_without_mixing():
     labels = [np.arange(w * h).reshape(h, w) % 7 for w, h in SIZES.tolist()]
     found = photographs(load_labels=lambda i: None if i == 1 else labels[i], label_names={3: "cup"})
     np.testing.assert_array_equal(found.labels(0), labels[0])

@@ -13,20 +13,20 @@ AXES = ("llff", "endonerf")
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 
 
-def row(viewmat, axes, said=(HEIGHT, WIDTH, FOCAL)):
-    """By the words: R's columns are directions of the camera in the world, t is where it stands."""
+def row(viewmat, axes, hwf=(HEIGHT, WIDTH, FOCAL)):
+    """By definition: the columns of R are the camera's axes in the world, t is its position."""
     right, down, forward = viewmat[:3, :3]
     columns = {"llff": (down, right, -forward), "endonerf": (right, -down, -forward)}[axes]
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return [*np.stack([*columns, eye, said], axis=-1).ravel(), 0.5, 9.0]
+    return [*np.stack([*columns, eye, hwf], axis=-1).ravel(), 0.5, 9.0]
 
 
 VIEWMATS = [look_at(np.array([0.5 * i, -4.0, 0.3 + i]), np.zeros(3)) for i in range(3)]
 
 
-def build(root, axes, said=(HEIGHT, WIDTH, FOCAL), name="poses_bounds.npy"):
+def build(root, axes, hwf=(HEIGHT, WIDTH, FOCAL), name="poses_bounds.npy"):
     root.mkdir(exist_ok=True)
-    np.save(root / name, np.array([row(viewmat, axes, said) for viewmat in VIEWMATS]))
+    np.save(root / name, np.array([row(viewmat, axes, hwf) for viewmat in VIEWMATS]))
     for i, viewmat in enumerate(VIEWMATS):
         image = dots.draw(WIDTH, HEIGHT, [dots.project(K, viewmat, point) for point in POINTS])
         dots.save(root / f"images/{i:03d}.png", image)
@@ -49,8 +49,10 @@ def test_points_are_where_they_were_drawn(tmp_path, axes, name):
     np.testing.assert_allclose(scene.viewmats, VIEWMATS, atol=1e-12)
     np.testing.assert_allclose(scene.Ks[0], K)
     assert farthest(scene) < 0.06
-    with pytest.raises(ValueError, match=r"axes must say how .*'llff' \(down.*'endonerf' .*; got 'opengl'"):
-        _read_rows(tmp_path / "fern", "opengl")  # a type checker stops it before, as do tests
+    with pytest.raises(
+        ValueError, match=r"axes must be the meaning .*'llff' \(down.*'endonerf' .*; got 'opengl'"
+    ):
+        _read_rows(tmp_path / "fern", "opengl")  # type checkers reject it, as do annotations under test
 
 
 def test_the_other_axes_are_another_scene(tmp_path):
@@ -59,7 +61,7 @@ def test_the_other_axes_are_another_scene(tmp_path):
 
 
 def test_photographs_may_be_smaller(tmp_path):
-    scene = read_llff(build(tmp_path, "llff", said=(4 * HEIGHT, 4 * WIDTH, 4 * FOCAL)), "llff")
+    scene = read_llff(build(tmp_path, "llff", hwf=(4 * HEIGHT, 4 * WIDTH, 4 * FOCAL)), "llff")
     np.testing.assert_allclose(scene.Ks[1], K)
     assert farthest(scene) < 0.06
     (tmp_path / "images").rename(tmp_path / "images_4")
@@ -68,7 +70,7 @@ def test_photographs_may_be_smaller(tmp_path):
         read_llff(tmp_path, "llff")
     dots.save(tmp_path / "images_4/001.png", np.zeros((WIDTH, HEIGHT, 3), np.uint8))
     with pytest.raises(
-        DataError, match=r"001.png: expected 384x288 pixels .*found 72x96.*turned on its side"
+        DataError, match=r"001.png: expected 384x288 pixels .*found 72x96.*rotated by 90 degrees"
     ):
         read_llff(tmp_path, "llff", "images_4")
 
@@ -77,7 +79,7 @@ def test_more_or_fewer_photographs_than_rows(tmp_path):
     build(tmp_path, "llff")
     dots.save(tmp_path / "images/003.jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     with pytest.raises(
-        DataError, match=r"expected 3 photographs in .*, one a row, found 4\. Name their folder"
+        DataError, match=r"expected 3 photographs in .*, one per row, found 4\. Give the name of their folder"
     ):
         read_llff(tmp_path, "llff")
     for name in ("001.png", "003.jpg"):
@@ -109,16 +111,16 @@ def changed(index, value):
             r"expected height, width and focal length above 0, found \[72.0, 96.0, 0.0\] in row 1",
         ),
         (changed(4, -72), r"found \[-72.0, 96.0, 100.0\] in row 1"),
-        (changed(4, 96), r"001.png: expected 96x96 pixels or a smaller copy, found 96x72"),
-        (changed([0, 5, 10], 0), r"pose of row 1 of .*poses_bounds.npy: R is no rotation"),
-        (changed([0, 1, 2, 5, 6, 7, 10, 11, 12], 0), r"pose of row 1 of .*: R is no rotation"),
+        (changed(4, 96), r"001.png: expected 96x96 pixels or a downscaled copy, found 96x72"),
+        (changed([0, 5, 10], 0), r"pose of row 1 of .*poses_bounds.npy: R is not a rotation"),
+        (changed([0, 1, 2, 5, 6, 7, 10, 11, 12], 0), r"pose of row 1 of .*: R is not a rotation"),
         (
             lambda rows: rows * np.where(np.arange(17) % 5 == 0, -1, 1),
-            r"row 0 of .*mirror image.*Is axes the",
+            r"row 0 of .*reflection.*Is axes set",
         ),
     ],
 )
-def test_what_is_wrong_with_a_file(tmp_path, change, says):
+def test_faults_of_a_file(tmp_path, change, says):
     build(tmp_path, "llff")
     file = tmp_path / "poses_bounds.npy"
     np.save(file, change(np.load(file)), allow_pickle=True)
@@ -126,7 +128,7 @@ def test_what_is_wrong_with_a_file(tmp_path, change, says):
         read_llff(tmp_path, "llff")
 
 
-def test_files_that_are_none(tmp_path):
+def test_files_that_are_not_arrays(tmp_path):
     build(tmp_path, "llff")
     file = tmp_path / "poses_bounds.npy"
     content = file.read_bytes()
@@ -147,7 +149,7 @@ def test_files_that_are_none(tmp_path):
 
 
 def film(path, frames, size=(WIDTH, HEIGHT)):
-    """Frame t is of grey 20 + 40 t."""
+    """Frame t has grey level 20 + 40 t."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, size)
     for t in range(frames):
         writer.write(np.full((size[1], size[0], 3), 20 + 40 * t, np.uint8))
@@ -155,7 +157,7 @@ def film(path, frames, size=(WIDTH, HEIGHT)):
 
 
 def test_dynerf(tmp_path):
-    build(tmp_path, "llff", said=(2 * HEIGHT, 2 * WIDTH, 2 * FOCAL))
+    build(tmp_path, "llff", hwf=(2 * HEIGHT, 2 * WIDTH, 2 * FOCAL))
     for camera, frames in ((0, 5), (3, 4), (11, 5)):
         film(tmp_path / f"cam{camera:02d}.mp4", frames)
     sequence = read_dynerf(tmp_path)
@@ -169,15 +171,17 @@ def test_dynerf(tmp_path):
     with pytest.raises(DataError, match=r"cam03.mp4: expected 96x72 as in cam00.mp4, found 48x36"):
         read_dynerf(tmp_path)
     (tmp_path / "cam03.mp4").write_bytes(b"no film")
-    with pytest.raises(DataError, match=r"cam03.mp4: expected a video, found something that does not open"):
+    with pytest.raises(DataError, match=r"cam03.mp4: expected a video, found a file that does not open"):
         read_dynerf(tmp_path)
     (tmp_path / "cam03.mp4").unlink()
-    with pytest.raises(DataError, match=r"poses_bounds.npy: expected 3 videos cam\*.mp4, one a row, found 2"):
+    with pytest.raises(
+        DataError, match=r"poses_bounds.npy: expected 3 videos cam\*.mp4, one per row, found 2"
+    ):
         read_dynerf(tmp_path)
 
 
 def test_the_tissue(shared_data):
-    """The scope looks at the tissue: its tracked vertices lie at the depth that the reader's files have."""
+    """The endoscope looks at the tissue: its tracked vertices lie in front of it, many of them in view."""
     scene = read_llff(shared_data / "tissue_0", "endonerf")
     vertices = np.load(shared_data / "tissue_0/truth.npz")["verts"]
     for i in (0, 30):

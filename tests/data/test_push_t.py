@@ -14,7 +14,7 @@ K = [[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 1.0]]
 
 
 def write_video(path, count):
-    """Frame i has grey level 10 + 8 i on its left, 128 on its right."""
+    """Frame i has grey level 10 + 8 i in its left half, 128 in its right."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 90, (WIDTH, HEIGHT))
     for i in range(count):
         image = np.full((HEIGHT, WIDTH, 3), 10 + 8 * i, np.uint8)
@@ -24,7 +24,7 @@ def write_video(path, count):
 
 
 def level(image):
-    """Which frame this is."""
+    """The frame number encoded in an image."""
     return round((float(image[:, : WIDTH // 4].mean()) - 10) / 8)
 
 
@@ -49,7 +49,7 @@ class Folder:
 
 @pytest.fixture
 def folder(tmp_path):
-    """Camera b misses its second image and runs 5 ms late."""
+    """Camera b lacks its second image and is 5 ms late."""
     times = np.arange(20) * 0.02
     return Folder(tmp_path / "push", {"a": times, "b": np.delete(times, 1) + 0.005})
 
@@ -86,9 +86,9 @@ def test_conventions_are_those_of_the_package(folder):
 
 def test_frames_of_which_a_camera_is_too_late_are_counted_and_left_out(folder):
     times = np.arange(20) * 0.02
-    late = np.where(np.arange(19) < 5, times[1:], times[1:] + 0.4 + MAX_SKEW_S)  # a pause after the fifth
+    late = np.where(np.arange(19) < 5, times[1:], times[1:] + 0.4 + MAX_SKEW_S)  # a gap after the fifth
     folder.write_record("b", late)
-    with pytest.warns(DataWarning, match=r"13 of 20 frames are left out, 13 without b.mp4 .* within 30 ms"):
+    with pytest.warns(DataWarning, match=r"13 of 20 frames are left out: 13 without b.mp4 .* within 30 ms"):
         sequence = read_push_t(folder.root)
     assert sequence.frame_ids == tuple(range(7))
     np.testing.assert_allclose(sequence.times, times[:7])
@@ -100,7 +100,9 @@ def test_frames_of_which_a_camera_is_too_late_are_counted_and_left_out(folder):
 
 def test_cameras_that_never_meet(folder):
     folder.write_record("b", np.delete(np.arange(20) * 0.02, 1) + 10)
-    with pytest.raises(DataError, match=r"videos: .* within 30 ms .* the nearest b.mp4 is 10 s away"):
+    with pytest.raises(
+        DataError, match=r"videos: .* within 30 ms, found none: .* the nearest b.mp4 is 10 s away"
+    ):
         read_push_t(folder.root)
 
 
@@ -110,7 +112,7 @@ def test_missing_and_disagreeing_files(folder, tmp_path):
     with pytest.raises(DataError, match=r"sample_demos/3/cameras.json"):
         read_push_t(folder.root, demo=3)
     folder.write_record("b", np.arange(18) * 0.02 + 0.02)
-    with pytest.raises(DataError, match=r"b.mp4: expected 18 frames, one a timestamp, found 19"):
+    with pytest.raises(DataError, match=r"b.mp4: expected 18 frames, one per timestamp, found 19"):
         read_push_t(folder.root).image(0, 1)
     folder.write_record("b", np.arange(20) * 0.02, resolution=[32, 48])
     with pytest.raises(DataError, match=r"b.json: expected 64x48 .*found 32x48"):
@@ -125,18 +127,18 @@ def test_missing_and_disagreeing_files(folder, tmp_path):
 
 def test_a_file_that_is_no_video(folder):
     (folder.demo / "videos/a.mp4").write_text("no video")
-    with pytest.raises(DataError, match=r"a.mp4: expected a video, found something that does not open"):
+    with pytest.raises(DataError, match=r"a.mp4: expected a video, found a file that does not open"):
         read_push_t(folder.root).image(0, 0)
 
 
-def test_a_video_of_another_size_or_shorter_than_it_says(folder):
+def test_a_video_of_another_size_or_length(folder):
     path = folder.demo / "videos/a.mp4"
     with pytest.raises(DataError, match=r"a.mp4: expected 32x24 pixels, found 64x48"):
         Video(path, 32, 24, 20).frame(0)
     video = Video(path, WIDTH, HEIGHT, 20)
     with pytest.raises(DataError, match=r"a.mp4: expected 20 frames, found no frame 25"):
         video.frame(25)
-    assert level(video.frame(3)) == 3  # it reads on after an error
+    assert level(video.frame(3)) == 3  # reading continues after an error
 
 
 def test_recordings_without_cameras_or_timestamps(folder):
@@ -177,7 +179,7 @@ def test_known_shapes(folder):
     ground, tblock = read_push_t(folder.root).models
     assert (ground.label, tblock.label) == (0, 1)
     assert tblock.pose is None
-    np.testing.assert_allclose(tblock.colors[0], [0.9, 0.4, 0.2])  # the file's are blue first
+    np.testing.assert_allclose(tblock.colors[0], [0.9, 0.4, 0.2])  # the file's order is blue, green, red
     np.testing.assert_allclose(tblock.plane, plane)
     w, a, b, c = ground.quats[0]
     normal = [2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)]

@@ -1,4 +1,4 @@
-"""The ray-caster against closed forms, its light and textures, and the motions of what it shows."""
+"""The ray-caster against closed forms, its light and textures, and keyframe motions."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ seeds = st.integers(0, 10_000)
 
 
 def single(primitive, pose, light=LIGHT, extra=(), size=(WIDTH, HEIGHT)):
-    """One primitive of label 1 at `pose`, seen by a camera at the origin that looks along +z of the world."""
+    """One primitive of label 1 at `pose`, and a camera at the origin that looks along the world's +z axis."""
     width, height = size
     poses = np.stack([np.eye(4), pose])[None]
     moved = Primitive(primitive.shape, primitive.size, primitive.texture, body=1)
@@ -83,7 +83,7 @@ def test_depth_of_a_sphere(seed):
 @pytest.mark.parametrize("solid", SOLIDS, ids=lambda solid: solid.shape)
 @given(seed=seeds)
 def test_hits_lie_on_the_surface_and_are_the_first(solid, seed):
-    """The solid's implicit function, positive outside, is zero at a hit, positive before it and on a miss."""
+    """The solid's implicit function is zero at a hit, and positive before it and along a miss."""
     rng = np.random.default_rng(seed)
     origin = Rotation.random(rng=rng).apply([0, 0, 2.0])
     directions = (rng.normal(size=(200, 3)) * 0.3 - origin).T
@@ -100,7 +100,7 @@ def test_hits_lie_on_the_surface_and_are_the_first(solid, seed):
 
 
 def outside(solid, points):
-    """Positive outside of the solid, zero on its surface, negative inside."""
+    """Implicit function: positive outside the solid, zero on its surface, negative inside."""
     match solid.shape:
         case "sphere":
             return np.linalg.norm(points, axis=0) - solid.size[0]
@@ -137,7 +137,7 @@ def test_a_camera_inside_or_before_a_solid_sees_nothing_of_it():
 
 @given(seeds)
 def test_a_solid_that_reaches_behind_the_camera_is_not_clipped(seed):
-    """The pixels that a long box covers do not depend on the rectangle in which it is looked for."""
+    """The pixels that a long box covers do not depend on the window in which it is traced."""
     rng = np.random.default_rng(seed)
     box = Primitive("box", (0.05, 0.05, 3.0), GREY)
     pose = rigid(Rotation.from_euler("xy", rng.uniform(-0.2, 0.2, 2)), np.array([0.3, 0.2, 2.0]))
@@ -218,7 +218,7 @@ def test_motions_pass_their_keyframes_at_rest():
     assert np.diff(slide).max() <= 0.2 * 0.1 + 1e-12
 
 
-def test_a_stick_lies_between_its_ends():
+def test_a_link_lies_between_its_ends():
     ends = np.random.default_rng(0).normal(size=(2, 5, 3))
     ends[:, 0, :2] = 0  # upright
     poses = between(ends[0], ends[1])

@@ -1,6 +1,6 @@
-"""Every reader and what may be wrong with its files: each message names the file and says what to do.
+"""Faults in the files of every reader: each message names the file and says what to do.
 
-docs/data-errors.md is written from these messages: `python -m tests.data.test_reader_errors`.
+docs/data-errors.md is generated from these messages: `python -m tests.data.test_reader_errors`.
 """
 
 import re
@@ -22,48 +22,52 @@ from tests.data.faulty import Fault
 LAYOUTS = PHOTOGRAPHS | RECORDINGS | SURGERY
 CASES = [(name, fault) for name, layout in LAYOUTS.items() for fault in layout.faults]
 PAGE = Path(__file__).parents[2] / "docs" / "data-errors.md"
-HEAD = """# What readers say
+HEAD = """# Reader errors
 
-What each reader says of data that is damaged or incomplete. `DATA` stands for the folder. *Refused* is an
-error (`DataError`, or another `ValueError` or `OSError`; exit code 2 on the command line); *used without it*
-is a `DataWarning`, and the rest is read; *used* is one too, and all is read as it is. Words of other
-libraries and sizes of files are left out (`...`).
-`python -m tests.data.test_reader_errors` writes this page, and a test compares it.
+What each reader reports about damaged or incomplete data. `DATA` is the folder, `FILE` the path of the file
+at fault, `...` a size or another library's words. Messages that differ only in names and numbers are listed
+once.
+
+Most are errors (`DataError`, or another `ValueError` or `OSError`; exit code 2 on the command line).
+*Rest used* and *all used* mark warnings (`DataWarning`). `python -m tests.data.test_reader_errors` writes
+this page; a test compares it.
 """
+SHARED = "Several layouts"
 
-# What others say of a file, and how many bytes an encoder wrote, differ from version to version.
+# Messages of other libraries, and file sizes of encoders, differ from version to version.
 _FOREIGN = re.compile(
-    r"(bad JSON|bad data|something else|no text|one that cannot be parsed|cut off) \((?:[^()]|\([^()]*\))*\)"
+    r"(bad JSON|bad data|something else|binary data|one that cannot be parsed|cut off) "
+    r"\((?:[^()]|\([^()]*\))*\)"
 )
 _BYTES = re.compile(r"\d+ (bytes|items)")
 
 
-class Said(NamedTuple):
+class Outcome(NamedTuple):
     refused: bool
-    text: str
+    message: str
 
 
 @cache
 def _sound(layout: str) -> Path:
-    """A recording with which nothing is wrong, made once."""
-    folder = Path(tempfile.mkdtemp()) / "freiburg3_DATA"  # TUM's reader takes its camera from the name
+    """A recording without faults, made once."""
+    folder = Path(tempfile.mkdtemp()) / "freiburg3_DATA"  # TUM's reader identifies the camera by the name
     folder.mkdir()
     LAYOUTS[layout].build(folder)
     return folder
 
 
-def said_of(layout: str, fault: Fault, scratch: Path) -> Said:
-    """What reading a recording with this fault says, paths replaced."""
+def outcome_of(layout: str, fault: Fault, scratch: Path) -> Outcome:
+    """The outcome of reading a recording with this fault, with paths replaced in the message."""
     root = Path(shutil.copytree(_sound(layout), scratch / "freiburg3_DATA"))
     fault.damage(root)
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
             LAYOUTS[layout].read(root)
         except (ValueError, OSError) as error:
-            return Said(True, _plain(str(error), root))
-    texts = [str(warning.message) for warning in heard if issubclass(warning.category, DataWarning)]
-    return Said(False, _plain("; ".join(texts), root))
+            return Outcome(True, _plain(str(error), root))
+    messages = [str(warning.message) for warning in caught if issubclass(warning.category, DataWarning)]
+    return Outcome(False, _plain("; ".join(messages), root))
 
 
 def _plain(text: str, root: Path) -> str:
@@ -71,21 +75,49 @@ def _plain(text: str, root: Path) -> str:
     return _BYTES.sub(r"... \1", _FOREIGN.sub(r"\1 (...)", text))
 
 
+class Case(NamedTuple):
+    layout: str
+    what: str
+    text: str
+
+
 def page(scratch: Path) -> str:
-    """docs/data-errors.md."""
-    parts = [HEAD]
+    """docs/data-errors.md: a table of the messages of several layouts, then one of each layout's own."""
+    alike: dict[tuple[str, str], list[Case]] = {}
     for number, (layout, fault) in enumerate(CASES):
-        if LAYOUTS[layout].faults[0] is fault:
-            parts.append(f"\n## {layout}\n\n| what is wrong | | what is said |\n| --- | --- | --- |\n")
-        refused, text = said_of(layout, fault, scratch / str(number))
-        used = "used without it" if "left out" in text else "used"
-        outcome, escaped = "refused" if refused else used, text.replace("|", r"\|")
-        parts.append(f"| {fault.what} | {outcome} | `{escaped}` |\n")
-    return "".join(parts)
+        refused, text = outcome_of(layout, fault, scratch / str(number))
+        outcome = "" if refused else "rest used" if "left out" in text else "all used"
+        alike.setdefault((outcome, _pattern(text)), []).append(Case(layout, fault.what, text))
+    sections: dict[str, list[str]] = {name: [] for name in (SHARED, *LAYOUTS)}
+    for (outcome, _), cases in alike.items():
+        section = SHARED if len({case.layout for case in cases}) > 1 else cases[0].layout
+        same = len({case.text for case in cases}) == 1
+        text = cases[0].text if same else _LEADING_PATH.sub("FILE", cases[0].text)
+        problem = _problem(cases, section == SHARED) + (f" (*{outcome}*)" if outcome else "")
+        sections[section].append(problem + " | `" + text.replace("|", r"\|") + "`\n")
+    head = "\n## {}\n\nproblem | message\n--- | ---\n"
+    return HEAD + "".join(head.format(name) + "".join(rows) for name, rows in sections.items() if rows)
+
+
+_LEADING_PATH = re.compile(r"^DATA[\w./*-]*")
+
+
+def _pattern(text: str) -> str:
+    """A message without its files' names and its numbers."""
+    named = re.sub(r"\([\w./]+\)|[\w./]+\.(png|txt|bin)", "NAME", _LEADING_PATH.sub("FILE", text))
+    return re.sub(r"\d+", "N", named)
+
+
+def _problem(cases: list[Case], name_layouts: bool) -> str:
+    """The faults that have one message, with the layouts in which each occurs if there are several."""
+    layouts: dict[str, list[str]] = {}
+    for case in cases:
+        layouts.setdefault(case.what, []).append(case.layout)
+    return "; ".join(f"{what} ({', '.join(of)})" if name_layouts else what for what, of in layouts.items())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_there_is_nothing_to_say_of_sound_data(layout):
+def test_sound_data_raises_no_warnings(layout):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)
         LAYOUTS[layout].read(_sound(layout))
@@ -95,17 +127,17 @@ def test_there_is_nothing_to_say_of_sound_data(layout):
     ("layout", "fault"), [pytest.param(*case, id=f"{case[0]}-{case[1].what}") for case in CASES]
 )
 def test_messages_name_the_file_and_say_what_to_do(layout, fault, tmp_path):
-    refused, text = said_of(layout, fault, tmp_path)
-    assert all(name in text for name in fault.names), text
+    refused, message = outcome_of(layout, fault, tmp_path)
+    assert all(name in message for name in fault.names), message
     if refused:
-        said, _, advice = text.rpartition("found ") if "found " in text else ("", "", text)
-        assert re.search(r"[.!?] [A-Z][^.]*[a-z].*[.?]?$", advice), text
-        assert not said or "expected " in said, text
+        before, _, advice = message.rpartition("found ") if "found " in message else ("", "", message)
+        assert re.search(r"[.!?] [A-Z][^.]*[a-z].*[.?]?$", advice), message
+        assert not before or "expected " in before, message
     else:
-        assert "left out" in text or re.search(r"[.;?] .*\b(give|set) ", text), text
+        assert "left out" in message or re.search(r"[.;?] .*\b(give|set) ", message), message
 
 
-def test_the_page_in_the_docs_is_what_readers_say(tmp_path):
+def test_the_page_in_the_docs_is_up_to_date(tmp_path):
     written = PAGE.read_text(encoding="utf-8")
     assert written == page(tmp_path), "run python -m tests.data.test_reader_errors"
 

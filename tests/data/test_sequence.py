@@ -19,7 +19,7 @@ FRAMES, CAMERAS, WIDTH, HEIGHT = 4, 2, 6, 5
 
 
 def make(**changes):
-    """A sequence whose image, depth and mask hold (t, c), so that one sees which was loaded."""
+    """A sequence whose images, depths and masks encode (t, c), to show which one was loaded."""
     K = np.array([[10.0, 0, 3], [0, 10.0, 2.5], [0, 0, 1]])
 
     def load_image(t, c):
@@ -111,7 +111,7 @@ def test_select_takes_positions_and_camera_ids():
 def test_smaller_colours_are_means_and_the_rest_is_not():
     def load_image(t, c):
         image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        image[::2, ::2] = 200  # one of the four pixels of each new one
+        image[::2, ::2] = 200  # one of the four pixels under each new one
         return image
 
     rising = np.arange(WIDTH, dtype=np.float32) + np.ones((4, 1), np.float32)
@@ -145,14 +145,14 @@ def test_smaller_float_pictures_have_lost_what_is_not_finite():
         image[0, 0], image[2, 2] = np.nan, 0.0
         return image
 
-    with pytest.warns(DataWarning, match="1 pixels are not finite"):
+    with pytest.warns(DataWarning, match="1 pixels are not finite; they become black"):
         small = make(load_image=load_image, float_images=True).scaled(0.5).image(0, 0)
     assert small.dtype == np.uint8
     assert small[1, 2].tolist() == [128, 128, 128]
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, float("nan")])
-def test_scales_that_make_nothing_smaller(scale):
+def test_invalid_scales_are_refused(scale):
     with pytest.raises(ValueError, match="scale must be above 0 and at most 1, got"):
         make().scaled(scale)
 
@@ -175,7 +175,7 @@ def test_select_swaps_cameras():
         (slice(None), [7, 7], "differ"),
     ],
 )
-def test_select_says_what_is_not_there(frames, cameras, says):
+def test_select_names_what_does_not_exist(frames, cameras, says):
     with pytest.raises(ValueError, match=says):
         make().select(frames, cameras)
 
@@ -185,7 +185,7 @@ def test_one_frame_is_a_sequence():
 
 
 @pytest.mark.parametrize(("t", "c"), [(4, 0), (0, 2), (-1, 0)])
-def test_frames_beyond_the_end_are_no_frames(t, c):
+def test_indices_out_of_range_are_errors(t, c):
     with pytest.raises(IndexError, match="4 frames and 2 cameras"):
         make().image(t, c)
 
@@ -204,14 +204,17 @@ def spoil(index, value):
 @pytest.mark.parametrize(
     ("viewmats", "says"),
     [
-        (spoil((0, 0), 2.0), r"viewmat of camera 3 in frame 30: R is no rotation: \|R\^T R - I\| reaches 3"),
-        (spoil((0, 0), -1.0), "camera 3 in frame 30: R is a mirror image"),
-        (spoil((0, 0), np.nan), "camera 3 in frame 30: it holds NaN"),
-        (spoil((1, 3), np.inf), "camera 3 in frame 30: it holds NaN or infinity"),
+        (
+            spoil((0, 0), 2.0),
+            r"viewmat of camera 3 in frame 30: R is not a rotation: \|R\^T R - I\| reaches 3",
+        ),
+        (spoil((0, 0), -1.0), "camera 3 in frame 30: R is a reflection"),
+        (spoil((0, 0), np.nan), "camera 3 in frame 30: it contains NaN"),
+        (spoil((1, 3), np.inf), "camera 3 in frame 30: it contains NaN or infinity"),
         (spoil((3, 3), 0.0), "camera 3 in frame 30: its last row is"),
     ],
 )
-def test_a_pose_that_is_no_rigid_motion_is_named(viewmats, says):
+def test_a_pose_that_is_not_a_rigid_motion_is_named(viewmats, says):
     with pytest.raises(ValueError, match=says) as caught:
         make(viewmats=viewmats)
     assert "world-to-camera" in str(caught.value)
@@ -275,7 +278,7 @@ def test_a_point_model_checks_its_shapes():
         ({"load_mask": lambda t, c: np.zeros((5, 6))}, "mask", "integer labels"),
     ],
 )
-def test_what_a_loader_gives_is_checked(changes, kind, says):
+def test_the_result_of_a_loader_is_checked(changes, kind, says):
     with pytest.raises(DataError, match=f"toy, {kind} of camera 7 in frame 20: .*{says}"):
         getattr(make(**changes), kind)(1, 0)
 
@@ -326,13 +329,13 @@ def test_depth_in_the_wrong_unit_is_an_error(scale):
 
 
 @pytest.mark.parametrize("median", [0.03, 1.0, 40.0])
-def test_usual_depth_passes_without_a_word(median):
+def test_usual_depth_passes_without_a_warning(median):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_depth(np.full((3, 4), median), "depth")
 
 
-def test_what_is_too_near_to_be_drawn_is_known_to_all_that_is_made_of_a_sequence():
+def test_the_near_distance_is_kept_by_everything_derived_from_a_sequence():
     sequence = make(near=0.4)
     assert sequence.select(cameras=[3]).scaled(0.5).camera(0, 0).near == 0.4
     assert sequence.frame(1).cameras.near == 0.4

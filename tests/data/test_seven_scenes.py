@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError, DataWarning, open_sequence, read_seven_scenes
-from tests.data.looks import depths_from_another_frame
+from tests.data.scene_helpers import depths_from_another_frame
 
 WALL_M, BOX_M = 2.0, 1.0
 COLOR_FOCAL, DEPTH_FOCAL, BASELINE_M = 525.0, 585.0, 0.025
@@ -22,7 +22,7 @@ def pose_at(x):
 
 
 def write_frame(root, number, x=0.0, ending="png"):
-    """A blue wall and a red box before it, as the camera of each picture sees them."""
+    """A blue wall and a red box in front of it, as seen by the colour and the depth camera."""
     root.mkdir(exist_ok=True)
     v, u = np.mgrid[:480, :640] + 0.5
 
@@ -54,7 +54,7 @@ def test_frames_times_and_poses(folder):
     assert sequence.frame_ids == (0, 1, 2, 5)
     np.testing.assert_allclose(sequence.times, np.array([0, 1, 2, 5]) / 30)
     assert (sequence.num_cameras, sequence.width, sequence.height) == (1, 640, 480)
-    assert sequence.image(2, 0)[0, 0, 2] > 200  # blue, from the one that is a JPEG
+    assert sequence.image(2, 0)[0, 0, 2] > 200  # blue, from the JPEG
     assert not sequence.has_masks
     assert sequence.name == f"{folder.parent.name}_seq-01"
 
@@ -69,7 +69,7 @@ def test_the_depth_camera_as_the_files_have_it(folder):
 
 
 def test_depth_is_carried_over_to_the_colour_camera(folder):
-    """What is near in depth is the red box in colour, but for the strip that the depth camera did not see."""
+    """Near depth coincides with the red box, except for the strip that is hidden from the depth camera."""
     sequence = read_seven_scenes(folder)
     np.testing.assert_allclose(sequence.Ks[0, 0], [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
     np.testing.assert_allclose(sequence.viewmats[0, 0] @ [0, 0, 2, 1], [-BASELINE_M, 0, 2, 1])
@@ -102,14 +102,14 @@ def test_a_point_seen_by_the_depth_camera_has_the_same_place_in_the_world(folder
 @pytest.mark.parametrize("number", ["nan", "-inf", "-1.#IND0000e+000", "1.#QNAN00e+000"])
 def test_frames_without_a_pose_are_counted_and_left_out(folder, number):
     (folder / "frame-000001.pose.txt").write_text("\n".join([" ".join([number] * 4)] * 4))
-    with pytest.warns(DataWarning, match="1 of 4 frames are left out, 1 without a finite pose"):
+    with pytest.warns(DataWarning, match="1 of 4 frames are left out: 1 without a finite pose"):
         assert read_seven_scenes(folder).frame_ids == (0, 2, 5)
 
 
 def test_frames_without_an_image_are_counted_and_left_out(folder):
     (folder / "frame-000000.depth.png").unlink()
     (folder / "frame-000005.color.png").unlink()
-    with pytest.warns(DataWarning, match="2 of 4 frames are left out, 2 without an image"):
+    with pytest.warns(DataWarning, match="2 of 4 frames are left out: 2 without an image"):
         sequence = read_seven_scenes(folder)
     assert sequence.frame_ids == (1, 2)
     for file in folder.glob("*.depth.png"):
@@ -120,7 +120,9 @@ def test_frames_without_an_image_are_counted_and_left_out(folder):
 
 def test_a_scene_of_several_sequences(folder):
     write_frame(folder.parent / "seq-02", 0)
-    with pytest.raises(DataError, match=r"found the sequences seq-01, seq-02. Give one of them, as in .*01"):
+    with pytest.raises(
+        DataError, match=r"found the sequences seq-01, seq-02. Give one of them, such as .*01"
+    ):
         open_sequence(folder.parent)
 
 
@@ -139,11 +141,11 @@ def test_a_pose_of_another_form(folder, text, says):
         read_seven_scenes(folder)
 
 
-def test_a_pose_that_is_no_rotation(folder):
+def test_a_pose_that_is_not_a_rotation(folder):
     pose = pose_at(0)
     pose[0, 0] = 1.5
     write_pose(folder / "frame-000005.pose.txt", pose)
-    with pytest.raises(ValueError, match=r"frame-000005.pose.txt: R is no rotation"):
+    with pytest.raises(ValueError, match=r"frame-000005.pose.txt: R is not a rotation"):
         read_seven_scenes(folder)
 
 
@@ -171,14 +173,14 @@ def test_the_kitchen(shared_data):
 
 
 def test_depth_of_the_kitchen_lies_on_that_of_another_frame(shared_data):
-    """Points of one frame, seen from where the camera stood a second later, lie on the depth there."""
+    """Points of one frame, projected into a later one, lie on its depth."""
     sequence = read_seven_scenes(shared_data / "seven_scenes_kitchen")
     measured, expected = depths_from_another_frame(sequence, 0, 10)
     assert np.median(np.abs(measured - expected)[measured > 0]) < 0.015
 
 
 def test_colour_of_the_kitchen_is_registered(shared_data):
-    """Edges of depth lie on edges of colour; without registration no more than anywhere else."""
+    """Depth edges coincide with colour edges; without registration no more than by chance."""
 
     def agreement(sequence):
         found = []

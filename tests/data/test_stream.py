@@ -1,4 +1,4 @@
-"""Frames that come when they come: nothing is waited for twice, and everything is counted."""
+"""Live streams of frames: the newest frame is delivered, and all others are counted."""
 
 import itertools
 import threading
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gsjax.data import DataError
-from gsjax.data.opencv_cameras import described, open_camera, snapshots
-from gsjax.data.stream import Newest, Snapshot, StreamStalled, back_and_forth, replay
+from gsjax.data.opencv_cameras import calibrated_camera, open_camera, snapshots
+from gsjax.data.stream import NewestSnapshots, Snapshot, StreamStalled, back_and_forth, replay
 from gsjax.geometry.cameras import Camera
 from gsjax.scene.frame import Frame
 
@@ -22,7 +22,7 @@ def snapshot(stamp: float, skew: float = 0.0) -> Snapshot:
     return Snapshot(FRAME, stamp, skew)
 
 
-def test_a_source_that_keeps_the_pace_loses_nothing():
+def test_a_consumer_that_keeps_up_loses_nothing():
     taken = threading.Semaphore(0)
 
     def source():
@@ -30,7 +30,7 @@ def test_a_source_that_keeps_the_pace_loses_nothing():
             yield snapshot(stamp)
             taken.acquire()
 
-    newest, stamps = Newest(source()), []
+    newest, stamps = NewestSnapshots(source()), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
         taken.release()
@@ -38,7 +38,7 @@ def test_a_source_that_keeps_the_pace_loses_nothing():
     assert (newest.counts.offered, newest.counts.used, newest.counts.dropped) == (5, 5, 0)
 
 
-def test_what_comes_while_nobody_takes_is_dropped_but_for_the_newest():
+def test_a_slow_consumer_gets_only_the_newest():
     begun, rest = threading.Event(), threading.Event()
 
     def source():
@@ -47,17 +47,17 @@ def test_what_comes_while_nobody_takes_is_dropped_but_for_the_newest():
         yield from map(snapshot, range(1, 9))
         rest.set()
 
-    newest, stamps = Newest(source()), []
+    newest, stamps = NewestSnapshots(source()), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
-        if arrival.snapshot.stamp == 0:  # an update that takes as long as eight frames
+        if arrival.snapshot.stamp == 0:  # processing that takes as long as eight frames
             begun.set()
             rest.wait()
     assert stamps == [0, 8]
     assert (newest.counts.offered, newest.counts.used, newest.counts.dropped) == (9, 2, 7)
 
 
-def test_what_is_out_of_order_or_out_of_sync_is_left_out_and_counted():
+def test_snapshots_out_of_order_or_out_of_sync_are_dropped_and_counted():
     taken = threading.Semaphore(0)
 
     def source():
@@ -66,7 +66,7 @@ def test_what_is_out_of_order_or_out_of_sync_is_left_out_and_counted():
             if shot.stamp in (1, 3):
                 taken.acquire(timeout=1)
 
-    newest, stamps = Newest(source(), max_skew=0.02), []
+    newest, stamps = NewestSnapshots(source(), max_skew=0.02), []
     for arrival in newest:
         stamps.append(arrival.snapshot.stamp)
         taken.release(2)
@@ -75,25 +75,25 @@ def test_what_is_out_of_order_or_out_of_sync_is_left_out_and_counted():
     assert (counts.offered, counts.used, counts.out_of_order, counts.out_of_sync) == (5, 2, 2, 1)
 
 
-def test_a_stream_that_stalls_says_so_and_what_came_before_is_kept():
-    never, came = threading.Event(), []
+def test_a_stalled_stream_raises_an_error():
+    never, received = threading.Event(), []
 
     def source():
         yield snapshot(0)
         never.wait(5)
 
     with pytest.raises(StreamStalled, match=r"nothing for 0.1 s after 1 frames"):
-        came.extend(arrival.snapshot.stamp for arrival in Newest(source(), patience=0.1))
+        received.extend(arrival.snapshot.stamp for arrival in NewestSnapshots(source(), patience=0.1))
     never.set()
 
 
-def test_what_a_source_raises_is_raised_where_it_is_read():
+def test_an_exception_of_the_source_is_raised_in_the_consumer():
     def source():
         yield snapshot(0)
         raise DataError("camera 0", "a picture", "none", "Check its connection.")
 
     with pytest.raises(DataError, match="camera 0"):
-        list(Newest(source()))
+        list(NewestSnapshots(source()))
 
 
 def test_a_recording_goes_back_and_forth_without_jumps():
@@ -102,7 +102,7 @@ def test_a_recording_goes_back_and_forth_without_jumps():
     assert list(itertools.islice(back_and_forth(2), 5)) == [0, 1, 0, 1, 0]
 
 
-def test_a_replay_comes_at_its_rate_whatever_each_frame_takes():
+def test_a_replay_keeps_its_rate_whatever_the_processing_time():
     clock, naps = [10.0], []
 
     def sleep(seconds):
@@ -113,13 +113,13 @@ def test_a_replay_comes_at_its_rate_whatever_each_frame_takes():
     frames = [eqx.tree_at(lambda f: f.images, FRAME, FRAME.images + i) for i in range(3)]
     for shot in replay(frames, 10.0, 0.5, now=lambda: clock[0], sleep=sleep):
         stamps.append((int(shot.frame.images[0, 0, 0, 0]), round(shot.stamp, 3), round(clock[0] - 10, 3)))
-        clock[0] += 0.04  # what is done with it
+        clock[0] += 0.04  # processing time
     assert stamps == [(0, 0.1, 0.1), (1, 0.2, 0.2), (2, 0.3, 0.3), (1, 0.4, 0.4), (0, 0.5, 0.5)]
     np.testing.assert_allclose(naps, [0.1, 0.06, 0.06, 0.06, 0.06], atol=1e-9)
 
 
 class FakeCapture:
-    """A camera of `frames` pictures as OpenCV's OpenNI 2 backend gives them."""
+    """A camera that returns `frames` pictures like OpenCV's OpenNI 2 backend."""
 
     def __init__(self, frames=2, focal=300.0, opened=True, depth=True, size=(4, 6)):
         self.left, self.focal, self.opened, self.depth, self.size = frames, focal, opened, depth, size
@@ -142,7 +142,7 @@ class FakeCapture:
 
 
 def test_opencv_gives_metres_and_red_green_blue():
-    cameras = [described(i, FakeCapture(), np.eye(4)) for i in range(2)]
+    cameras = [calibrated_camera(i, FakeCapture(), np.eye(4)) for i in range(2)]
     np.testing.assert_allclose(cameras[0].K, [[300, 0, 3], [0, 300, 2], [0, 0, 1]])
     shots = list(snapshots(cameras))
     assert len(shots) == 2
@@ -155,17 +155,17 @@ def test_opencv_gives_metres_and_red_green_blue():
 @pytest.mark.parametrize(
     ("cameras", "says"),
     [
-        ([FakeCapture(opened=False)], "none that opens"),
+        ([FakeCapture(opened=False)], "none that can be opened"),
         ([FakeCapture(focal=0.0)], "a camera without depth"),
         ([FakeCapture(depth=False)], "a frame without depth"),
         ([FakeCapture(), FakeCapture(size=(3, 6))], r"\(3, 6\), \(4, 6\)"),
     ],
 )
-def test_a_camera_that_does_not_serve_is_told_apart(cameras, says):
+def test_unsuitable_cameras_are_refused_with_the_reason(cameras, says):
     with pytest.raises(DataError, match=says):
-        list(snapshots([described(i, camera, np.eye(4)) for i, camera in enumerate(cameras)]))
+        list(snapshots([calibrated_camera(i, camera, np.eye(4)) for i, camera in enumerate(cameras)]))
 
 
-def test_no_camera_is_an_error_that_says_what_to_do():
+def test_a_missing_camera_is_an_error_with_advice():
     with pytest.raises(DataError, match="replay a folder"):
         open_camera(97)

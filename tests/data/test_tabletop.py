@@ -1,4 +1,4 @@
-"""The built-in scene of things on a table against its own poses."""
+"""The built-in tabletop scene: images, depth, labels and flow agree with its poses."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from gsjax.data.simulated import Light, Primitive, Scene, simulated_sequence, tabletop
 from gsjax.data.simulated.motion import rigid
 from gsjax.geometry.cameras import intrinsics, look_at
-from tests.data.looks import seconds_a_frame
+from tests.data.scene_helpers import seconds_per_frame
 from tests.data.test_raycaster import GREY, HEIGHT, SOLIDS, WIDTH, outside, single
 
 
@@ -24,7 +24,7 @@ def world_points(sequence, t, c, mask):
     return view[:3, :3].T @ (local - view[:3, 3:]), x, y
 
 
-def test_it_is_what_its_description_says(scene):
+def test_it_is_as_documented(scene):
     assert scene.truth.names == ("carton", "can", "ball", "block")
     assert scene.truth.label_ids.tolist() == [2, 3, 4, 5]
     assert scene.truth.robot == 1
@@ -52,7 +52,7 @@ def test_objects_move_as_far_as_promised(seed, option):
 
 @pytest.mark.parametrize("name", ["carton", "can", "ball", "block"])
 def test_depth_labels_and_poses_agree(scene, name):
-    """Pixels of an object, taken back into its own frame, lie on its surface in every frame."""
+    """Pixels of an object, mapped back to its own frame, lie on its surface in every frame."""
     k = scene.truth.names.index(name)
     solids = {
         "carton": [Primitive("box", (0.045, 0.028, 0.065), GREY)],
@@ -70,7 +70,7 @@ def test_depth_labels_and_poses_agree(scene, name):
 
 
 def flow_by_poses(sequence, t, c, k):
-    """Pixels that object k moves from frame t to the next, from its depth and its poses."""
+    """Displacement in pixels of object k from frame t to the next, from its depth and poses."""
     points, x, y = world_points(sequence, t, c, sequence.mask(t, c) == sequence.truth.label_ids[k])
     motion = sequence.truth.poses[t + 1, k] @ np.linalg.inv(sequence.truth.poses[t, k])
     view = sequence.viewmats[t + 1, c] @ motion
@@ -98,7 +98,7 @@ def test_flow_of_a_selection_spans_the_frames_left_out(scene):
 
 
 def test_flow_warps_one_image_onto_the_next(scene):
-    """Brightness is kept, as far as shadows do not move."""
+    """Brightness is preserved, except where shadows move."""
     first, second = scene.image(4, 1).astype(float).mean(-1), scene.image(5, 1).astype(float).mean(-1)
     can = scene.mask(4, 1) == 3
     y, x = np.nonzero(can)
@@ -109,7 +109,7 @@ def test_flow_warps_one_image_onto_the_next(scene):
     assert np.mean(warped) < 0.6 * np.mean(unmoved)
 
 
-def test_where_nothing_is_seen():
+def test_pixels_that_see_nothing():
     sequence = single(SOLIDS[1], rigid(None, [0.0, 0.0, 3.0]))
     scene = Scene(
         primitives=(SOLIDS[1],),
@@ -182,9 +182,9 @@ def test_counts_must_be_positive(name):
 
 def test_a_frame_is_rendered_fast():
     sequence = tabletop(frames=4, width=320, height=240)
-    sequence.image(0, 0)  # the noise is made once
-    # It is 0.1 s without the checks of annotations.
-    assert seconds_a_frame(sequence, ((1, 0), (2, 0), (3, 0))) < 0.6
+    sequence.image(0, 0)  # generates the noise once
+    # It takes 0.1 s without annotation checks.
+    assert seconds_per_frame(sequence, ((1, 0), (2, 0), (3, 0))) < 0.6
 
 
 def test_cameras_look_at_the_table(scene):

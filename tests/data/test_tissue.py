@@ -1,4 +1,4 @@
-"""A sheet that bumps lift and shift: the laws of its map, rays that meet it, and the built-in tissue."""
+"""A sheet deformed by bumps: properties of its map, ray intersections, and the built-in tissue scene."""
 
 import warnings
 
@@ -12,14 +12,14 @@ from scipy.ndimage import binary_dilation
 from gsjax.data import open_sequence
 from gsjax.data.simulated import tissue
 from gsjax.data.simulated.sheet import Sheet
-from tests.data.looks import between_pixels, looked_at, seconds_a_frame
+from tests.data.scene_helpers import interpolate, project_points, seconds_per_frame
 
 seeds = st.integers(0, 10_000)
 TOOL = 1
 
 
 def some_sheet(seed):
-    """Gentle bumps, and random numbers to go on with."""
+    """A random sheet with gentle bumps, and the random generator."""
     rng = np.random.default_rng(seed)
     places, widths = rng.uniform(-0.05, 0.05, (3, 2)), rng.uniform(0.02, 0.04, (3, 1))
     shifts = rng.uniform(-1, 1, (3, 3)) * widths * [0.25, 0.25, 0.3]
@@ -51,7 +51,7 @@ def test_there_and_back(seed):
 
 
 @given(seeds)
-def test_normals_are_perpendicular_to_what_lies_in_the_surface(seed):
+def test_normals_are_perpendicular_to_the_surface(seed):
     sheet, rng = some_sheet(seed)
     rest = flat_points(rng)
     normals = sheet.normals(rest)
@@ -80,7 +80,7 @@ def test_rays_that_rise_meet_nothing():
 
 
 @pytest.mark.parametrize("bumps", [(0.0,) * 6, (0.0, 0.0, -1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)])
-def test_bumps_that_are_none(bumps):
+def test_invalid_bumps_are_refused(bumps):
     with pytest.raises(ValueError, match="bumps must be x, y, a width above 0 and a shift each, got"):
         Sheet(bumps)
 
@@ -94,14 +94,14 @@ def scene():
 
 
 def only_tissue_around(sequence, t, c, pixels):
-    """Whether a place is in the picture and no pixel within two of it shows the tool."""
+    """Whether a position is in the image and no pixel within two of it shows the tool."""
     inside = ((pixels > 2) & (pixels < [sequence.width - 2, sequence.height - 2])).all(1)
     tool = binary_dilation(sequence.mask(t, c) == TOOL, np.ones((5, 5)))
-    return inside & (between_pixels(tool, pixels) == 0)
+    return inside & (interpolate(tool, pixels) == 0)
 
 
 def seen_pixels(sequence, t, c):
-    """Rows, columns and world points of what a camera sees of the tissue."""
+    """Rows, columns and world points of the tissue that a camera sees."""
     y, x = np.nonzero(sequence.mask(t, c) == 0)
     pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
     local = np.linalg.inv(sequence.Ks[t, c]) @ pixels * sequence.depth(t, c)[y, x]
@@ -109,7 +109,7 @@ def seen_pixels(sequence, t, c):
     return y, x, (view[:3, :3].T @ (local - view[:3, 3:])).T
 
 
-def test_it_is_what_its_description_says(scene):
+def test_it_is_as_documented(scene):
     assert (scene.num_frames, scene.camera_ids) == (40, (0, 1))
     np.testing.assert_allclose(np.diff(scene.times), 1 / 15)
     assert (scene.truth.names, scene.truth.label_ids.tolist()) == (("tool",), [TOOL])
@@ -128,48 +128,48 @@ def test_it_is_what_its_description_says(scene):
 
 @pytest.mark.parametrize(("t", "c"), [(0, 0), (14, 1), (22, 0)])
 def test_depth_agrees_with_tracks(scene, t, c):
-    pixels, depths = looked_at(scene, t, c, scene.truth.tracks[t])
+    pixels, depths = project_points(scene, t, c, scene.truth.tracks[t])
     shown = only_tissue_around(scene, t, c, pixels)
     assert shown.sum() > 250
-    np.testing.assert_allclose(between_pixels(scene.depth(t, c), pixels)[shown], depths[shown], atol=1e-4)
+    np.testing.assert_allclose(interpolate(scene.depth(t, c), pixels)[shown], depths[shown], atol=1e-4)
 
 
 def test_flow_agrees_with_tracks(scene):
     t, c = 8, 1
-    (now, _), (then, _) = (looked_at(scene, u, c, scene.truth.tracks[u]) for u in (t, t + 1))
+    (now, _), (then, _) = (project_points(scene, u, c, scene.truth.tracks[u]) for u in (t, t + 1))
     shown = only_tissue_around(scene, t, c, now)
-    flow = np.stack([between_pixels(scene.flow(t, c)[..., i], now) for i in range(2)], 1)
+    flow = np.stack([interpolate(scene.flow(t, c)[..., i], now) for i in range(2)], 1)
     moved = then - now
     assert np.linalg.norm(moved[shown], axis=1).max() > 1
     np.testing.assert_allclose(flow[shown], moved[shown], atol=0.05)
 
 
 def test_the_pattern_sticks_to_the_tissue(scene):
-    """Brightness moves with the flow: far better explained by it than by tissue that stays."""
+    """Brightness moves with the flow, which explains it far better than no motion."""
     t = 8
     first, second = (scene.image(u, 0).astype(float).mean(-1) for u in (t, t + 1))
     places = scene.flow(t, 0) + np.stack(np.meshgrid(np.arange(160), np.arange(128)), -1) + 0.5
     shown = (scene.mask(t, 0) == 0) & (binary_dilation(scene.mask(t + 1, 0) == TOOL, iterations=4) == 0)
     moves = shown & (np.linalg.norm(scene.flow(t, 0), axis=-1) > 0.7)
     assert moves.sum() > 500
-    explained = np.abs(between_pixels(second, places[moves]) - first[moves]).mean()
+    explained = np.abs(interpolate(second, places[moves]) - first[moves]).mean()
     assert explained < 0.4 * np.abs(second[moves] - first[moves]).mean()
 
 
 def test_both_eyes_see_the_same_tissue(scene):
-    """What the left eye sees has the same colour where its depth puts it before the right one."""
+    """Points seen by the left eye have the same colour where their depth places them in the right one."""
     t = 14
     y, x, points = seen_pixels(scene, t, 0)
-    pixels, depths = looked_at(scene, t, 1, points)
+    pixels, depths = project_points(scene, t, 1, points)
     both = only_tissue_around(scene, t, 1, pixels)
-    np.testing.assert_allclose(between_pixels(scene.depth(t, 1), pixels)[both], depths[both], atol=2e-4)
+    np.testing.assert_allclose(interpolate(scene.depth(t, 1), pixels)[both], depths[both], atol=2e-4)
     left, right = (scene.image(t, c).astype(float).mean(-1) for c in (0, 1))
-    explained = np.abs(between_pixels(right, pixels[both]) - left[y, x][both]).mean()
+    explained = np.abs(interpolate(right, pixels[both]) - left[y, x][both]).mean()
     assert explained < 0.3 * np.abs(right[y, x][both] - left[y, x][both]).mean()
 
 
 def test_it_has_fine_detail(scene):
-    """Its finest lines are a pixel or two wide: blurring by two pixels loses much of the contrast."""
+    """Its finest lines are a pixel or two wide: a blur of two pixels removes much of the contrast."""
     image = scene.image(0, 0).astype(np.float64)
     fine = image - cv2.GaussianBlur(image, (0, 0), 2)
     assert fine[scene.mask(0, 0) == 0].std() > 5
@@ -185,9 +185,9 @@ def test_tissue_moves_as_far_as_promised_and_faces_the_endoscope(seed):
     assert np.linalg.norm(np.diff(tracks, axis=0), axis=-1).max() < 0.004  # metres a frame
     tip = sequence.truth.poses[:, 0, :3, 3]
     near = np.linalg.norm(tracks - tip[:, None], axis=-1).min(1)
-    assert near[3:28].max() < 0.004  # it holds the tissue, between points 4 mm apart
+    assert near[3:28].max() < 0.004  # it holds the tissue, whose points are 4 mm apart
     assert near[39] > 0.015
-    for t in (0, 14):  # so rays meet it once
+    for t in (0, 14):  # so that rays meet it only once
         y, x, points = seen_pixels(sequence, t, 0)
         grid = np.full((32, 40, 3), np.nan)
         grid[y, x] = points
@@ -226,5 +226,5 @@ def test_counts_must_be_positive(name):
 
 
 def test_a_frame_is_drawn_fast(scene):
-    # It is 0.15 s without the checks of annotations.
-    assert seconds_a_frame(scene, ((14, 0), (15, 0), (16, 0))) < 1
+    # It takes 0.15 s without annotation checks.
+    assert seconds_per_frame(scene, ((14, 0), (15, 0), (16, 0))) < 1

@@ -5,7 +5,7 @@ import pytest
 from gsjax.data.endovis import INSTRUMENTS, PARTS
 from gsjax.data.tool_masks import is_tool
 
-# Of EndoVis 2018's labels.json.
+# From EndoVis 2018's labels.json.
 SCENE = {
     0: "background-tissue",
     1: "instrument-shaft",
@@ -29,5 +29,5 @@ def test_by_their_names():
 
 
 @pytest.mark.parametrize(("value", "tool"), [(-1, False), (0, False), (1, True), (7, True)])
-def test_what_has_no_name_is_a_tool_but_for_nothing(value, tool):
+def test_without_a_name_any_value_above_0_is_a_tool(value, tool):
     assert is_tool(value, {}) is tool

@@ -13,14 +13,14 @@ POINTS = np.array([[0.5, 0.25, 0.0], [-0.6, 0.3, 0.4], [0.2, -0.5, -0.5]])
 
 
 def pose(x=0.0, y=0.0, z=4.0):
-    """OpenGL: it looks along -z, with y up."""
+    """A pose in OpenGL axes: the camera looks along -z, with y up."""
     matrix = np.eye(4)
     matrix[:3, 3] = x, y, z
     return matrix
 
 
 def pixel(point, eye, width=WIDTH, height=HEIGHT, focal=FOCAL):
-    """By hand: what is right of the axis is right in the photograph, what is above it is above."""
+    """By hand: right of the axis is right in the photograph, above it is above."""
     right, up, back = point - eye
     return np.array([width / 2 + focal * right / -back, height / 2 - focal * up / -back])
 
@@ -91,7 +91,7 @@ def test_each_frame_may_have_its_own_camera_and_size(folder):
     check_dots(scene)
 
 
-def test_photographs_may_be_smaller_than_is_said(folder):
+def test_photographs_may_be_downscaled_copies(folder):
     folder.meta |= {key: 4 * folder.meta[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
     check_dots(folder.read())
     check_dots(folder.read().scaled(0.7), within=0.2)
@@ -156,14 +156,16 @@ def test_masks_depths_splits_and_points(folder):
         scene.mask(0)
 
 
-def test_photographs_that_no_list_of_a_split_names_are_left_out_as_in_nerfstudio(folder):
+def test_photographs_in_no_split_are_left_out_as_in_nerfstudio(folder):
     folder.meta["frames"] += [folder.add(f"images/{i}.png", (0.1 * i, 0, 4)) for i in (2, 3)]
     folder.meta |= {"train_filenames": ["images/1.png"], "test_filenames": ["./images/2.png"]}
-    with pytest.warns(DataWarning, match="of 4 listed photographs 2 that no list of train, val or test"):
+    with pytest.warns(
+        DataWarning, match="of 4 listed photographs, 2 in none of the train, val and test lists"
+    ):
         scene = folder.read()
     assert (scene.names, scene.splits) == (("images/1.png", "images/2.png"), ("train", "test"))
     folder.meta["train_filenames"] = [f"images/{i}.png" for i in range(4)]
-    assert folder.read().splits == ("train", "train", "test", "train")  # what is judged is not fitted
+    assert folder.read().splits == ("train", "train", "test", "train")  # held-out photographs are not fitted
     folder.meta |= {"train_filenames": [], "test_filenames": []}
     assert folder.read().splits is None
 
@@ -196,18 +198,18 @@ def test_listed_photographs_without_file_or_pose_are_counted(folder):
     missing = [folder.meta["frames"][0] | {"file_path": f"images/gone{i}.png"} for i in range(4)]
     lost = folder.meta["frames"][0] | {"transform_matrix": np.full((4, 4), np.nan).tolist()}
     folder.meta["frames"] += [*missing, lost]
-    said = r"of 7 listed photographs 4 that have no file \(images/gone0.png, .*, \.\.\.\) and 1 without a fin"
-    with pytest.warns(DataWarning, match=said):
+    files = r"of 7 listed photographs, 4 with no file \(images/gone0.png, .*, \.\.\.\)"
+    with pytest.warns(DataWarning, match=rf"{files} and 1 without a finite pose"):
         assert folder.read().names == ("images/0.png", "images/1.png")
     folder.meta["frames"] = [*missing, lost]
     with pytest.raises(
-        DataError, match=r"garden: expected a photograph with a pose, found of 5 listed 4 that"
+        DataError, match=r"garden: expected a photograph with a pose, found 5 listed, 4 with no file"
     ):
         folder.read()
 
 
 def test_exif_does_not_turn_a_photograph(folder):
-    """Phones store that it is on its side; the calibration is of the pixels as they are stored."""
+    """Phones store the orientation in EXIF data; the calibration is for the stored pixels."""
     turned = Image.fromarray(np.tile(np.arange(WIDTH, dtype=np.uint8)[None, :, None] * 2, (HEIGHT, 1, 3)))
     exif = Image.Exif()
     exif[274] = 6
@@ -232,19 +234,22 @@ def with_all(**changes):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (with_all(frames=[]), r"transforms.json: expected frames, a list of one or more, found none"),
-        (with_all(frames={"a": 1}), r"expected frames, a list"),
+        (with_all(frames=[]), r"transforms.json: expected frames, a non-empty list, found none"),
+        (with_all(frames={"a": 1}), r"expected frames, a non-empty list"),
         (with_all(frames=[3]), r"transforms.json, frame 0: expected file_path and transform_matrix, found 3"),
         (with_frame(file_path=None), r"frame 1: expected file_path"),
-        (with_frame(transform_matrix=None), r"frame 1: expected transform_matrix, 4 lines of 4 numbers"),
-        (with_frame(transform_matrix=[[1, 0], [0]]), r"4 lines of 4 numbers"),
-        (with_frame(transform_matrix="eye"), r"4 lines of 4 numbers"),
+        (with_frame(transform_matrix=None), r"frame 1: expected transform_matrix, 4 rows of 4 numbers"),
+        (with_frame(transform_matrix=[[1, 0], [0]]), r"4 rows of 4 numbers"),
+        (with_frame(transform_matrix="eye"), r"4 rows of 4 numbers"),
         (
             with_frame(transform_matrix=np.zeros((4, 4)).tolist()),
             r"transforms.json, frame 1 \(images/1.png\): its last row is \[0. 0. 0. 0.\]. It must be a",
         ),
         (with_frame(transform_matrix=(2 * np.eye(4)).tolist()), r"frame 1 \(images/1.png\): its last row"),
-        (with_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), r"1 \(images/1.png\): R is no rot"),
+        (
+            with_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
+            r"1 \(images/1.png\): R is not a rot",
+        ),
         (with_frame(fl_x=float("nan")), r"frame 1: expected fl_x, a number, found nan"),
         (with_frame(k1=float("inf")), r"frame 1: expected k1, a number, found inf"),
         (with_frame(cx="mid"), r"frame 1: expected cx, a number, found 'mid'"),
@@ -254,19 +259,19 @@ def with_all(**changes):
         (with_frame(fl_y=0), r"frame 1: expected focal lengths above 0, found 100 and 0"),
         (with_frame(fl_x=-1, k1=0.1), r"expected focal lengths above 0, found -1"),
         (with_frame(w=-96, h=-72), r"frame 1: expected a width and a height above 0, found -96x-72"),
-        (with_frame(w=72, h=96), r"frame 1: expected 72x96 .*found 96x72.*turned on its side"),
+        (with_frame(w=72, h=96), r"frame 1: expected 72x96 .*found 96x72.*rotated by 90 degrees"),
         (with_all(fl_x=None), r"frame 0: expected fl_x or camera_angle_x, found neither"),
         (
             with_all(camera_model="EQUIRECTANGULAR"),
             r"frame 0: .*OPENCV_FISHEYE, found EQUIRECTANGULAR. Undis",
         ),
-        (with_all(camera_model=["OPENCV"]), r"expected a camera_model of .*found \['OPENCV'\]"),
-        (with_all(k4=0.1), r"frame 0: expected a k4 of 0 but for a fisheye, found 0.1. Undistort"),
+        (with_all(camera_model=["OPENCV"]), r"expected camera_model to be one of .*found \['OPENCV'\]"),
+        (with_all(k4=0.1), r"frame 0: expected k4 to be 0 except for a fisheye, found 0.1. Undistort"),
         (with_all(train_filenames=3), r"transforms.json: expected train_filenames, a list of names, found 3"),
         (with_all(test_filenames=[["a"]]), r"expected test_filenames, a list of names"),
         (
             with_all(val_filenames=["images/0.png"], test_filenames=["images/1.png"]),
-            r"transforms.json: expected train_filenames beside other lists, found only val_filenames and te",
+            r"transforms.json: expected train_filenames besides other lists, found only val_filenames and te",
         ),
         (
             with_all(train_filenames=["images/0.png", "images/7.png"]),
@@ -276,7 +281,7 @@ def with_all(**changes):
         (with_all(ply_file_path=5), r"garden/5: expected a point cloud, found no such file"),
     ],
 )
-def test_what_is_wrong_with_a_file(folder, change, says):
+def test_faults_of_a_file(folder, change, says):
     change(folder.meta)
     with pytest.raises(ValueError, match=says):
         folder.read()
@@ -285,13 +290,13 @@ def test_what_is_wrong_with_a_file(folder, change, says):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("[]", r"expected frames, a list of one or more, found none"),
+        ("[]", r"expected frames, a non-empty list, found none"),
         ('{"frames": [', r"expected a JSON file, found bad JSON"),
         ("", r"expected a JSON file, found bad JSON"),
         (b"\xff\xfe\x80", r"expected a JSON file, found bad JSON"),
     ],
 )
-def test_files_that_are_none(folder, content, says):
+def test_invalid_files_are_refused(folder, content, says):
     folder.write()
     path = folder.root / "transforms.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -321,10 +326,10 @@ def test_photographs_that_are_cut_off_or_change(folder):
 
 
 def test_the_fox(shared_data):
-    with pytest.warns(DataWarning, match="of 67 listed photographs 17 that have no file"):
+    with pytest.warns(DataWarning, match="of 67 listed photographs, 17 with no file"):
         scene = open_photographs(shared_data / "fox")
     assert scene.num == 50
     assert scene.scaled(0.1).image(0).shape == (192, 108, 3)
     centers = np.linalg.inv(scene.viewmats)[:, :3, 3]
-    axes = scene.viewmats[:, 2, :3]  # cameras that stand around a thing look at one another's front
+    axes = scene.viewmats[:, 2, :3]  # cameras around an object face its centre
     assert (((centers.mean(0) + 5 * axes.mean(0) - centers) * axes).sum(-1) > 0).all()

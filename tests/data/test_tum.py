@@ -15,7 +15,7 @@ def save(path, image):
 
 
 class Folder:
-    """Colour at 30 Hz, depth 4 ms later, poses at 100 Hz of a camera that moves and turns."""
+    """Colour at 30 Hz, depth 4 ms later, and poses at 100 Hz of a camera that moves and rotates."""
 
     def __init__(self, root, size=(640, 480)):
         self.root, self.size = root, size
@@ -63,7 +63,7 @@ def test_the_layout(folder):
 
 
 def test_poses_are_interpolated_between_those_around_a_frame(folder):
-    """The camera is at 0.4 m/s and 1 rad/s; frame 1 lies a third of the way between two poses."""
+    """The camera moves at 0.4 m/s and 1 rad/s; frame 1 lies a third of the way between two poses."""
     sequence = folder.read()
     for t in range(FRAMES):
         seconds = t / RATE
@@ -102,7 +102,7 @@ def test_frames_without_depth_or_pose_are_counted_and_left_out(folder):
     folder.depths = {stamp: file for stamp, file in folder.depths.items() if file != "depth/1.png"}
     folder.poses = {stamp: pose for stamp, pose in folder.poses.items() if stamp < START + 0.135}
     with pytest.warns(
-        DataWarning, match=r"2 of 6 .*, 1 without depth \(.*, 1 without pose \(.* within 20 ms"
+        DataWarning, match=r"2 of 6 .*: 1 without depth \(.*, 1 without pose \(.* within 20 ms"
     ):
         sequence = folder.read()
     assert sequence.frame_ids == (0, 2, 3, 4)
@@ -121,12 +121,12 @@ def test_clocks_that_never_meet(folder):
 def test_files_that_are_listed_but_missing(folder):
     (folder.root / "rgb/0.png").unlink()
     (folder.root / "depth/4.png").unlink()
-    with pytest.warns(DataWarning) as said:
+    with pytest.warns(DataWarning) as caught:
         sequence = folder.read()
     assert sequence.frame_ids == (1, 2, 3, 5)
-    texts = [str(warning.message) for warning in said]
+    messages = [str(warning.message) for warning in caught]
     for name in ("rgb.txt", "depth.txt"):
-        assert any(f"{name}: 1 of 6 files do not exist" in text for text in texts)
+        assert any(f"{name}: 1 of 6 files do not exist" in message for message in messages)
     for file in folder.root.glob("rgb/*"):
         file.unlink()
     with pytest.raises(DataError, match=r"rgb.txt: expected files that exist, found none of 6, for example"):
@@ -160,7 +160,7 @@ def test_lines_of_another_form(folder, name, line, says):
         read_tum(folder.root)
 
 
-def test_quaternions_that_are_none(folder):
+def test_invalid_quaternions_are_refused(folder):
     folder.poses[START] = [0, 0, 0, 0, 0, 0, 0]
     with pytest.raises(DataError, match=r"groundtruth.txt: expected unit quaternions, found one of length 0"):
         folder.read()
@@ -181,14 +181,14 @@ def test_missing_and_empty_lists(folder, name):
     with pytest.raises(DataError, match=rf"{name}: expected lines 'stamp .*found none"):
         open_sequence(folder.root)
     (folder.root / name).write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(DataError, match=rf"{name}: .*found no text"):
+    with pytest.raises(DataError, match=rf"{name}: .*found binary data"):
         open_sequence(folder.root)
     (folder.root / name).unlink()
     with pytest.raises(DataError, match=rf"{name}: expected lines 'stamp .*found no such file"):
         open_sequence(folder.root)
 
 
-def test_a_folder_whose_name_tells_no_camera(tmp_path):
+def test_a_folder_whose_name_does_not_identify_the_camera(tmp_path):
     folder = Folder(tmp_path / "desk", size=(64, 48))
     with pytest.raises(DataError, match=r"freiburg1, freiburg2 or .*found 'desk'.*read_tum\(path, K="):
         folder.read()
@@ -206,7 +206,7 @@ def test_the_published_intrinsics_hold_for_one_size(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "focal"), [("freiburg1", 517.3), ("freiburg2", 520.9), ("fr1", 517.3)])
-def test_lenses_are_straightened_as_opencv_does(tmp_path, name, focal):
+def test_lenses_are_undistorted_as_by_opencv(tmp_path, name, focal):
     folder = Folder(tmp_path / f"rgbd_dataset_{name}_xyz")
     v, u = np.mgrid[:480, :640]
     smooth = np.stack([u / 3, v / 3, (u + v) / 5], -1).astype(np.uint8)
@@ -238,5 +238,5 @@ def test_beyond_the_photograph_is_black_and_without_depth(tmp_path):
     assert (depth[0] == 0).all()
     assert (image[0] == 0).all()
     assert (image[24, 32] == 100).all()
-    assert set(np.unique(image)) == {0, 100}  # nothing is mixed with what is not there
+    assert set(np.unique(image)) == {0, 100}  # nothing is blended with pixels outside
     np.testing.assert_array_equal(depth == 0, (image == 0).all(-1))

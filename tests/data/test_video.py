@@ -1,4 +1,4 @@
-"""What a video says of itself, and stills of it."""
+"""Metadata of a video, and stills from it."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_files_that_are_no_video(tmp_path, content):
     path = tmp_path / "a.mp4"
     path.write_bytes(content)
     for call in (describe_video, lambda path: write_stills(path, tmp_path / "stills", 3)):
-        with pytest.raises(DataError, match=r"a.mp4: expected a video, found something that does not open"):
+        with pytest.raises(DataError, match=r"a.mp4: expected a video, found a file that does not open"):
             call(path)
     path.unlink()
     with pytest.raises(DataError, match=r"a.mp4: expected a video, found no such file"):
@@ -39,7 +39,7 @@ def test_files_that_are_no_video(tmp_path, content):
 
 
 def test_a_video_that_is_cut_off(tmp_path):
-    """The index of an mp4 that is made for the web stands in front: it still says how long it was."""
+    """The index of a web-optimised mp4 is at its start, so its original length is still known."""
     path = write(tmp_path / "a.mp4", [NOISE, 255 - NOISE] * 10)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
@@ -48,9 +48,9 @@ def test_a_video_that_is_cut_off(tmp_path):
     assert 1 <= len(names) < 20
 
 
-def test_the_sharpest_frame_of_each_stretch(tmp_path):
+def test_the_sharpest_frame_of_each_segment(tmp_path):
     blurred = np.full_like(SMOOTH, SMOOTH.mean())
-    frames = [SMOOTH if i in (2, 3, 9) else blurred for i in range(12)]  # none in the second stretch of four
+    frames = [SMOOTH if i in (2, 3, 9) else blurred for i in range(12)]  # none in the second segment of four
     frames[2] = ((SMOOTH.astype(int) + blurred) // 2).astype(np.uint8)
     path = write(tmp_path / "a.mp4", frames)
     names = write_stills(path, tmp_path / "stills", 3)

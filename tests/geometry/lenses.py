@@ -1,4 +1,4 @@
-"""What tests of lens distortion share: lenses, what OpenCV makes of them, and a check of derivatives."""
+"""Shared by the tests of lens distortion: lenses, OpenCV's results for them, and a check of derivatives."""
 
 import cv2
 import jax
@@ -53,7 +53,7 @@ def cv_undistorted(points, coeffs, model):
 
 
 def for_cv(matrix):
-    """The same K where pixel centres are counted at integers."""
+    """The same K in OpenCV's convention, with pixel centres at integers."""
     matrix = np.array(matrix, np.float64)
     matrix[:2, 2] -= 0.5
     return matrix

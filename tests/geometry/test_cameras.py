@@ -1,14 +1,17 @@
 """Cameras: projection and back, conventions of axes and pixels."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import (
     Camera,
     camera_centers,
     intrinsics,
     look_at,
+    perturbed,
     pixel_grid,
     pixels_of,
     project,
@@ -68,6 +71,35 @@ def test_look_at_sees_its_target_in_the_middle_with_up_above():
     above = viewmat[:3, :3] @ (TARGET + np.array([0, 0, 0.1])) + viewmat[:3, 3]
     assert above[1] < 0  # +y is down
     np.testing.assert_allclose(camera_centers(jnp.asarray(viewmat)), EYE, atol=1e-6)
+
+
+@pytest.mark.usefixtures("x64")
+def test_perturbed_cameras_are_rotated_about_their_own_centres_and_shifted():
+    viewmats = jnp.stack([jnp.asarray(look_at(EYE, TARGET)), jnp.asarray(look_at(-EYE, TARGET))])
+    twist = jnp.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2])
+    found = perturbed(viewmats, twist, 2.0)
+    shifts = camera_centers(found) - camera_centers(viewmats)
+    np.testing.assert_allclose(shifts, [2.0 * twist[3:]] * 2, atol=1e-12)
+    turn = Rotation.from_rotvec(np.array(twist[:3])).as_matrix()
+    np.testing.assert_allclose(found[:, :3, :3], viewmats[:, :3, :3] @ turn.T, atol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_derivatives_of_perturbed_cameras_are_those_of_finite_differences():
+    viewmat, K = jnp.asarray(look_at(EYE, TARGET))[None], jnp.asarray(SKEWED, jnp.float64)
+    random = np.random.default_rng(1)
+    points = jnp.asarray(random.uniform(-0.02, 0.02, (20, 3)))
+    weights = jnp.asarray(random.normal(size=(20, 3)))
+
+    def of(twist):
+        pixels, depths = project(points, perturbed(viewmat, twist, 0.03)[0], K)
+        return jnp.sum(weights * jnp.concatenate([pixels, depths[:, None]], axis=1))
+
+    for twist in (jnp.zeros(6), jnp.asarray(random.normal(size=6) * 0.1)):
+        slopes = jax.grad(of)(twist)
+        steps = 1e-6 * np.eye(6)
+        measured = [(of(twist + step) - of(twist - step)) / 2e-6 for step in steps]
+        np.testing.assert_allclose(slopes, np.array(measured), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("eye", "target"), [(EYE, EYE), (np.zeros(3), np.array([0.0, 0.0, 2.0]))])

@@ -1,4 +1,5 @@
-"""Images through lenses: maps and pictures are OpenCV's, and a lens is found through the rasterizer."""
+"""Distortion of images: maps and images agree with OpenCV, and a lens is calibrated through the
+rasterizer."""
 
 from functools import partial
 
@@ -75,7 +76,7 @@ def test_sampling_is_bilinear_as_in_scipy_and_opencv():
     want = np.stack([scipy.ndimage.map_coordinates(image[..., c], at, order=1) for c in range(3)], -1)
     np.testing.assert_allclose(values, want, atol=1e-12)
     np.testing.assert_allclose(values[0, 2], image[7, 10], atol=1e-15)
-    # OpenCV rounds positions to 1/32 pixel, so it is given such.
+    # OpenCV rounds positions to 1/32 pixel, so these are rounded beforehand.
     coarse = np.round(pixels * 32) / 32
     x, y = np.float32(np.moveaxis(coarse - 0.5, -1, 0))
     theirs = cv2.remap(np.float32(image), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -93,7 +94,7 @@ def test_sampling_says_what_lies_outside_or_has_no_value():
     expected[:, 5] = expected[1, 1] = expected[1, 2] = False
     np.testing.assert_array_equal(touched, expected)
     centred = sample(image, pixel_grid(6, 4))
-    assert centred.valid.sum() == 23  # of weight 0 no neighbour spoils anything
+    assert centred.valid.sum() == 23  # a neighbour of weight 0 spoils nothing
     gradient = jax.grad(lambda i: sample(i, pixel_grid(6, 4) + 0.25).image.sum())(image)
     assert np.isfinite(gradient).all()
 
@@ -113,7 +114,7 @@ def test_photographs_are_undistorted_as_opencv_does(lens):
 
 
 def test_the_optical_axis_stays_where_it_is():
-    # The axis meets the centre of pixel (10, 20): counted from anywhere else, a strong lens would move it.
+    # The axis meets the centre of pixel (10, 20); with any other convention a strong lens would move it.
     centred = jnp.asarray(K, jnp.float32).at[:2, 2].set(jnp.array([20.5, 10.5]))
     image = jnp.asarray(picture(), jnp.float32)
     for warp in (distort_image, undistort_image):
@@ -137,7 +138,7 @@ def test_a_distorted_image_shows_what_opencv_projects(lens):
     model, coeffs = lens_of(lens)
     wide_K, width, height = with_margin(jnp.asarray(K), WIDTH, HEIGHT, 40)
 
-    def scene(points):  # colours by direction, so smooth that bilinear interpolation hardly errs
+    def scene(points):  # colours by direction, smooth enough for bilinear interpolation to be accurate
         return jnp.stack([jnp.sin(3 * points[..., 0]), jnp.cos(2 * points[..., 1]), points[..., 0]], -1)
 
     rays = (pixel_grid(width, height) - wide_K[:2, 2]) / jnp.diag(wide_K)[:2]
@@ -208,7 +209,7 @@ def test_a_gaussian_is_seen_where_opencv_projects_its_centre(lens):
     else:
         want = cv2.projectPoints(centre, cv2.Rodrigues(R)[0], t, K_cv, np.float64(coeffs))[0]
     plain, _ = project(jnp.asarray(centre, jnp.float32), VIEWMAT, camera)
-    assert np.linalg.norm(want.ravel() + 0.5 - plain) > 0.5  # the lens is seen
+    assert np.linalg.norm(want.ravel() + 0.5 - plain) > 0.5  # the lens has a visible effect
     np.testing.assert_allclose(
         found, want.ravel() + 0.5, atol=0.1
     )  # a blob's centre is not its middle's image

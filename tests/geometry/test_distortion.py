@@ -115,7 +115,7 @@ def test_beyond_the_fold_is_finite_not_valid_and_without_gradient(dtype):
 
 
 def test_a_point_that_comes_back_from_beyond_the_fold_is_not_mistaken():
-    # Its polynomial falls behind r = 1.05 and rises again behind 1.7: three points share one image.
+    # Its polynomial falls beyond r = 1.05 and rises again beyond 1.7: three points share one image.
     coeffs = jnp.array([-0.45, 0.0, 0.0, 0.0, 0.045])
     radii = jnp.linspace(0.05, 0.85, 17)
     bent = distort(radii[:, None] * jnp.array([1.0, 0.0]), coeffs)
@@ -188,9 +188,9 @@ def test_jit_and_vmap_are_the_loop():
 
 def test_what_is_not_a_lens_is_named():
     points = jnp.zeros((3, 2))
-    with pytest.raises(ValueError, match="model is one of opencv, opencv_fisheye"):
+    with pytest.raises(ValueError, match="model: expected one of opencv, opencv_fisheye, found 'thin_prism'"):
         distort(points, jnp.zeros(4), "thin_prism")
-    with pytest.raises(ValueError, match=r"\(4, 5, 8\) in number, but have shape \(6,\)"):
+    with pytest.raises(ValueError, match=r"coeffs: expected 4 or 5 or 8 .* opencv, found shape \(6,\)"):
         undistort(points, jnp.zeros(6))
-    with pytest.raises(ValueError, match=r"opencv_fisheye are \(4,\)"):
+    with pytest.raises(ValueError, match=r"expected 4 coefficients for opencv_fisheye, found shape \(5,\)"):
         distort_map(jnp.eye(3), jnp.zeros(5), 4, 4, model="opencv_fisheye")

@@ -1,4 +1,4 @@
-"""Warping along a flow, and where a flow can be believed."""
+"""Warping along a flow, and where a flow is reliable."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_whole_pixels_are_moved_without_loss(seed, x, y):
 
 @given(seeds)
 def test_between_pixels_a_slope_is_read_exactly(seed):
-    """Bilinear reading is exact for a picture that is linear, whatever the flow."""
+    """Bilinear interpolation is exact for a linear image, whatever the flow."""
     rng = np.random.default_rng(seed)
     rows, columns = np.indices((8, 10))
     flow = rng.uniform(-3, 3, (8, 10, 2))

@@ -1,4 +1,4 @@
-"""Joints as motions, and found again in motions."""
+"""Motions of joints, and joints recovered from motions."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ kinds = st.sampled_from(KINDS)
 
 
 def made_up(kind, seed, frames=12):
-    """A joint that opens by half a metre or a radian and a half, and points of a part beside it."""
+    """A joint that opens by about half a metre or 1.5 radians, and points of a part near it."""
     rng = np.random.default_rng(seed)
     axis = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0])
     values = np.cumsum(rng.uniform(0.0, 0.25, frames)) * (0.3 if kind == "prismatic" else 1.0)
@@ -22,7 +22,8 @@ def made_up(kind, seed, frames=12):
 
 
 def shaken(motions, points, noise, seed):
-    """Each frame turned and shifted a little, about the part: `noise` metres and as much of a radian."""
+    """Each frame perturbed about the part's centroid: `noise` metres and `noise` radians, standard
+    deviation."""
     rng, middle = np.random.default_rng(seed), points.mean(0)
     turns = Rotation.from_rotvec(noise * rng.normal(size=(len(motions), 3))).as_matrix()
     steps = np.broadcast_to(np.eye(4), (len(motions), 4, 4)).copy()
@@ -67,7 +68,7 @@ def test_a_joint_is_found_exactly(kind, seed):
     np.testing.assert_allclose(found.joint.axis, joint.axis, atol=1e-7)
     np.testing.assert_allclose(found.joint.values, joint.values, atol=1e-7)
     np.testing.assert_allclose(found.joint.motions(), joint.motions(), atol=1e-7)
-    if kind == "revolute":  # any point of the axis says the same
+    if kind == "revolute":  # any point on the axis is equivalent
         np.testing.assert_allclose(np.cross(found.joint.point - joint.point, joint.axis), 0, atol=1e-6)
     assert found.errors_m[kind] < 1e-7
     assert found.confidence > 0.99
@@ -85,7 +86,7 @@ def test_tracking_noise_costs_as_much_as_it_is(kind, seed):
 
 @given(seeds)
 def test_where_the_world_is_seen_from_does_not_matter(seed):
-    """Another frame turns the axis and moves the point, and changes no error."""
+    """A change of frame rotates the axis and moves the point, but changes no error."""
     joint, points = made_up("revolute", seed)
     motions = shaken(joint.motions(), points, 5e-4, seed)
     frame = np.eye(4)
@@ -121,7 +122,7 @@ def test_what_slides_and_turns_is_free(seed):
 
 @given(seeds, st.floats(0.5, 1.2))
 def test_a_steady_slide_and_turn_is_no_sure_hinge(seed, turn):
-    """It is nearly one, about an axis far away: what allows for so much noise cannot tell."""
+    """It nearly is one, about a distant axis; a tolerance this large cannot tell the two apart."""
     rng = np.random.default_rng(seed)
     share, way = np.linspace(0, 1, 16), rng.normal(size=2)
     motions = np.tile(np.eye(4), (16, 1, 1))
@@ -134,7 +135,7 @@ def test_a_steady_slide_and_turn_is_no_sure_hinge(seed, turn):
 
 
 def test_how_sure_it_is_falls_to_nothing_where_the_answer_becomes_another():
-    """A hinge that is followed worse and worse is at last free; the more is allowed, the later."""
+    """A hinge tracked with growing noise eventually becomes free; the larger the tolerance, the later."""
     joint, points = made_up("revolute", 4)
     found = {
         allowed: [

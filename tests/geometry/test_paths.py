@@ -1,4 +1,4 @@
-"""A path looks at what the cameras look at, from where they stand."""
+"""Camera paths look at the focus of the given cameras, from where these stand."""
 
 import numpy as np
 import pytest

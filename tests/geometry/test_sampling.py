@@ -1,4 +1,4 @@
-"""Points that are picked cover the others and keep apart."""
+"""Sampled points cover the others and keep apart."""
 
 import hypothesis.strategies as st
 import jax
@@ -26,7 +26,7 @@ def test_picked_points_cover_the_others_and_keep_apart(seed, there):
     assert valid[picked].all()
     center = points[valid].mean(0)
     far = np.where(valid, np.linalg.norm(points - center, axis=1), -1)
-    np.testing.assert_allclose(far[picked[0]], far.max())  # of two, both are as far from their middle
+    np.testing.assert_allclose(far[picked[0]], far.max())  # two points are equally far from their mean
     for i in range(1, len(picked)):  # each is the farthest from those before it
         apart = np.where(valid, cdist(np.nan_to_num(points), points[picked[:i]]).min(1), -1)
         np.testing.assert_allclose(apart[picked[i]], apart.max())
@@ -48,5 +48,5 @@ def test_a_batch_is_a_loop():
 
 
 def test_a_count_below_one_is_named():
-    with pytest.raises(ValueError, match=r"count=0.*1 or more"):
+    with pytest.raises(ValueError, match="count: expected 1 or more, found 0"):
         farthest_points(jnp.zeros((4, 3)), 0)

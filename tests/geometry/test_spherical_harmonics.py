@@ -71,5 +71,5 @@ def test_degree_0_stores_a_colour():
 
 @pytest.mark.parametrize("degree", [-1, 4])
 def test_other_degrees_are_refused(degree):
-    with pytest.raises(ValueError, match=f"sh_degree must be 0, 1, 2 or 3, got {degree}"):
+    with pytest.raises(ValueError, match=f"degree: expected 0, 1, 2 or 3, found {degree}"):
         sh_bases(degree, jnp.ones((1, 3)))

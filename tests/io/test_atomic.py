@@ -1,4 +1,4 @@
-"""Atomic files: whole or not at all."""
+"""Atomic writes: a file is complete or does not exist."""
 
 import json
 import os
@@ -39,14 +39,14 @@ def test_errors_name_the_file_that_was_asked_for(tmp_path):
     assert caught.value.filename == str(tmp_path / "x.ply")
 
 
-def test_a_new_file_takes_the_first_name_that_nothing_has(tmp_path):
+def test_a_new_file_takes_the_first_free_name(tmp_path):
     (tmp_path / "1").write_text("mine")
     names = [tmp_path / name for name in "123"]
     assert write_new(names, lambda path: path.write_text("new")) == tmp_path / "2"
     assert (tmp_path / "1").read_text() == "mine"
 
     def full(path):
-        assert path.exists()  # nobody else can have it
+        assert path.exists()  # the name is reserved
         raise OSError("no space")
 
     with pytest.raises(OSError, match="no space"):
@@ -76,5 +76,5 @@ def test_npz_needs_no_pickle(tmp_path):
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
         np.testing.assert_array_equal(archive["values"], [0, 1, 2])
         assert str(archive["name"]) == "text"
-    with pytest.raises(ValueError, match=r"\['bad'\] hold Python objects"):
+    with pytest.raises(ValueError, match=r"found Python objects in \['bad'\]"):
         write_npz(tmp_path / "b.npz", {"bad": np.array([{}])})

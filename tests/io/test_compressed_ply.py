@@ -1,4 +1,4 @@
-"""PlayCanvas's compressed PLY: what another encoder packed is read to within its steps; faults are told."""
+"""PlayCanvas's compressed PLY: another encoder's values are read within quantisation; faults are named."""
 
 import math
 import runpy
@@ -19,7 +19,7 @@ ROUNDING = 1e-5  # float32, of values up to 10
 
 
 def make_scene(count, degree=0, seed=0, low=0.02, high=0.98):
-    """Values as the format stores them: rgb and opacity 0 to 1, log scales, unit quaternions."""
+    """Values in the form that the format stores: rgb and opacity 0 to 1, log scales, unit quaternions."""
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(count, 4))
     return {
@@ -37,7 +37,7 @@ def code(fraction, bits):
 
 
 def pack_quat(quat):
-    """w x y z: number of the largest in 2 bits, the other three in 10 each."""
+    """w x y z: index of the largest in 2 bits, the other three in 10 bits each."""
     largest = max(range(4), key=lambda i: abs(quat[i]))
     word = largest
     for i in range(4):
@@ -47,7 +47,7 @@ def pack_quat(quat):
 
 
 def fractions(values, low, high):
-    """Where values lie between low and high, 0 where these are the same (as PlayCanvas's encoder has it)."""
+    """Positions of values between low and high; 0 where these are equal, as in PlayCanvas's encoder."""
     return [(v - a) / (b - a) if b > a else 0.0 for v, a, b in zip(values, low, high, strict=True)]
 
 
@@ -64,7 +64,7 @@ def pack_color(rgb, opacity, low, high):
 
 
 def pack(scene, chunk_colors=True):
-    """(rows of chunk, of vertex, of sh) of a scene, one number at a time, without the reader's code."""
+    """Rows of chunk, vertex and sh of a scene, packed number by number, independently of the reader."""
     chunks, vertices = [], []
     for start in range(0, len(scene["means"]), 256):
         part = {name: value[start : start + 256] for name, value in scene.items()}
@@ -111,7 +111,7 @@ def rewrite(path, change, **options):
 
 
 def only(rows, names):
-    """A copy of a structured array with these properties."""
+    """A copy of a structured array with only these properties."""
     kept = np.empty(len(rows), [(name, rows.dtype[name]) for name in names])
     for name in names:
         kept[name] = rows[name]
@@ -154,8 +154,8 @@ def test_packed_values_come_back_to_within_half_a_step(tmp_path, count, degree, 
 
     rows, largest = np.arange(count), np.abs(scene["quats"]).argmax(1)
     sign = np.sign(scene["quats"][rows, largest])
-    # The largest follows from the others: |d largest| <= sum |other| / largest |d other| <= 3 half steps (and
-    # second order, for which 1 % is ample).
+    # The largest is computed from the others: |d largest| <= sum |other| / largest |d other| <= 3 half steps
+    # (plus second-order terms, for which 1 % is ample).
     tolerance = np.where(np.arange(4) == largest[:, None], 3.03, 1.0) * 0.5 * QUAT_STEP + ROUNDING
     check(gaussians.quats, sign[:, None] * scene["quats"], tolerance)
     np.testing.assert_allclose(np.linalg.norm(gaussians.quats, axis=1), 1, atol=1e-6)
@@ -250,7 +250,9 @@ def test_a_file_cut_off_is_named(tmp_path, keep):
     write(path, make_scene(300, degree=1))
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content))])
-    with pytest.raises(PlyError, match=r"scene\.compressed\.ply: expected a whole PLY file.*export it again"):
+    with pytest.raises(
+        PlyError, match=r"scene\.compressed\.ply: expected a complete PLY file.*export it again"
+    ):
         read_ply(path)
 
 
@@ -291,13 +293,13 @@ def set_bound(name, value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (drop_chunks, r"element 'chunk' beside packed vertices, found only elements vertex, sh"),
-        (drop_chunk_row, r"2 rows of element 'chunk' \(300 Gaussians, 256 a chunk\), found 1"),
-        (drop_sh_row, r"300 rows of element 'sh' \(one a Gaussian\), found 299"),
+        (drop_chunks, r"element 'chunk' for packed vertices, found only elements vertex, sh"),
+        (drop_chunk_row, r"2 rows of element 'chunk' \(300 Gaussians, 256 per chunk\), found 1"),
+        (drop_sh_row, r"300 rows of element 'sh' \(one per Gaussian\), found 299"),
         (drop("vertex", "packed_scale"), r"packed_color in element 'vertex', found no packed_scale among"),
         (drop("chunk", "max_y", "min_scale_z"), r"element 'chunk', found no max_y, min_scale_z among min_x"),
         (drop("chunk", "max_b"), r"max_b in element 'chunk', found no max_b among"),
-        (drop("sh", "f_rest_3"), r"9, 24, 45 properties f_rest_\* .*found 8"),
+        (drop("sh", "f_rest_3"), r"9, 24 or 45 properties f_rest_\* .*found 8"),
         (drop("sh", *(f"f_rest_{i}" for i in range(1, 9))), r"properties f_rest_\* .*found 1"),
         (
             cast("vertex", "packed_rotation", "f4"),
@@ -321,7 +323,7 @@ def test_each_fault_names_the_file_what_was_expected_and_found(tmp_path, change,
 
 
 def test_a_real_file_gives_the_numbers_of_another_decoder(shared_data):
-    """The guitar of PlayCanvas's examples against decode.py, which was checked by splatting."""
+    """The guitar from PlayCanvas's examples against decode.py, which was checked by rendering."""
     folder = shared_data / "guitar"
     path, decoder = folder / "guitar.compressed.ply", folder / "decode.py"
     if not (path.is_file() and decoder.is_file()):

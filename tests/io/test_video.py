@@ -1,4 +1,4 @@
-"""Videos: what is written plays, also after an exception or Ctrl-C."""
+"""Videos: written files can be played, even after an exception or Ctrl-C."""
 
 import contextlib
 import os
@@ -80,7 +80,7 @@ def test_ctrl_c_at_a_terminal_leaves_a_video(tmp_path):
     )
     assert process.stdout.readline() == b"ready\n"
     time.sleep(0.2)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group
+    os.killpg(process.pid, signal.SIGINT)  # to the whole group, like a terminal
     process.wait(timeout=20)
     process.stdout.close()
     assert len(read_video_frames(tmp_path / "a.mp4")) == 4
@@ -92,7 +92,7 @@ def test_a_frame_of_another_size_is_refused_and_the_rest_kept(tmp_path):
             video.write(ramp(0))
             video.write(ramp(0, height=30))
 
-    with pytest.raises(ValueError, match=r"got shape \(30, 48, 3\), want \(32, 48, 3\)"):
+    with pytest.raises(ValueError, match=r"expected shape \(32, 48, 3\) .*, found \(30, 48, 3\)"):
         record()
     assert len(read_video_frames(tmp_path / "a.mp4")) == 1
 
@@ -104,14 +104,14 @@ def test_nothing_written_leaves_no_file(tmp_path):
 
 
 def test_bad_arguments_and_files_are_named(tmp_path):
-    with pytest.raises(ValueError, match="fps: got 0"):
+    with pytest.raises(ValueError, match="fps: expected a positive number, found 0"):
         VideoWriter(tmp_path / "a.mp4", fps=0)
     with pytest.raises(ValueError, match=r"ends in \.mp4"):
         VideoWriter(tmp_path / "a.avi", fps=1)
     video = VideoWriter(tmp_path / "a.mp4", fps=1)
-    with pytest.raises(ValueError, match="want uint8 or floats"):
+    with pytest.raises(ValueError, match="expected uint8 or floats"):
         video.write(np.zeros((4, 4, 3), int))
-    with pytest.raises(ValueError, match=r"got shape \(4, 4\), want \[H, W, 3\]"):
+    with pytest.raises(ValueError, match=r"expected shape \[H, W, 3\], found \(4, 4\)"):
         video.write(np.zeros((4, 4)))
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(ValueError, match=r"text\.mp4: expected a video"):
@@ -120,7 +120,7 @@ def test_bad_arguments_and_files_are_named(tmp_path):
         read_video_frames(tmp_path / "none.mp4")
 
 
-def test_what_ffmpeg_says_is_passed_on_and_no_litter_stays(tmp_path):
+def test_the_output_of_ffmpeg_is_passed_on_and_no_litter_stays(tmp_path):
     video = VideoWriter(tmp_path / "a.mp4", fps=10)
     with pytest.raises(OSError, match="ffmpeg"):  # noqa: PT012  (it may fail at any write, or at the end)
         for _ in range(3):

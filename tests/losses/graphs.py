@@ -1,4 +1,4 @@
-"""Small graphs that tests of graphs and of their losses share."""
+"""Small graphs shared by tests of graphs and their losses."""
 
 import hypothesis.strategies as st
 import jax
@@ -24,7 +24,7 @@ SEEDS = st.integers(0, 1000)
 
 
 def case(seed: int) -> dict[str, np.ndarray]:
-    """Positions, a teacher's features and those that learn; some nodes are absent."""
+    """Positions, a teacher's features and trained features; some nodes are absent."""
     random = np.random.default_rng(seed)
     return {
         "positions": random.normal(size=(T, N, 3)),
@@ -41,7 +41,7 @@ def arrays(case):
 
 @jax.jit
 def graph(positions, teacher, times, valid, **_):
-    """Nearest, matched and similar ones."""
+    """Edges to nearest and matching nodes, their weights and affinities, and edges to similar nodes."""
     edges = spatial_edges(positions, 3, valid) | temporal_edges(teacher, 2, 2, valid)
     weights = edge_weights(positions, teacher, times, edges, TAU_X, TAU_T)
     alike = similar_edges(teacher, 2, 0, valid), similar_edges(teacher, 2, 1, valid)

@@ -1,4 +1,4 @@
-"""Nodes, edges and affinities against what they mean, written out in loops in float64."""
+"""Nodes, edges and affinities against their definitions, written as loops in float64."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +29,9 @@ from tests.losses.graphs import (
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_edges_are_those_of_loops_over_nodes(seed):
-    told = case(seed)
-    positions, teacher, valid = told["positions"], told["teacher"], told["valid"]
-    edges, _, _, (within, across) = graph(**arrays(told))
+    inputs = case(seed)
+    positions, teacher, valid = inputs["positions"], inputs["teacher"], inputs["valid"]
+    edges, _, _, (within, across) = graph(**arrays(inputs))
     assert edges.nodes.shape == edges.valid.shape == (T, N, len(edges.offsets)) == (T, N, 3 + 4 * 2)
     matched = {o: np.asarray(matrices(jnp.asarray(teacher), o, jnp.asarray(valid))) for o in (1, 2)}
     want, alike = set(), {0: set(), 1: set()}
@@ -62,23 +62,23 @@ def test_temporal_edges_find_the_order_in_which_nodes_come():
     np.testing.assert_array_equal(edges.nodes[0, :, 0], np.argsort(order))
     np.testing.assert_array_equal(edges.nodes[1, :, 1], order)
     assert edges.valid[0, :, 0].all()
-    assert not edges.valid[0, :, 1].any()  # nothing is before the first
+    assert not edges.valid[0, :, 1].any()  # there is no frame before the first
 
 
-def test_there_are_fewer_edges_than_asked_for_where_there_are_fewer_nodes():
-    told = arrays(case(0))
-    few = told["positions"][:, :3]
+def test_there_are_fewer_edges_than_requested_if_there_are_fewer_nodes():
+    inputs = arrays(case(0))
+    few = inputs["positions"][:, :3]
     near = spatial_edges(few, 5)
     assert near.nodes.shape == (T, 3, 5)
     assert (near.valid.sum(2) == 2).all()
     assert not spatial_edges(few[:, :1], 5).valid.any()
-    assert temporal_edges(told["teacher"][:1], 2, 3).nodes.shape == (1, N, 0)  # no other frame
-    assert all_edges(told["valid"][:1], 3).offsets == (0,) * N
-    nothing = told["teacher"].at[:, 2].set(0.0).at[:, 3].set(jnp.nan)
+    assert temporal_edges(inputs["teacher"][:1], 2, 3).nodes.shape == (1, N, 0)  # no other frame
+    assert all_edges(inputs["valid"][:1], 3).offsets == (0,) * N
+    nothing = inputs["teacher"].at[:, 2].set(0.0).at[:, 3].set(jnp.nan)
     alike = similar_edges(nothing, 2, 1)
     ends = {node for _, i, _, j in listed(alike) for node in (i, j)}
     assert ends <= {*range(N)} - {2, 3}
-    assert alike.valid.sum() == 2 * (T - 1) * (N - 2) * 2  # and those take no one's place
+    assert alike.valid.sum() == 2 * (T - 1) * (N - 2) * 2  # absent nodes take no one's place
 
 
 def test_all_edges_are_all_pairs():
@@ -91,10 +91,10 @@ def test_all_edges_are_all_pairs():
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_weights_and_affinities_are_those_of_each_edge(seed):
-    told = case(seed)
-    edges, *rest, _ = graph(**arrays(told))
+    inputs = case(seed)
+    edges, *rest, _ = graph(**arrays(inputs))
     weights, found, nodes, there = map(np.asarray, (*rest, edges.nodes, edges.valid))
-    positions, teacher, times = told["positions"], told["teacher"], told["times"]
+    positions, teacher, times = inputs["positions"], inputs["teacher"], inputs["times"]
     normal = teacher - teacher.mean(2, keepdims=True)
     normal /= np.sqrt((normal**2).mean(2, keepdims=True))
     for t, i, e in np.ndindex(T, N, len(edges.offsets)):
@@ -110,9 +110,9 @@ def test_weights_and_affinities_are_those_of_each_edge(seed):
         scores = normal[first] @ normal[last].T
         if t == s:
             np.fill_diagonal(scores, -np.inf)
-        rows, columns = map(jnp.asarray, told["valid"][[first, last]])
+        rows, columns = map(jnp.asarray, inputs["valid"][[first, last]])
         matrix = np.asarray(matching_of(jnp.asarray(scores), np.sqrt(D), rows=rows, columns=columns))
-        choices = told["valid"][s].sum() - (s == t)
+        choices = inputs["valid"][s].sum() - (s == t)
         for i, e in np.argwhere(there[t] & (np.array(edges.offsets) == s - t)):
             pair = (i, nodes[t, i, e]) if s >= t else (nodes[t, i, e], i)
             np.testing.assert_allclose(found[t, i, e], choices * matrix[pair], rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Losses of graphs against what they mean, written out in float64; central differences; extremes."""
+"""Losses of graphs against their definitions in float64; central differences; extremes."""
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +26,10 @@ from tests.losses.graphs import (
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_losses_are_means_over_nodes_and_edges(seed):
-    told = case(seed)
-    given_ = arrays(told)
+    inputs = case(seed)
+    given_ = arrays(inputs)
     edges, weights, wanted, (within, across) = graph(**given_)
-    features, teacher, valid = told["features"], told["teacher"], told["valid"]
+    features, teacher, valid = inputs["features"], inputs["teacher"], inputs["valid"]
     found = np.asarray(edge_values(given_["features"], edges, given_["valid"]))
     apart = np.abs(found - np.asarray(wanted))
     want = [
@@ -44,16 +44,16 @@ def test_losses_are_means_over_nodes_and_edges(seed):
     np.testing.assert_allclose(compiled(given_["features"], given_), want, rtol=1e-9)
 
 
-def losses(features, told, matching=MATCHING):
-    """All of them, of nodes that learn."""
-    edges, weights, wanted, (within, across) = graph(**told)
+def losses(features, inputs, matching=MATCHING):
+    """All losses of trained node features."""
+    edges, weights, wanted, (within, across) = graph(**inputs)
     return jnp.stack(
         [
-            node_loss(features, told["teacher"], told["valid"]),
-            structure_loss(features, wanted, edges, weights, told["valid"], matching),
-            structure_loss(features, wanted, edges, None, told["valid"], matching),
-            similarity_loss(features, within, told["valid"]),
-            similarity_loss(features, across, told["valid"]),
+            node_loss(features, inputs["teacher"], inputs["valid"]),
+            structure_loss(features, wanted, edges, weights, inputs["valid"], matching),
+            structure_loss(features, wanted, edges, None, inputs["valid"], matching),
+            similarity_loss(features, within, inputs["valid"]),
+            similarity_loss(features, across, inputs["valid"]),
         ]
     )
 
@@ -64,135 +64,138 @@ slopes_of = jax.jit(jax.jacrev(losses), static_argnums=2)
 
 @pytest.mark.usefixtures("x64")
 def test_all_pairs_are_compared_by_the_l1_distance_of_rows():
-    told, apart = arrays(case(2)), []
+    inputs, apart = arrays(case(2)), []
     for t, s in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2)):
-        ours, theirs = (affinities(told[name], s - t, told["valid"])[t] for name in ("features", "teacher"))
+        ours, theirs = (
+            affinities(inputs[name], s - t, inputs["valid"])[t] for name in ("features", "teacher")
+        )
         for axis in (1,) if s == t else (1, 0):
-            choices = told["valid"][s if axis == 1 else t].sum() - (s == t)
-            rows = told["valid"][t if axis == 1 else s]
+            choices = inputs["valid"][s if axis == 1 else t].sum() - (s == t)
+            rows = inputs["valid"][t if axis == 1 else s]
             apart += [(choices, d) for d in np.abs(ours - theirs).sum(axis)[np.asarray(rows)]]
     choices, distances = np.array(apart).T
     assert distances.max() < 2
-    edges = all_edges(told["valid"], 1)
-    wanted = edge_values(told["teacher"], edges, told["valid"])
-    found = jax.jit(structure_loss)(told["features"], wanted, edges, None, told["valid"])
+    edges = all_edges(inputs["valid"], 1)
+    wanted = edge_values(inputs["teacher"], edges, inputs["valid"])
+    found = jax.jit(structure_loss)(inputs["features"], wanted, edges, None, inputs["valid"])
     np.testing.assert_allclose(found, np.average(distances, weights=choices), rtol=1e-9)
 
 
 @pytest.mark.usefixtures("x64")
-def test_features_like_the_teachers_have_no_loss_and_the_teacher_and_the_graph_no_slope():
-    told = arrays(case(3))
-    none = compiled(told["teacher"], told)[:3]
+def test_features_equal_to_the_teachers_have_no_loss_and_teacher_and_graph_no_gradient():
+    inputs = arrays(case(3))
+    none = compiled(inputs["teacher"], inputs)[:3]
     np.testing.assert_allclose(none, 0, atol=1e-9)
-    structure = compiled(3 * told["teacher"] - 2, told)[1:3]  # affinities know no scale and no shift
+    # Affinities are invariant to scale and shift.
+    structure = compiled(3 * inputs["teacher"] - 2, inputs)[1:3]
     np.testing.assert_allclose(structure, 0, atol=1e-9)
-    assert (compiled(told["features"], told) > 1e-2).all()
+    assert (compiled(inputs["features"], inputs) > 1e-2).all()
 
     def of_teacher(positions, teacher):
-        return losses(told["features"], told | {"positions": positions, "teacher": teacher}).sum()
+        return losses(inputs["features"], inputs | {"positions": positions, "teacher": teacher}).sum()
 
-    for slope in jax.jit(jax.grad(of_teacher, (0, 1)))(told["positions"], told["teacher"]):
+    for slope in jax.jit(jax.grad(of_teacher, (0, 1)))(inputs["positions"], inputs["teacher"]):
         np.testing.assert_array_equal(slope, 0)
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("derivative", ["unrolled", "implicit"])
 def test_slopes_are_those_of_central_differences_and_jvp_agrees_with_vjp(derivative):
-    told, matching = arrays(case(4)), Matching(iterations=60, derivative=derivative)
+    inputs, matching = arrays(case(4)), Matching(iterations=60, derivative=derivative)
     along = jnp.asarray(np.random.default_rng(5).normal(size=(T, N, D)))
-    slopes = slopes_of(told["features"], told, matching)
-    ahead, behind = (compiled(told["features"] + step * along, told, matching) for step in (1e-6, -1e-6))
+    slopes = slopes_of(inputs["features"], inputs, matching)
+    ahead, behind = (compiled(inputs["features"] + step * along, inputs, matching) for step in (1e-6, -1e-6))
     by_slope = (slopes * along).sum((1, 2, 3))
     np.testing.assert_allclose(by_slope, (ahead - behind) / 2e-6, rtol=1e-6)
-    by_jvp = jax.jvp(lambda f: compiled(f, told, matching), (told["features"],), (along,))[1]
+    by_jvp = jax.jvp(lambda f: compiled(f, inputs, matching), (inputs["features"],), (along,))[1]
     np.testing.assert_allclose(by_jvp, by_slope, rtol=1e-9)
-    assert (slopes[:, ~told["valid"]] == 0).all()
+    assert (slopes[:, ~inputs["valid"]] == 0).all()
     assert (np.abs(slopes).max((1, 2, 3)) > 1e-3).all()
 
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
 def test_another_order_of_nodes_changes_no_loss(seed):
-    told = arrays(case(seed))
+    inputs = arrays(case(seed))
     order = np.random.default_rng(seed).permutation(N)
-    other = {name: a[:, order] if a.ndim > 1 else a for name, a in told.items()}
+    other = {name: a[:, order] if a.ndim > 1 else a for name, a in inputs.items()}
     np.testing.assert_allclose(
-        compiled(other["features"], other), compiled(told["features"], told), rtol=1e-8
+        compiled(other["features"], other), compiled(inputs["features"], inputs), rtol=1e-8
     )
 
 
 @pytest.mark.usefixtures("x64")
 def test_twice_the_nodes_change_no_loss():
-    told = arrays(case(6))
-    twice = {name: jnp.concatenate([a, a], axis=1) if a.ndim > 1 else a for name, a in told.items()}
+    inputs = arrays(case(6))
+    twice = {name: jnp.concatenate([a, a], axis=1) if a.ndim > 1 else a for name, a in inputs.items()}
 
     @jax.jit
-    def across(told):  # in one frame each has a twin, which it lacks among half of them
-        edges = all_edges(told["valid"], 1)
-        wanted = edge_affinities(told["teacher"], edges, told["valid"])
+    def across(inputs):  # within a frame each node has a twin, which half of the nodes lack
+        edges = all_edges(inputs["valid"], 1)
+        wanted = edge_affinities(inputs["teacher"], edges, inputs["valid"])
         between = jnp.broadcast_to(np.array(edges.offsets) != 0, edges.valid.shape) * 1.0
-        nodes = node_loss(told["features"], told["teacher"], told["valid"])
-        return nodes, structure_loss(told["features"], wanted, edges, between, told["valid"])
+        nodes = node_loss(inputs["features"], inputs["teacher"], inputs["valid"])
+        return nodes, structure_loss(inputs["features"], wanted, edges, between, inputs["valid"])
 
-    np.testing.assert_allclose(across(twice), across(told), rtol=1e-9)
+    np.testing.assert_allclose(across(twice), across(inputs), rtol=1e-9)
 
 
 # -- extremes ------------------------------------------------------------------------------------------------
 
 
 def extreme(name: str):
-    told = {k: jnp.asarray(a, bool if k == "valid" else jnp.float32) for k, a in case(7).items()}
+    inputs = {k: jnp.asarray(a, bool if k == "valid" else jnp.float32) for k, a in case(7).items()}
     if name == "no features":
-        told["features"] = told["teacher"] = jnp.zeros((T, N, D))
+        inputs["features"] = inputs["teacher"] = jnp.zeros((T, N, D))
     elif name == "features all alike":
-        told["features"] = told["teacher"] = jnp.ones((T, N, D))
+        inputs["features"] = inputs["teacher"] = jnp.ones((T, N, D))
     elif name == "one node":
-        told["valid"] = jnp.zeros((T, N), bool).at[1, 2].set(True)
-        told["teacher"] = told["features"]
+        inputs["valid"] = jnp.zeros((T, N), bool).at[1, 2].set(True)
+        inputs["teacher"] = inputs["features"]
     elif name == "no nodes":
-        told["valid"] = jnp.zeros((T, N), bool)
-    return told
+        inputs["valid"] = jnp.zeros((T, N), bool)
+    return inputs
 
 
 @pytest.mark.parametrize("name", ["no features", "features all alike", "one node", "no nodes"])
-def test_where_nothing_can_be_asked_losses_are_zero_without_a_slope(name):
-    told = extreme(name)
-    np.testing.assert_allclose(compiled(told["features"], told), 0, atol=1e-6)
-    np.testing.assert_allclose(slopes_of(told["features"], told), 0, atol=1e-6)
+def test_in_degenerate_cases_losses_are_zero_with_zero_gradient(name):
+    inputs = extreme(name)
+    np.testing.assert_allclose(compiled(inputs["features"], inputs), 0, atol=1e-6)
+    np.testing.assert_allclose(slopes_of(inputs["features"], inputs), 0, atol=1e-6)
 
 
-def test_features_that_are_still_zero_learn_from_nodes_and_all_else_is_finite():
-    told = extreme("")
-    found, slopes = (f(jnp.zeros((T, N, D)), told) for f in (compiled, slopes_of))
+def test_zero_features_learn_from_the_node_loss_and_the_rest_is_finite():
+    inputs = extreme("")
+    found, slopes = (f(jnp.zeros((T, N, D)), inputs) for f in (compiled, slopes_of))
     assert found[0] > 1
-    assert (jnp.abs(slopes[0]).max(2) > 0)[told["valid"]].all()
+    assert (jnp.abs(slopes[0]).max(2) > 0)[inputs["valid"]].all()
     assert np.isfinite(found).all()
     assert np.isfinite(slopes).all()
     np.testing.assert_array_equal(found[3:], 0)
 
 
-def test_what_is_not_a_number_is_left_out_and_does_not_spread():
-    told = extreme("")
-    t, i = np.argwhere(told["valid"])[0]
-    broken = told["features"].at[t, i].set(jnp.nan)
-    found, slopes = (f(broken, told) for f in (compiled, slopes_of))
+def test_nan_is_left_out_and_does_not_spread():
+    inputs = extreme("")
+    t, i = np.argwhere(inputs["valid"])[0]
+    broken = inputs["features"].at[t, i].set(jnp.nan)
+    found, slopes = (f(broken, inputs) for f in (compiled, slopes_of))
     assert np.isfinite(found).all()
     assert np.isfinite(slopes).all()
     np.testing.assert_array_equal(slopes[:, t, i], 0)
-    edges, weights, wanted, _ = graph(**told)
+    edges, weights, wanted, _ = graph(**inputs)
     ends_there = (np.arange(T)[:, None] + np.array(edges.offsets) == t)[:, None] & (edges.nodes == i)
     counted = jnp.where(ends_there, 0.0, weights).at[t, i].set(0.0)
-    absent = told["valid"].at[t, i].set(False)
+    absent = inputs["valid"].at[t, i].set(False)
     one, other = (
         structure_loss(features, wanted, edges, weight, valid)
         for features, weight, valid in (
-            (broken, weights, told["valid"]),
-            (told["features"], counted, absent),
+            (broken, weights, inputs["valid"]),
+            (inputs["features"], counted, absent),
         )
     )
     np.testing.assert_allclose(one, other, rtol=1e-5)
-    broken = told | {"teacher": told["teacher"].at[t, i].set(jnp.nan)}
-    without = told | {"valid": absent}
+    broken = inputs | {"teacher": inputs["teacher"].at[t, i].set(jnp.nan)}
+    without = inputs | {"valid": absent}
     np.testing.assert_allclose(
         *(np.asarray(compiled(t["features"], t))[[0, 3, 4]] for t in (broken, without)), rtol=1e-5
     )
@@ -202,7 +205,7 @@ def test_what_is_not_a_number_is_left_out_and_does_not_spread():
 
 
 @pytest.mark.parametrize(("channels", "width"), [(9, 4), (4, 9), (6, 6)])
-def test_a_teachers_projection_is_orthonormal_and_another_for_every_key(channels, width):
+def test_a_teachers_projection_is_orthonormal_and_differs_between_keys(channels, width):
     one, other = (orthonormal_projection(jax.random.key(i), channels, width) for i in (0, 1))
     assert one.shape == (width, channels)
     gram = one @ one.T if width <= channels else one.T @ one
@@ -220,14 +223,14 @@ def test_a_batch_is_a_loop():
 
 
 def test_float32_is_near_to_float64():
-    told = case(8)
-    single = compiled(*(lambda t: (t["features"], t))(arrays(told)))
+    inputs = case(8)
+    single = compiled(*(lambda t: (t["features"], t))(arrays(inputs)))
     with jax.enable_x64(True):
-        double = compiled(*(lambda t: (t["features"], t))(arrays(told)))
+        double = compiled(*(lambda t: (t["features"], t))(arrays(inputs)))
     np.testing.assert_allclose(single, double, rtol=1e-4)
 
 
 def test_mistakes_are_named():
-    told = arrays(case(0))
+    inputs = arrays(case(0))
     with pytest.raises(ValueError, match=r"window=0.*1 frame or more"):
-        temporal_edges(told["teacher"], 2, 0)
+        temporal_edges(inputs["teacher"], 2, 0)

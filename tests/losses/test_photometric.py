@@ -10,7 +10,7 @@ from gsjax.losses.photometric import l1_loss, photometric_loss, ssim, truncated_
 
 
 def images(seed: int, shape=(2, 20, 24, 3), noise: float = 0.15) -> tuple[np.ndarray, np.ndarray]:
-    """An image with some structure and a disturbed copy, values 0 to 1."""
+    """An image with some structure and a noisy copy, values 0 to 1."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0 : shape[1], 0 : shape[2]]
     waves = np.sin(rows / 3.0)[..., None] * np.cos(columns / 4.0)[..., None] * np.array([0.3, 0.2, 0.4])
@@ -36,7 +36,7 @@ def test_l1_averages_over_channels_and_pixels_and_follows_the_weights():
     assert l1_loss(image, target, jnp.zeros((2, 2))) == 0
 
 
-def test_truncated_l1_counts_what_is_far_off_as_the_limit_and_does_not_pull_on_it():
+def test_truncated_l1_counts_large_differences_as_the_limit_without_gradient():
     values, targets = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.02, 2.5, 3.0])
     weights = jnp.array([1.0, 1.0, 0.0])
     loss, gradient = jax.value_and_grad(truncated_l1)(values, targets, weights, 0.05)
@@ -87,7 +87,7 @@ def test_photometric_loss_mixes_l1_and_dssim():
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("loss", [l1_loss, ssim, photometric_loss], ids=lambda f: f.__name__)
 def test_gradients_are_those_of_central_differences(loss):
-    rng = np.random.default_rng(5)  # not clipped: where both are 0, L1 has a kink
+    rng = np.random.default_rng(5)  # not clipped: L1 has a kink where both are 0
     both = tuple(jnp.asarray(rng.uniform(size=(2, 2, 13, 15, 3))))
     directions = tuple(jnp.asarray(np.random.default_rng(6).normal(size=(2, 2, 13, 15, 3))))
     step = 1e-6

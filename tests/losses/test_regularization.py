@@ -1,4 +1,4 @@
-"""Losses that ask nothing of the data: smooth planes, and what moves evenly over time."""
+"""Losses that do not depend on data: smooth planes, and uniform motion over time."""
 
 import jax
 import jax.numpy as jnp

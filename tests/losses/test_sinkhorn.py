@@ -24,7 +24,7 @@ def scores_of(seed: int, rows: int = N, columns: int = N) -> jnp.ndarray:
 
 
 def value(inputs, weights, iterations=20, derivative="unrolled", **there):
-    """Of scores, a temperature and perhaps a slack."""
+    """A scalar of the matching for scores, a temperature and optionally a slack."""
     scores, temperature, *slack = inputs
     options = {"iterations": iterations, "derivative": derivative, **there}
     return jnp.vdot(weights, sinkhorn(scores, temperature, slack=slack[0] if slack else None, **options))
@@ -41,14 +41,14 @@ slopes_of = jax.jit(jax.grad(value), static_argnames=STATIC)
 def test_rows_and_columns_sum_to_one(seed, temperature):
     few, many = (match(scores_of(seed), temperature, iterations=i) for i in (2, ENOUGH))
     assert (few >= 0).all()
-    np.testing.assert_allclose(few.sum(0), 1, rtol=1e-12)  # of columns always
+    np.testing.assert_allclose(few.sum(0), 1, rtol=1e-12)  # columns always do
     np.testing.assert_allclose(many.sum(0), 1, rtol=1e-12)
     np.testing.assert_allclose(many.sum(1), 1, rtol=1e-9)
 
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, TEMPERATURES, st.floats(-3, 3))
-def test_a_slack_takes_what_is_unmatched_and_less_the_lower_its_score(seed, temperature, slack):
+def test_a_slack_takes_the_unmatched_and_less_for_a_lower_score(seed, temperature, slack):
     scores = scores_of(seed, N, M)
     found, lower = (match(scores, temperature, slack=s, iterations=ENOUGH) for s in (slack, slack - 0.5))
     assert (found.sum(0) < 1).all()
@@ -58,7 +58,7 @@ def test_a_slack_takes_what_is_unmatched_and_less_the_lower_its_score(seed, temp
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, TEMPERATURES)
-def test_a_slack_is_there_where_sizes_differ_or_when_asked_for(seed, temperature):
+def test_there_is_a_slack_if_sizes_differ_or_one_is_given(seed, temperature):
     scores = scores_of(seed, N, M)
     np.testing.assert_array_equal(match(scores, temperature), match(scores, temperature, slack=0.0))
     square = scores[:, :N]
@@ -73,7 +73,7 @@ def test_a_slack_is_there_where_sizes_differ_or_when_asked_for(seed, temperature
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, st.sampled_from([(3, 3), (1, 5), (4, 2)]))
-def test_what_is_absent_might_as_well_not_be_in_the_matrix(seed, size):
+def test_absent_rows_and_columns_act_as_if_not_in_the_matrix(seed, size):
     random = np.random.default_rng(seed)
     rows, columns = random.permutation(N) < size[0], random.permutation(M) < size[1]
     scores = scores_of(seed, N, M)
@@ -87,7 +87,7 @@ def test_what_is_absent_might_as_well_not_be_in_the_matrix(seed, size):
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, TEMPERATURES)
-def test_another_order_of_rows_and_columns_is_that_order_of_the_matching(seed, temperature):
+def test_permuting_rows_and_columns_permutes_the_matching(seed, temperature):
     random = np.random.default_rng(seed)
     rows, columns = random.permutation(N), random.permutation(M)
     scores = scores_of(seed, N, M)
@@ -98,7 +98,7 @@ def test_another_order_of_rows_and_columns_is_that_order_of_the_matching(seed, t
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, st.floats(-1e4, 1e4))
-def test_what_a_row_or_a_column_or_all_scores_have_in_common_is_of_no_account(seed, shift):
+def test_an_offset_of_a_row_or_a_column_or_all_scores_does_not_matter(seed, shift):
     random = np.random.default_rng(seed)
     scores = scores_of(seed)
     rows, columns = jnp.asarray(random.normal(size=(N, 1))), jnp.asarray(random.normal(size=N))
@@ -117,7 +117,7 @@ def test_what_a_row_or_a_column_or_all_scores_have_in_common_is_of_no_account(se
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS)
-def test_cold_it_is_the_best_assignment_and_hot_it_is_even(seed):
+def test_it_is_the_best_assignment_when_cold_and_uniform_when_hot(seed):
     scores = scores_of(seed)
     rows, columns = linear_sum_assignment(scores, maximize=True)
     cold = match(scores, 0.01, iterations=20_000)
@@ -129,7 +129,7 @@ def test_cold_it_is_the_best_assignment_and_hot_it_is_even(seed):
 
 @pytest.mark.usefixtures("x64")
 @given(SEEDS, st.floats(-1, 1))
-def test_cold_pairs_are_matched_that_are_better_than_the_slack(seed, slack):
+def test_when_cold_only_pairs_better_than_the_slack_are_matched(seed, slack):
     scores = scores_of(seed, N, M)
     gains = np.maximum(np.asarray(scores) - slack, 0)
     rows, columns = linear_sum_assignment(gains, maximize=True)
@@ -155,7 +155,7 @@ EXTREMES = {
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-def test_it_and_its_slopes_are_finite_whatever_the_scores(name):
+def test_the_matching_and_its_gradients_are_finite_whatever_the_scores(name):
     scores = jnp.asarray(EXTREMES[name], jnp.float32)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=scores.shape), jnp.float32)
     for slack in ((), (jnp.float32(-0.5),)):
@@ -169,7 +169,7 @@ def test_it_and_its_slopes_are_finite_whatever_the_scores(name):
                 assert np.isfinite(slope).all()
 
 
-def test_equal_scores_match_evenly_and_a_pair_alone_wholly():
+def test_equal_scores_match_uniformly_and_a_single_pair_fully():
     for shift in (1e4, -1e4):
         np.testing.assert_allclose(sinkhorn(jnp.full((4, 4), shift), 0.5), 0.25, rtol=1e-6)
     np.testing.assert_allclose(sinkhorn(jnp.full((1, 1), -1e4), 0.5), 1)
@@ -217,12 +217,12 @@ def test_slopes_are_those_of_central_differences_and_jvp_agrees_with_vjp(derivat
         by_slope = sum(map(jnp.vdot, slopes, along))
         np.testing.assert_allclose(by_slope, (ahead - behind) / 2e-6, rtol=1e-7)
         np.testing.assert_allclose(jax.jvp(loss, (inputs,), (along,))[1], by_slope, rtol=1e-9)
-        for slope in slopes:  # and each is one that matters
+        for slope in slopes:  # and none vanishes
             assert jnp.abs(slope).max() > 1e-4
 
 
 @pytest.mark.usefixtures("x64")
-def test_the_implicit_slope_is_the_unrolled_one_where_converged_and_else_off_by_what_the_rows_are():
+def test_the_implicit_gradient_is_the_unrolled_one_up_to_the_error_of_row_sums():
     inputs, weights = (scores_of(1), jnp.asarray(0.3)), scores_of(2)
     errors, gaps = [], []
     for iterations in (5, 20, ENOUGH):
@@ -231,7 +231,7 @@ def test_the_implicit_slope_is_the_unrolled_one_where_converged_and_else_off_by_
         errors.append(float(jnp.abs(implicit - unrolled).max()))
         gaps.append(float(jnp.abs(match(*inputs, **options).sum(1) - 1).max()))
     assert errors[-1] < 1e-12
-    assert errors[0] > errors[1] > 1e-6  # the test is one of both cases
+    assert errors[0] > errors[1] > 1e-6  # the test covers both cases
     assert all(error < 5 * gap for error, gap in zip(errors[:2], gaps[:2], strict=True))
 
 
@@ -251,7 +251,7 @@ def test_second_derivatives_agree_too():
     assert jnp.abs(unrolled).max() > 1e-2
 
 
-def test_a_sharp_matching_has_no_slope_left_in_float32():
+def test_a_sharp_matching_has_no_gradient_in_float32():
     slope = slopes_of((jnp.eye(N) * 100, 1.0), scores_of(0), derivative="implicit")[0]
     np.testing.assert_allclose(slope, 0, atol=1e-6)
 
@@ -266,11 +266,11 @@ def test_a_batch_is_a_loop(derivative):
     np.testing.assert_allclose(jax.vmap(slope)(many, rows), list(map(slope, many, rows)), atol=1e-6)
 
 
-# -- another's -----------------------------------------------------------------------------------------------
+# -- other implementations -----------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("x64")
-def test_it_is_what_ott_has():
+def test_it_agrees_with_ott():
     from ott.geometry.geometry import Geometry
     from ott.problems.linear.linear_problem import LinearProblem
     from ott.solvers.linear.sinkhorn import Sinkhorn

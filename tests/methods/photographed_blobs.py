@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.fit import View
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 
@@ -19,8 +19,8 @@ def cameras(count: int) -> Camera:
     return Camera(viewmats, Ks, WIDTH, HEIGHT)
 
 
-def photographed_blobs() -> list[View]:
-    """Eight views, with depth."""
+def photographed_blobs() -> list[Frame]:
+    """Eight photographs with depth, each a frame of one camera on the host."""
     random, count = np.random.default_rng(0), 30
     means, colors = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(size=(count, 3))
     quats, scales = random.normal(size=(count, 4)), random.uniform(0.08, 0.25, (count, 3))
@@ -30,4 +30,7 @@ def photographed_blobs() -> list[View]:
     images = np.round(255 * np.clip(np.asarray(drawn.colors), 0, 1)).astype(np.uint8)
     depths = np.where(np.asarray(drawn.alphas) > 0.9, np.asarray(drawn.depths), 0)
     viewmats, Ks = np.asarray(eight.viewmat, np.float64), np.asarray(eight.K, np.float64)
-    return [View(images[i], None, depths[i], viewmats[i], Ks[i]) for i in range(8)]
+    return [
+        Frame(images[i : i + 1], depths[i : i + 1], Camera(viewmats[i : i + 1], Ks[i : i + 1], WIDTH, HEIGHT))
+        for i in range(8)
+    ]

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gsjax
-from gsjax.geometry.cameras import project
 from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.deform import (
     DeformConfig,
@@ -21,7 +20,6 @@ from gsjax.methods.deform import (
     reconstruct,
     refined_viewmats,
 )
-from gsjax.methods.twisted import twisted
 from gsjax.scene.deformation import DeformationConfig
 from tests.methods.tissue import looks_of
 
@@ -156,24 +154,6 @@ class TestRefining:
         batch = problem.batches[2]._replace(plan=plan)
         fall = float(of(rows - step, batch) - of(rows + step, batch))
         np.testing.assert_allclose(fall, -2e-4 * np.linalg.norm(slopes[2]), rtol=0.15)
-
-
-@pytest.mark.usefixtures("x64")
-def test_slopes_of_a_twist_are_those_of_finite_differences(askew):
-    view, K = jnp.asarray(askew[1].viewmat)[None], jnp.asarray(askew[1].K)
-    random = np.random.default_rng(1)
-    points = jnp.asarray(random.uniform(-0.02, 0.02, (20, 3)))
-    weights = jnp.asarray(random.normal(size=(20, 3)))
-
-    def of(twist):
-        pixels, depths = project(points, twisted(view, twist, 0.03)[0], K)
-        return jnp.sum(weights * jnp.concatenate([pixels, depths[:, None]], axis=1))
-
-    for twist in (jnp.zeros(6), jnp.asarray(random.normal(size=6) * 0.1)):
-        slopes = jax.grad(of)(twist)
-        steps = 1e-6 * np.eye(6)
-        measured = [(of(twist + step) - of(twist - step)) / 2e-6 for step in steps]
-        np.testing.assert_allclose(slopes, np.array(measured), rtol=1e-6, atol=1e-6)
 
 
 class TestBetweenLooks:

@@ -260,12 +260,12 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("losses", "said"),
         [
-            ([nothing], r"expected a tuple of functions, \(loss,\) for one, found list"),
+            ([nothing], r"expected a tuple of functions, such as \(loss,\), found list"),
             (nothing, "found function"),
             ((1.0,), "expected functions loss"),
             ((nothing, nothing), "two named 'nothing'"),
-            ((lambda *_: jnp.zeros(3),), r"expected a scalar of <lambda>, found shape \(3,\)"),
-            ((lambda *_: None,), "expected a scalar of <lambda>, found None"),
+            ((lambda *_: jnp.zeros(3),), r"expected a scalar from <lambda>, found shape \(3,\)"),
+            ((lambda *_: None,), "expected a scalar from <lambda>, found None"),
         ],
     )
     def test_what_is_no_loss_is_refused(self, losses, said):

@@ -8,28 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.geometry.cameras import Camera, camera_centers, project
+from gsjax.engine.drive import drive
+from gsjax.geometry.cameras import camera_centers, on_device, project
 from gsjax.methods.fit import (
     Batch,
+    Fit,
     FitConfig,
-    FitState,
     GrowthConfig,
     Model,
-    Observation,
     RatesConfig,
     SplitConfig,
     StartConfig,
-    View,
-    begin,
     extent_of,
-    fit,
     fit_loss,
 )
-from gsjax.methods.fit.method import _observe, enlarged
+from gsjax.methods.fit.method import on_device_at
 from gsjax.methods.fit.model import exposed, refined
 from gsjax.methods.fit.start import start_points
 from gsjax.optim.densification import is_alive
 from gsjax.rasterize.plan import rung
+from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render, render
 from tests.methods.photographed_blobs import HEIGHT, WIDTH, cameras, photographed_blobs
 
@@ -43,8 +41,23 @@ def views():
     return photographed_blobs()
 
 
-def without_depth(views: list[View]) -> list[View]:
-    return [view._replace(depth=None) for view in views]
+def having(frame: Frame, **changes) -> Frame:
+    """The frame with other images, depths, masks or viewmats."""
+    viewmat = changes.pop("viewmat", None)
+    frame = replace(frame, **changes)
+    if viewmat is None:
+        return frame
+    return replace(frame, cameras=replace(frame.cameras, viewmat=viewmat))
+
+
+def without_depth(views: list[Frame]) -> list[Frame]:
+    return [having(view, depths=None) for view in views]
+
+
+def fitted_to(views, config, progress=None, **options):
+    """A fit that is yet to be driven."""
+    method = Fit(config, **options)
+    return drive(method, *method.start(views), progress=progress)
 
 
 def copied(tree):
@@ -52,32 +65,28 @@ def copied(tree):
     return jax.tree.map(lambda leaf: np.array(leaf) if hasattr(leaf, "shape") else leaf, tree)
 
 
-def picture(gaussians, view: View) -> np.ndarray:
-    camera = Camera(
-        jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(view.K, jnp.float32)[None], WIDTH, HEIGHT
-    )
-    return np.asarray(render(gaussians, camera).colors[0])
+def picture(gaussians, view: Frame) -> np.ndarray:
+    return np.asarray(render(gaussians, on_device(view.cameras)).colors[0])
 
 
-def psnr(gaussians, view: View) -> float:
-    return -10 * np.log10(np.mean((picture(gaussians, view) - view.image / 255) ** 2))
+def psnr(gaussians, view: Frame) -> float:
+    return -10 * np.log10(np.mean((picture(gaussians, view) - view.images[0] / 255) ** 2))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("source", "steps"), [("depth", 60), ("random", 400)])
 def test_a_view_that_was_held_out_is_seen_better_and_better(views, source, steps):
     config = replace(QUICK, steps=steps, start=replace(QUICK.start, source=source))
-    problem, state = begin(views[1:], config)
-    assert problem.start == source
-    before = psnr(state.gaussians, views[0])
-    shrinks = []
-    for fitted in fit(problem, state):
-        shrinks.append(fitted.shrink)
-        assert not bool(fitted.info["skipped"])
-    assert fitted.state.step == config.steps
-    assert sorted(set(shrinks), reverse=True) == [4, 2, 1] == list(dict.fromkeys(shrinks))
-    assert fitted.state.gaussians.sh_degree == 1
-    assert psnr(fitted.state.gaussians, views[0]) > before + 1.5
+    ticks = fitted_to(views[1:], config)
+    assert ticks.problem.start == source
+    before, sizes = psnr(ticks.run.params.gaussians, views[0]), []
+    for now in ticks:
+        sizes.append(max(now.run.plans, key=list(now.run.plans).index))
+        assert not bool(now.info["skipped"])
+    assert now.step == config.steps
+    assert [name.split(":")[0] for name in dict.fromkeys(sizes)] == ["4", "2", "1"]
+    assert now.result.sh_degree == 1
+    assert psnr(now.result, views[0]) > before + 1.5
 
 
 SPLITTING = replace(
@@ -103,20 +112,19 @@ SPLITTING = replace(
     ],
 )
 def test_a_resumed_fit_is_equal_to_the_bit(views, config):
-    problem, state = begin(without_depth(views), config)
-    for fitted in fit(problem, state):
-        if fitted.state.step == 37:
-            halfway = copied(fitted.state)  # before the degree changes, or more slots are taken, at 40
-    problem, _ = begin(without_depth(views), config)
-    arrays = jax.tree.map(jnp.asarray, (halfway.model, halfway.optimizer))
-    *_, again = fit(problem, FitState(*arrays, halfway.step, halfway.capacity))
-    jax.tree.map(np.testing.assert_array_equal, copied(again.state), copied(fitted.state))
+    for now in fitted_to(without_depth(views), config):
+        if now.step == 37:  # before the degree changes, or more slots are taken, at 40
+            halfway = copied(now.run)
+    method = Fit(config)
+    problem, _ = method.start(without_depth(views))
+    *_, again = drive(method, problem, jax.tree.map(jnp.asarray, halfway).having(step=halfway.step))
+    jax.tree.map(np.testing.assert_array_equal, copied(again.run), copied(now.run))
 
 
 @pytest.mark.slow
 def test_splitting_takes_more_slots_as_it_needs_them_up_to_the_cap(views):
-    problem, state = begin(without_depth(views), SPLITTING)
-    slots = [state.gaussians.num] + [fitted.state.gaussians.num for fitted in fit(problem, state)]
+    ticks = fitted_to(without_depth(views), SPLITTING)
+    slots = [ticks.run.params.gaussians.num] + [now.run.params.gaussians.num for now in ticks]
     assert sorted(set(slots)) == [rung(4500), rung(6000), 9000]
     assert slots == sorted(slots)
 
@@ -125,26 +133,23 @@ def test_splitting_takes_more_slots_as_it_needs_them_up_to_the_cap(views):
 def test_exposure_is_learned_where_photographs_differ_in_it(views):
     gains = np.linspace(0.6, 1.0, len(views))
     dimmed = [
-        v._replace(image=np.round(g * v.image).astype(np.uint8)) for g, v in zip(gains, views, strict=True)
+        having(v, images=np.round(g * v.images).astype(np.uint8)) for g, v in zip(gains, views, strict=True)
     ]
     config = replace(QUICK, steps=300, sh_degree=0, coarse_until=0.0, rates=RatesConfig(exposures=3e-3))
-    told = {}
+    off = {}
     for exposure in (False, True):
-        problem, state = begin(dimmed, replace(config, exposure=exposure))
-        *_, fitted = fit(problem, state)
-        told[exposure] = np.mean(
-            [
-                float(np.abs(seen_as(fitted.state.model, v, i) - v.image / 255).mean())
-                for i, v in enumerate(dimmed)
-            ]
-        )
-    assert told[True] < 0.85 * told[False]
-    maps = fitted.state.model.exposures
+        *_, now = fitted_to(dimmed, replace(config, exposure=exposure))
+        seen = [
+            np.abs(seen_as(now.run.params, v, i) - v.images[0] / 255).mean() for i, v in enumerate(dimmed)
+        ]
+        off[exposure] = np.mean(seen)
+    assert off[True] < 0.85 * off[False]
+    maps = now.run.params.exposures
     found = np.asarray(1 + (maps - maps.mean(0))[:, np.arange(3), np.arange(3)].mean(-1))
     assert np.corrcoef(found, gains)[0, 1] > 0.9
 
 
-def seen_as(model: Model, view: View, number: int) -> np.ndarray:
+def seen_as(model: Model, view: Frame, number: int) -> np.ndarray:
     drawn = jnp.asarray(picture(model.gaussians, view))[None]
     return np.asarray(
         drawn if model.exposures is None else exposed(drawn, model.exposures, jnp.int32(number))
@@ -155,19 +160,16 @@ def seen_as(model: Model, view: View, number: int) -> np.ndarray:
 def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
     random = np.random.default_rng(3)
     twists = np.concatenate([random.normal(size=(8, 3)) * 0.02, random.normal(size=(8, 3)) * 0.01], axis=1)
-    off = [v._replace(viewmat=moved(v, twists.mean(0) - twists, i, 3.3)) for i, v in enumerate(views)]
+    off = [having(v, viewmat=moved(v, twists.mean(0) - twists, i, 3.3)) for i, v in enumerate(views)]
     config = replace(QUICK, steps=250, sh_degree=0, coarse_until=0.0, refine_poses=True)
-    problem, state = begin(off, replace(config, rates=RatesConfig(twists=2e-3)))
-    *_, fitted = fit(problem, state)
-    found = [
-        v._replace(viewmat=moved(v, fitted.state.model.twists, i, problem.extent.radius))
-        for i, v in enumerate(off)
-    ]
+    *_, now = fitted_to(off, replace(config, rates=RatesConfig(twists=2e-3)))
+    twists, radius = now.run.params.twists, now.problem.extent.radius
+    found = [having(v, viewmat=moved(v, twists, i, radius)) for i, v in enumerate(off)]
 
     def pixels_off(others):
         points = jnp.asarray(random.uniform(-0.6, 0.6, (50, 3)))
         seen = [
-            [project(points, jnp.asarray(v.viewmat), jnp.asarray(v.K))[0] for v in pair]
+            [project(points, jnp.asarray(v.cameras.viewmat[0]), jnp.asarray(v.cameras.K[0]))[0] for v in pair]
             for pair in zip(others, views, strict=True)
         ]
         return np.mean([np.abs(a - b).mean() for a, b in seen])
@@ -176,13 +178,13 @@ def test_cameras_that_stand_elsewhere_than_was_said_are_found(views):
     assert pixels_off(found) < 0.4 * pixels_off(off)
 
 
-def moved(view: View, twists, number: int, radius: float) -> np.ndarray:
-    viewmat, twists = jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(twists, jnp.float32)
-    return np.asarray(refined(viewmat, twists, jnp.int32(number), radius)[0])
+def moved(view: Frame, twists, number: int, radius: float) -> np.ndarray:
+    viewmat, twists = jnp.asarray(view.cameras.viewmat, jnp.float32), jnp.asarray(twists, jnp.float32)
+    return np.asarray(refined(viewmat, twists, jnp.int32(number), radius))
 
 
 def test_a_turned_camera_stays_where_it_is_and_twists_of_all_move_none(views):
-    viewmats = jnp.asarray(np.stack([v.viewmat for v in views[:2]]))
+    viewmats = jnp.asarray(np.concatenate([v.cameras.viewmat for v in views[:2]]))
     twists = jnp.array([[0.1, -0.2, 0.3, 0, 0, 0], [-0.1, 0.2, -0.3, 0, 0, 0.0]])
     turned = refined(viewmats, twists, jnp.int32(0), 2.0)
     np.testing.assert_allclose(camera_centers(turned), camera_centers(viewmats), atol=1e-6)
@@ -195,46 +197,41 @@ def test_a_turned_camera_stays_where_it_is_and_twists_of_all_move_none(views):
 def test_slots_fill_up_to_the_cap_and_no_further(views):
     growth = replace(QUICK.growth, every=5, begin=5, factor=1.5, opacity_cost=0.0)
     config = replace(QUICK, growth=growth, start=StartConfig(source="depth", count=40, opacity=0.5))
-    problem, state = begin(views, config)
-    first = int(is_alive(state.gaussians).sum())
-    counts = [
-        int(is_alive(fitted.state.gaussians).sum()) for fitted in fit(problem, state, share=lambda i: i / 40)
-    ]
+    ticks = fitted_to(views, config, lambda i: i / 41)
+    first = int(is_alive(ticks.run.params.gaussians).sum())
+    counts = [int(is_alive(now.run.params.gaussians).sum()) for now in ticks]
     assert first == 40
     assert max(counts) == config.cap
 
 
 def test_what_a_mask_leaves_out_has_no_slope_and_costs_nothing(views):
-    view = views[0]
-    _, state = begin([view], QUICK)
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[:, : WIDTH // 2] = True
-    camera = Camera(
-        jnp.asarray(view.viewmat, jnp.float32)[None], jnp.asarray(view.K, jnp.float32)[None], WIDTH, HEIGHT
-    )
-    plan = plan_render(state.gaussians, camera)
-    loss = fit_loss(replace(QUICK, growth=replace(QUICK.growth, opacity_cost=0.0, scale_cost=0.0)), 1.0)
+    view, method = views[0], Fit(QUICK)
+    model = method.start([view])[1].params
+    mask = np.zeros((1, HEIGHT, WIDTH), bool)
+    mask[..., : WIDTH // 2] = True
+    camera = on_device(view.cameras)
+    plan = plan_render(model.gaussians, camera)
+    loss = fit_loss(replace(QUICK, growth=replace(QUICK.growth, opacity_cost=0.0, scale_cost=0.0)))
 
-    def of(image):
-        seen = Observation(jnp.asarray(image)[None], jnp.asarray(mask)[None], None, camera, jnp.int32(0))
-        batch = Batch(seen, jnp.zeros((1, 3)), plan)
-        return jax.jit(jax.value_and_grad(lambda g: loss(g, batch, step=0, key=None)[0]))(state.model)
+    def of(images):
+        frame = Frame(jnp.asarray(images), None, camera, jnp.asarray(mask))
+        batch = Batch(frame, jnp.int32(0), jnp.zeros((1, 3)), 0.0, 1.0, plan)
+        return jax.jit(jax.value_and_grad(lambda m: loss(m, batch, step=0, key=None)[0]))(model)
 
-    garbled = view.image.copy()
-    garbled[:, WIDTH // 2 + 12 :] = (
-        255 - garbled[:, WIDTH // 2 + 12 :]
-    )  # further off than SSIM's windows reach
-    value, slope = of(view.image)
+    garbled = view.images.copy()
+    beyond = WIDTH // 2 + 12  # further off than SSIM's windows reach
+    garbled[:, :, beyond:] = 255 - garbled[:, :, beyond:]
+    value, slope = of(view.images)
     other, other_slope = of(garbled)
     np.testing.assert_allclose(other, value, rtol=1e-5)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), other_slope, slope)
 
 
 def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(views):
-    problem, state = begin(views, QUICK)
-    *_, fitted = fit(problem, state, share=lambda i: i / 3)
-    model, optimizer = fitted.state.model, fitted.state.optimizer
-    wider, known = enlarged(problem, model, optimizer, 2, QUICK.cap + 30)
+    *_, now = fitted_to(views, QUICK, lambda i: i / 3)
+    model, optimizer = now.run.params, now.run.state
+    larger = Fit(QUICK)._enlarged(now.run, degree=2, slots=QUICK.cap + 30)
+    wider, known = larger.params, larger.state
     assert wider.gaussians.sh_degree == 2
     assert wider.gaussians.num == QUICK.cap + 30
     np.testing.assert_allclose(
@@ -245,21 +242,22 @@ def test_more_coefficients_and_slots_draw_the_same_and_keep_what_adam_knows(view
     assert before.keys() < after.keys()
     for path, leaf in before.items():
         np.testing.assert_array_equal(after[path][tuple(slice(0, size) for size in leaf.shape)], leaf)
-    assert enlarged(problem, wider, known, 1, 10)[0] is wider  # never back
+    assert Fit(QUICK)._enlarged(larger, degree=1, slots=10) is larger  # never back
 
 
 def test_masks_that_leave_nothing_are_refused(views):
-    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    nothing = np.zeros((1, HEIGHT, WIDTH), bool)
     with pytest.raises(ValueError, match="are they inverted"):
-        begin([view._replace(mask=nothing) for view in views], QUICK)
+        Fit(QUICK).start([having(view, masks=nothing) for view in views])
 
 
 def test_poison_in_a_photograph_cannot_be_and_in_a_gaussian_skips_the_step(views):
-    problem, state = begin(views, QUICK)
-    sick = eqx.tree_at(lambda s: s.model.gaussians.sh0, state, state.gaussians.sh0.at[3].set(jnp.nan))
-    (fitted, *_) = fit(problem, sick, share=lambda i: i / 1)
-    assert bool(fitted.info["skipped"])
-    assert np.isfinite(np.asarray(fitted.state.gaussians.means)).all()
+    method = Fit(QUICK)
+    problem, run = method.start(views)
+    sick = eqx.tree_at(lambda r: r.params.gaussians.sh0, run, run.params.gaussians.sh0.at[3].set(jnp.nan))
+    (now, *_) = drive(method, problem, sick, progress=lambda i: i / 1)
+    assert bool(now.info["skipped"])
+    assert np.isfinite(np.asarray(now.run.params.gaussians.means)).all()
 
 
 def test_an_extent_is_that_of_the_cameras_and_where_they_look():
@@ -290,7 +288,7 @@ def test_starts_that_the_data_does_not_have_are_refused(views):
         with pytest.raises(ValueError, match=r"start.source: the data has no .*; use"):
             start_points(without_depth(views), None, config, 0)
     with pytest.raises(ValueError, match="at least one photograph"):
-        begin([], QUICK)
+        Fit(QUICK).start([])
     cloud = (np.zeros((3, 3)), np.full((3, 3), 0.5))
     assert start_points(views, cloud, StartConfig(), 0)[2] == "cloud"
 
@@ -311,7 +309,7 @@ def test_points_in_another_unit_than_the_poses_are_told(views):
     points, colors = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)), np.full((50, 3), 0.5)
     with pytest.warns(UserWarning, match=r"so far away .* are they in the unit of the poses"):
         start_points(views, (1e3 * points, colors), StartConfig(), 0)
-    same_place = [view._replace(viewmat=views[0].viewmat) for view in views]
+    same_place = [having(view, viewmat=views[0].cameras.viewmat) for view in views]
     start_points(same_place, (points, colors), StartConfig(), 0)  # says nothing: a warning fails the test
 
 
@@ -339,34 +337,27 @@ def test_settings_without_meaning_are_refused(kind, name, value, says):
 
 def test_another_background_than_that_of_the_data_is_refused(views):
     with pytest.raises(ValueError, match="leave it at data"):
-        begin(views, replace(QUICK, background="random"), background=(1.0, 1.0, 1.0))
+        Fit(replace(QUICK, background="random")).start(views, background=(1.0, 1.0, 1.0))
 
 
 def test_depth_that_knows_nothing_is_no_start(views):
-    blind = [view._replace(depth=np.zeros_like(view.depth)) for view in views]
+    blind = [having(view, depths=np.zeros_like(view.depths)) for view in views]
     assert start_points(blind, None, StartConfig(count=10), 0)[2] == "random"
     with pytest.raises(ValueError, match="the data has no depth"):
         start_points(blind, None, StartConfig(source="depth"), 0)
 
 
 def test_photographs_with_and_without_masks_and_depth_share_one_program(views):
-    ones = np.ones((HEIGHT, WIDTH), bool)
+    ones = np.ones((1, HEIGHT, WIDTH), bool)
     holed = ones.copy()
-    holed[0, 0] = False  # which is gone in a smaller picture
+    holed[0, 0, 0] = False  # which is gone in a smaller picture
     mixed = [
-        view._replace(mask=[None, ones, holed][i % 3], depth=view.depth if i % 2 else None)
+        having(view, masks=[None, ones, holed][i % 3], depths=view.depths if i % 2 else None)
         for i, view in enumerate(views)
     ]
-    kinds = {
-        jax.tree.structure(_observe(view, i, shrink, (True, True)))
-        for i, view in enumerate(mixed)
-        for shrink in (1,)
-    }
-    assert len(kinds) == 1
-    problem, state = begin(
-        mixed, replace(QUICK, sh_degree=0, coarse_until=0.0, growth=GrowthConfig(begin=99))
-    )
-    compiling = [fitted.compile_seconds > 0 for fitted in fit(problem, state, share=lambda i: i / 12)]
+    assert len({jax.tree.structure(on_device_at(mixed, i, 1)) for i in range(len(mixed))}) == 1
+    config = replace(QUICK, sh_degree=0, coarse_until=0.0, growth=GrowthConfig(begin=99))
+    compiling = [now.compile_seconds > 0.1 for now in fitted_to(mixed, config, lambda i: i / 12)]
     assert sum(compiling) == 1
 
 
@@ -376,6 +367,5 @@ def test_few_grow_too(views):
     config = replace(
         QUICK, growth=growth, start=StartConfig(source="depth", count=4, opacity=0.9), sh_degree=0
     )
-    problem, state = begin(views[:4], config)
-    *_, fitted = fit(problem, state, share=lambda i: i / 16)
-    assert int(fitted.info["alive"]) > 4
+    *_, now = fitted_to(views[:4], config, lambda i: i / 16)
+    assert int(now.info["alive"]) > 4

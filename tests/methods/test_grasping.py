@@ -226,5 +226,5 @@ def test_a_gripper_without_a_size_is_refused(name, value):
 
 
 def test_no_samples_are_refused():
-    with pytest.raises(ValueError, match="samples is 0"):
+    with pytest.raises(ValueError, match="samples: expected 1 or more, found 0"):
         grasp(cylinder(0.03, 0.1, 10), samples=0)

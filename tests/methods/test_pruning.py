@@ -5,17 +5,19 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.geometry.cameras import intrinsics, look_at
-from gsjax.methods.fit import View, light_of, needed
+from gsjax.geometry.cameras import Camera, intrinsics, look_at
+from gsjax.methods.fit import light_of, needed
 from gsjax.rasterize.reference import rasterization_reference
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import gaussians_from_activated
 
 WIDTH, HEIGHT = 32, 24
 
 
-def view(eye) -> View:
-    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    return View(image, None, None, look_at(np.array(eye), np.zeros(3)), intrinsics(30.0, WIDTH, HEIGHT))
+def view(eye) -> Frame:
+    viewmat, K = look_at(np.array(eye), np.zeros(3)), intrinsics(30.0, WIDTH, HEIGHT)
+    camera = Camera(viewmat[None], K[None], WIDTH, HEIGHT)
+    return Frame(np.zeros((1, HEIGHT, WIDTH, 3), np.uint8), None, camera)
 
 
 def wall(count=60):
@@ -41,8 +43,8 @@ def test_light_is_the_sum_of_weights_in_the_view_that_sees_the_most():
             gaussians.scales,
             gaussians.opacities,
             jnp.eye(gaussians.num),
-            jnp.asarray(one.viewmat),
-            jnp.asarray(one.K),
+            jnp.asarray(one.cameras.viewmat[0]),
+            jnp.asarray(one.cameras.K[0]),
             WIDTH,
             HEIGHT,
         )[0]
@@ -70,6 +72,5 @@ def test_what_is_left_out_is_needed_least_and_sends_no_more_than_the_share(light
 
 
 def test_a_scene_that_is_small_in_its_pictures_is_needed_all_the_same():
-    far = look_at(np.array([60.0, 0.0, 0.0]), np.zeros(3))
-    light = light_of(wall(), [view((3.0, 0.2, 0.5))._replace(viewmat=far)])
+    light = light_of(wall(), [view((60.0, 0.0, 0.0))])
     assert needed(light, 0.002).sum() > 100

@@ -1,5 +1,5 @@
-"""The tracker's step as a pair of pure functions: what composes with it, and what it does where nothing can be
-said."""
+"""The tracker's step as a pair of pure functions: how it composes, and what it does with frames that say
+nothing."""
 
 from dataclasses import replace
 from functools import partial

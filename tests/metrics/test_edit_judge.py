@@ -1,4 +1,4 @@
-"""The scripted judge on a square that was asked to go to the right: done, not done, half done, badly done."""
+"""The scripted judge on a request to move a square to the right: done, not done, half done, badly done."""
 
 import math
 
@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 from gsjax.geometry.cameras import intrinsics
 from gsjax.metrics.edit_judge import (
     Finding,
-    asked_displacement,
-    asked_motion_is_seen,
     place_is_clean,
+    requested_displacement,
+    requested_motion_is_seen,
     rest_stays,
     worst,
 )
@@ -23,7 +23,7 @@ FRAMES, HEIGHT, WIDTH, SIDE = 2, 24, 40, 8
 
 
 def scene(seed, x):
-    """A textured square whose left side is at `x`, before a pattern; and where it is."""
+    """A textured square whose left side is at `x`, in front of a pattern; its mask; and the pattern alone."""
     rng = np.random.default_rng(seed)
     behind = 0.5 * gaussian_filter(rng.uniform(size=(HEIGHT, WIDTH, 3)), (1, 1, 0))
     part = np.zeros((FRAMES, HEIGHT, WIDTH), bool)
@@ -33,7 +33,7 @@ def scene(seed, x):
     return video, part, np.tile(behind, (FRAMES, 1, 1, 1))
 
 
-def asked_to_go(part, pixels):
+def requested_shift(part, pixels):
     displacement = np.full((*part.shape, 2), np.nan)
     displacement[part] = [pixels, 0.0]
     return displacement
@@ -44,34 +44,34 @@ def test_what_was_asked_and_done_is_perfect(seed, pixels):
     before, part, behind = scene(seed, 6)
     after, there, _ = scene(seed, 6 + pixels)
     assert rest_stays(before, after, part | there).score == 1
-    assert asked_motion_is_seen(before, after, asked_to_go(part, pixels)).score == 1
+    assert requested_motion_is_seen(before, after, requested_shift(part, pixels)).score == 1
     assert place_is_clean(after, np.ones(part.shape), behind, part & ~there).score == 1
 
 
 @given(seeds, st.integers(1, 20))
 def test_what_was_asked_and_not_done_is_nothing(seed, pixels):
     before, part, _ = scene(seed, 6)
-    assert asked_motion_is_seen(before, before, asked_to_go(part, pixels)).score == 0
+    assert requested_motion_is_seen(before, before, requested_shift(part, pixels)).score == 0
     deleted = np.where(part[..., None], 0.0, before)
-    assert asked_motion_is_seen(before, deleted, asked_to_go(part, pixels)).score < 0.2
+    assert requested_motion_is_seen(before, deleted, requested_shift(part, pixels)).score < 0.2
 
 
 def test_another_way_than_asked_is_not_found():
     before, part, _ = scene(0, 6)
     after, _, _ = scene(0, 9)
-    wrong = asked_motion_is_seen(before, after, asked_to_go(part, 12))
+    wrong = requested_motion_is_seen(before, after, requested_shift(part, 12))
     assert wrong.score < 0.2
     assert "12.0 pixels away" in wrong.reason
 
 
 def test_pixels_that_would_look_the_same_do_not_count():
-    """The inside of a plain square tells nothing; its leading edge does."""
+    """The inside of a uniform square is not informative; its leading edge is."""
     before, after = np.zeros((2, 1, 16, 32, 3))
     before[:, 4:12, 4:12], after[:, 4:12, 7:15] = 1.0, 1.0
     part = before[..., 0] > 0
-    assert asked_motion_is_seen(before, after, asked_to_go(part, 3)).reason.startswith("24 of 24 ")
-    assert asked_motion_is_seen(before, before, asked_to_go(part, 3)).reason.startswith("0 of 24 ")
-    unasked = asked_motion_is_seen(before, after, asked_to_go(part, 0))
+    assert requested_motion_is_seen(before, after, requested_shift(part, 3)).reason.startswith("24 of 24 ")
+    assert requested_motion_is_seen(before, before, requested_shift(part, 3)).reason.startswith("0 of 24 ")
+    unasked = requested_motion_is_seen(before, after, requested_shift(part, 0))
     assert math.isnan(unasked.score)
     assert unasked.reason.startswith("no pixel to judge whether")
 
@@ -120,14 +120,14 @@ def test_an_edit_is_as_good_as_its_worst_side():
 
 
 def test_a_displacement_follows_from_depth_and_motion():
-    """10 cm to the right at 2 m and a focal length of 100 are 5 pixels; what is nearer goes further."""
+    """10 cm to the right at 2 m and a focal length of 100 are 5 pixels; nearer points move farther."""
     depth, after, part = np.full((6, 24), 2.0), np.full((6, 24), 3.0), np.ones((6, 24), bool)
     depth[0], depth[1, 1], part[2, 2] = 1.0, 0.0, False
-    after[3, 10], after[3, 12], after[3, 14] = 1.9, 1.99, 0.0  # in the way; as near as can be told; unknown
+    after[3, 10], after[3, 12], after[3, 14] = 1.9, 1.99, 0.0  # in the way; within the tolerance; unknown
     motion, viewmat = np.eye(4), np.eye(4)
     motion[0, 3], viewmat[:3, 3] = 0.1, [0.3, -0.2, 0.0]
     camera = (viewmat, intrinsics(100.0, 24, 6))
-    asked = asked_displacement(depth, after, part, motion, *camera)
+    asked = requested_displacement(depth, after, part, motion, *camera)
     expected = np.zeros((6, 24, 2))
     expected[0, :, 0], expected[1:, :, 0] = 10.0, 5.0
     expected[0, 14:] = expected[1:, 19:] = np.nan  # out of the picture
@@ -135,7 +135,7 @@ def test_a_displacement_follows_from_depth_and_motion():
     np.testing.assert_allclose(asked, expected, atol=1e-3)
     back = np.eye(4)
     back[2, 3] = -2.5
-    assert np.isnan(asked_displacement(depth, after, part, back, *camera)).all()
+    assert np.isnan(requested_displacement(depth, after, part, back, *camera)).all()
 
 
 def test_shapes_that_do_not_fit_are_named():
@@ -143,6 +143,6 @@ def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"touched: expected shape \(2, 24, 40\), found \(1, 24, 40\)"):
         rest_stays(before, before, part[1:])
     with pytest.raises(ValueError, match=r"after: expected shape \(2, 24, 40, 3\), found \(1, 24, 40, 3\)"):
-        asked_motion_is_seen(before, before[1:], asked_to_go(part, 1))
+        requested_motion_is_seen(before, before[1:], requested_shift(part, 1))
     with pytest.raises(ValueError, match=r"alphas: expected shape \(2, 24, 40\), found \(2, 23, 40\)"):
         place_is_clean(before, np.ones((2, 23, 40)), behind, part)

@@ -1,4 +1,4 @@
-"""f-PSNR by hand, and as it follows from the cosine."""
+"""f-PSNR computed by hand, and from the cosine."""
 
 import math
 
@@ -20,7 +20,7 @@ def test_feature_psnr_follows_from_the_cosine(seed, channels):
         np.linalg.norm(features, axis=-1) * np.linalg.norm(teacher, axis=-1)
     )
     lengths = rng.uniform(0.1, 10, (4, 5, 1))
-    if channels > 1:  # of one channel all that differ are opposite, or none
+    if channels > 1:  # with one channel, features are equal or opposite
         expected = 10 * math.log10(channels / (2 - 2 * cosines.mean()))
         assert feature_psnr(features, teacher) == pytest.approx(expected)
         assert feature_psnr(lengths * features, teacher) == pytest.approx(expected)
@@ -30,7 +30,7 @@ def test_feature_psnr_follows_from_the_cosine(seed, channels):
 def test_feature_psnr_by_hand():
     x, y = np.broadcast_to([3.0, 0, 0, 0], (2, 3, 4)), np.broadcast_to([0, 1.0, 0, 0], (2, 3, 4))
     assert feature_psnr(x, y) == pytest.approx(10 * math.log10(4 / 2))
-    assert feature_psnr(x, 0 * y) == pytest.approx(10 * math.log10(4))  # what is nothing stays nothing
+    assert feature_psnr(x, 0 * y) == pytest.approx(10 * math.log10(4))  # zeros stay zeros
     assert feature_psnr(x, x) == math.inf
     mask = np.zeros((2, 3), bool)
     assert math.isnan(feature_psnr(x, y, mask))

@@ -1,4 +1,4 @@
-"""Divisions against brute force over pairs and permutations; joints moved by known errors."""
+"""Labelings against brute force over pairs and permutations; joints perturbed by known errors."""
 
 import math
 from itertools import combinations, permutations
@@ -24,7 +24,7 @@ def labelings(seed, count=14, found=4, true=3, unknown=True):
 
 @given(seeds)
 def test_the_rand_index_is_that_of_all_pairs(seed):
-    """Pairs that both, one or none hold together, counted one by one, and adjusted as the definition says."""
+    """Counts pairs that are together in both, one or neither, and applies the definition."""
     predicted, true = labelings(seed)
     known = np.flatnonzero(true != -1)
     pairs = list(combinations(known, 2))
@@ -117,14 +117,14 @@ def made_up(kind, seed):
 
 
 def across(axis, rng):
-    """A direction at right angles to an axis."""
+    """A random direction perpendicular to an axis."""
     side = np.cross(axis, rng.normal(size=3))
     return side / np.linalg.norm(side)
 
 
 @given(kinds, seeds)
-def test_a_joint_said_otherwise_is_the_same_joint(kind, seed):
-    """Axis and values of the other sign, another point of the line, another zero."""
+def test_an_equivalent_joint_has_no_error(kind, seed):
+    """Axis and values of opposite sign, another point on the axis, another zero."""
     joint, middle, rng = made_up(kind, seed)
     same = Joint(kind, -joint.axis, joint.point + rng.normal() * joint.axis, 0.4 - joint.values)
     error = joint_error(same, joint, middle, anchor=int(rng.integers(6)))
@@ -136,7 +136,7 @@ def test_a_joint_said_otherwise_is_the_same_joint(kind, seed):
 
 
 @given(kinds, seeds, st.floats(0, 89))
-def test_a_tilt_is_as_many_degrees_as_it_is(kind, seed, degrees):
+def test_a_tilted_axis_is_off_by_the_tilt(kind, seed, degrees):
     joint, middle, rng = made_up(kind, seed)
     tilt = Rotation.from_rotvec(np.radians(degrees) * across(joint.axis, rng))
     tilted = Joint(kind, tilt.apply(joint.axis), joint.point, joint.values)
@@ -144,8 +144,8 @@ def test_a_tilt_is_as_many_degrees_as_it_is(kind, seed, degrees):
 
 
 @given(seeds, st.floats(0, 0.3), st.floats(-1, 1))
-def test_a_line_is_off_by_as_much_as_it_is_beside_the_part(seed, metres, radians):
-    """Parallel, by how far it was moved; tilted about where it is nearest to the part, not at all."""
+def test_the_distance_of_an_axis_is_measured_next_to_the_part(seed, metres, radians):
+    """A parallel axis is off by its offset; one tilted about its point nearest to the part, not at all."""
     joint, middle, rng = made_up("revolute", seed)
     beside = joint.point + (middle - joint.point) @ joint.axis * joint.axis
     moved = Joint("revolute", joint.axis, joint.point + metres * across(joint.axis, rng), joint.values)
@@ -156,7 +156,7 @@ def test_a_line_is_off_by_as_much_as_it_is_beside_the_part(seed, metres, radians
 
 def test_lines_that_meet_far_away_are_not_near():
     true = Joint("revolute", np.array([0.0, 0.0, 1.0]), np.zeros(3), np.zeros(2))
-    axis = np.array([-0.05, 0.0, 50.0]) / math.hypot(0.05, 50)  # it meets the true line 50 m further up
+    axis = np.array([-0.05, 0.0, 50.0]) / math.hypot(0.05, 50)  # it meets the true axis 50 m farther up
     found = Joint("revolute", axis, np.array([0.05, 0.0, 0.0]), np.zeros(2))
     assert joint_error(found, true, np.array([0.3, 0.3, 0.0])).line_mm == pytest.approx(50, abs=1e-3)
 
@@ -167,7 +167,7 @@ def test_values_are_compared_since_the_anchor():
     assert joint_error(half, true, np.zeros(3)).value_mm == pytest.approx((0 + 50 + 150) / 3)
     assert joint_error(half, true, np.zeros(3), anchor=2).value_mm == pytest.approx((150 + 100 + 0) / 3)
     hinge, other_way = (Joint("revolute", x, np.zeros(3), v) for v in (values, -values))
-    error = joint_error(other_way, hinge, np.zeros(3))  # the same axis, and it opens to the wrong side
+    error = joint_error(other_way, hinge, np.zeros(3))  # the same axis, opening to the wrong side
     assert error.value_deg == pytest.approx(np.degrees(2 * 0.4 / 3))
 
 

@@ -1,4 +1,4 @@
-"""LPIPS against a plain float64 one with random weights; files that are none of its own are refused."""
+"""LPIPS against a plain float64 implementation with random weights; unsupported files are refused."""
 
 import json
 import math
@@ -9,8 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from gsjax.metrics.perceptual import load_lpips, lpips
 
-# (index, channels, window, stride, padding) of a convolution, a number for a maximum of that window; * is
-# compared. As in the papers' tables, and not as the package has it.
+# (index, channels, window, stride, padding) of a convolution; a number is max pooling with that window; *
+# marks a layer that is compared. Written as in the papers' tables, independently of the package.
 ALEXNET = (
     (0, 64, 11, 4, 2),
     "*",
@@ -47,7 +47,7 @@ def random_weights(network, seed=0):
 
 
 def reference(network, arrays, image, other):
-    """The mean over places of every layer, and the maps, in float64."""
+    """LPIPS and its maps of distances, in float64."""
     x = (2 * np.stack([image, other]) - 1 - [-0.03, -0.088, -0.188]) / [0.458, 0.448, 0.45]
     maps = []
     for entry in network:
@@ -74,7 +74,7 @@ def pictures(shape, seed=1):
 
 
 def write_safetensors(path, arrays):
-    """As the format's specification says."""
+    """Follows the specification of the format."""
     header, end = {"__metadata__": {"format": "pt"}}, 0
     for name, array in arrays.items():
         begin, end = end, end + array.nbytes
@@ -119,7 +119,7 @@ def test_vgg16_agrees_with_a_plain_one_and_may_lie_in_two_files(tmp_path):
     image, other = pictures((19, 23))
     expected, _ = reference(VGG16, arrays, image, other)
     assert lpips(weights, image, other) == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(ValueError, match="want at least 16 on each side for LPIPS with VGG16"):
+    with pytest.raises(ValueError, match="expected at least 16 pixels on each side for LPIPS with VGG16"):
         lpips(weights, image[:15], other[:15])
 
 
@@ -133,7 +133,7 @@ def test_a_mask_weighs_places_by_what_it_covers(alexnet, alexnet_file):
     assert lpips(weights, image, other, np.ones((47, 47), bool)) == pytest.approx(whole, rel=1e-6)
     _, maps = reference(ALEXNET, alexnet, image, other)
     shares = []
-    for layer in maps:  # columns of places, each by how much of it lies left of the edge, and the rows alike
+    for layer in maps:  # columns of places, weighted by the fraction left of the edge
         columns = layer.shape[1]
         covered = np.clip(23 / 47 * columns - np.arange(columns), 0, 1)
         shares.append((layer * covered).sum() / (covered.sum() * layer.shape[0]))
@@ -145,11 +145,11 @@ def test_a_mask_weighs_places_by_what_it_covers(alexnet, alexnet_file):
 def test_pictures_that_do_not_agree_or_are_too_small(alexnet_file):
     weights = load_lpips(alexnet_file)
     image, other = pictures((31, 40))
-    with pytest.raises(ValueError, match=r"reference: got shape \(30, 40, 3\), want \(31, 40, 3\)"):
+    with pytest.raises(ValueError, match=r"reference: expected shape \(31, 40, 3\), found \(30, 40, 3\)"):
         lpips(weights, image, other[1:])
-    with pytest.raises(ValueError, match=r"mask: got shape \(3, 3\), want \(31, 40\)"):
+    with pytest.raises(ValueError, match=r"mask: expected shape \(31, 40\) .* found \(3, 3\)"):
         lpips(weights, image, other, np.ones((3, 3), bool))
-    with pytest.raises(ValueError, match=r"got \(30, 40\) pixels, want at least 31 on each side"):
+    with pytest.raises(ValueError, match=r"expected at least 31 pixels on each side .* found \(30, 40\)"):
         lpips(weights, image[1:], other[1:])
 
 
@@ -174,7 +174,7 @@ def test_a_pickle_inside_an_npz_is_not_read(tmp_path):
 def test_what_is_missing_or_of_another_shape_is_named(alexnet, tmp_path):
     file = tmp_path / "w.npz"
 
-    def said(arrays):
+    def message(arrays):
         np.savez(file, **arrays)
         with pytest.raises(ValueError, match=r"w\.npz: expected") as error:
             load_lpips(file)
@@ -183,14 +183,16 @@ def test_what_is_missing_or_of_another_shape_is_named(alexnet, tmp_path):
     with pytest.raises(FileNotFoundError, match="found nothing there"):
         load_lpips(file)
     other = {"features.0.weight": np.zeros((96, 3, 7, 7))}
-    assert "shape (64, 3, 11, 11) (AlexNet) or (64, 3, 3, 3) (VGG16), found (96, 3, 7, 7)" in said(other)
-    assert "found no such array" in said({"conv.weight": np.zeros(3)})
+    assert "shape (64, 3, 11, 11) (AlexNet) or (64, 3, 3, 3) (VGG16), found (96, 3, 7, 7)" in message(other)
+    assert "found no such array" in message({"conv.weight": np.zeros(3)})
     headless = {name: array for name, array in alexnet.items() if not name.startswith("lin3")}
-    assert "lin3.model.1.weight of shape (1, 256, 1, 1), found no such array" in said(headless)
-    assert "features.3.bias of shape (192,), found (5,)" in said(alexnet | {"features.3.bias": np.zeros(5)})
+    assert "lin3.model.1.weight of shape (1, 256, 1, 1), found no such array" in message(headless)
+    assert "features.3.bias of shape (192,), found (5,)" in message(
+        alexnet | {"features.3.bias": np.zeros(5)}
+    )
     broken = alexnet["features.6.bias"].copy()
     broken[7] = np.nan
-    assert "finite numbers in features.6.bias" in said(alexnet | {"features.6.bias": broken})
+    assert "finite numbers in features.6.bias" in message(alexnet | {"features.6.bias": broken})
 
 
 def test_a_damaged_safetensors_file_is_named(alexnet, tmp_path):
@@ -203,7 +205,5 @@ def test_a_damaged_safetensors_file_is_named(alexnet, tmp_path):
         with pytest.raises(ValueError, match=r"w\.safetensors: expected arrays by name"):
             load_lpips(file)
     write_safetensors(file, {"features.0.weight": np.zeros((64, 3, 3, 3), np.int64)})
-    with pytest.raises(
-        ValueError, match=r"features\.0\.weight is of type I64, which is none of F64, F32, F16"
-    ):
+    with pytest.raises(ValueError, match=r"features\.0\.weight: expected F64 or F32 or F16, found I64"):
         load_lpips(file)

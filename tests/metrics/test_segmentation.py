@@ -1,4 +1,4 @@
-"""Overlap of labels, pooled over pictures."""
+"""Overlap of labels, pooled over images."""
 
 import math
 
@@ -34,16 +34,16 @@ def test_f1_is_dice_and_accuracy_is_the_share_that_is_right():
     overlap = LabelOverlap()
     overlap.add(predicted, true)
     predicted, true = predicted[true >= 0], true[true >= 0]
-    told = []
+    scores = []
     for label in range(4):
         precision, recall = (
             (true[predicted == label] == label).mean(),
             (predicted[true == label] == label).mean(),
         )
-        told.append(2 / (1 / precision + 1 / recall))
-        assert overlap.f1(label) == pytest.approx(told[-1])
-        assert overlap.dice(label) == pytest.approx(told[-1])
-    assert overlap.mean(overlap.f1, range(5)) == pytest.approx(np.mean(told))  # there is no label 4
+        scores.append(2 / (1 / precision + 1 / recall))
+        assert overlap.f1(label) == pytest.approx(scores[-1])
+        assert overlap.dice(label) == pytest.approx(scores[-1])
+    assert overlap.mean(overlap.f1, range(5)) == pytest.approx(np.mean(scores))  # there is no label 4
     assert overlap.accuracy == pytest.approx((predicted == true).mean())
 
 
@@ -67,7 +67,7 @@ def test_unknown_pixels_and_labels_never_seen_score_nothing():
 def test_masks_and_shapes():
     assert iou_of_masks(np.array([True, True, False]), np.array([False, True, False])) == 0.5
     assert math.isnan(iou_of_masks(np.zeros(3, bool), np.zeros(3, bool)))
-    with pytest.raises(ValueError, match=r"predicted: got shape \(2,\), want \(3,\)"):
+    with pytest.raises(ValueError, match=r"predicted: expected shape \(3,\) to match true, found \(2,\)"):
         LabelOverlap().add(np.zeros(2, int), np.zeros(3, int))
 
 
@@ -84,7 +84,7 @@ def test_a_boundary_is_a_band_of_two_percent_of_the_diagonal():
     assert not band[100, 100]
     whole = boundary(square(0, 200))
     assert whole[0, 0]
-    assert not whole[100, 100]  # the picture's edge is an outline too
+    assert not whole[100, 100]  # the edge of the image counts as outline
     np.testing.assert_array_equal(boundary(square(50, 53)), square(50, 53))
 
 

@@ -1,4 +1,4 @@
-"""Steadiness of videos whose motion is known, pixel for pixel."""
+"""Temporal consistency of videos whose motion is known for every pixel."""
 
 import math
 
@@ -30,7 +30,7 @@ FRAMES, HEIGHT, WIDTH, STEP = 4, 24, 32, 2
 
 
 def panned(seed=0, step=STEP):
-    """A window that goes left over a pattern by whole pixels, so that everything in it goes right."""
+    """A window that moves left over a pattern by whole pixels, so that its content moves right."""
     rng = np.random.default_rng(seed)
     pattern = gaussian_filter(rng.uniform(size=(HEIGHT, WIDTH + step * FRAMES, 3)), (1, 1, 0))
     starts = step * np.arange(FRAMES)[::-1]
@@ -59,7 +59,7 @@ def test_along_the_true_flow_nothing_changes(seed):
     video, flows = panned(seed), flows_to_the_right()
     found = flow_warp_error(video, flows)
     assert found.error == pytest.approx(0, abs=1e-12)
-    assert found.share == pytest.approx(1 - STEP / WIDTH)  # what goes out on the right is not compared
+    assert found.share == pytest.approx(1 - STEP / WIDTH)  # pixels that leave on the right are not compared
     assert along_flow(ssim, video, flows) == pytest.approx(1)
     assert t_ssim(video) < 0.9
 
@@ -85,9 +85,10 @@ def test_what_a_mask_hides_counts_neither_where_it_was_nor_where_it_goes():
     assert flow_warp_error(video, flows_to_the_right()).error > 1e-3
     found = flow_warp_error(video, flows_to_the_right(), masks)
     assert found.error == pytest.approx(0, abs=1e-12)
-    # Of the last pair the 16 hidden pixels are not asked for; of the one before they are, and not compared.
-    asked = 3 * HEIGHT * WIDTH - 16
-    assert found.share == pytest.approx((asked - 16 - 3 * STEP * HEIGHT) / asked)
+    # In the last pair the 16 hidden pixels are outside the mask; in the one before they count, but are not
+    # compared.
+    masked = 3 * HEIGHT * WIDTH - 16
+    assert found.share == pytest.approx((masked - 16 - 3 * STEP * HEIGHT) / masked)
     assert along_flow(psnr, video, flows_to_the_right(), masks) > 100
     nothing = flow_warp_error(video, flows_to_the_right(), np.zeros_like(masks))
     assert math.isnan(nothing.error)
@@ -99,7 +100,7 @@ def test_neighbours_are_compared_where_both_masks_are_true():
     masks[1, :12], masks[2, 6:] = True, True
     both = np.zeros((HEIGHT, WIDTH), bool)
     both[6:12] = True
-    expected = psnr(video[2], video[1], both)  # the other pairs share no pixel and are left out
+    expected = psnr(video[2], video[1], both)  # the other pairs of masks do not overlap
     assert between_neighbors(psnr, video, masks) == pytest.approx(expected)
     assert math.isnan(between_neighbors(psnr, video, np.zeros_like(masks)))
 
@@ -159,7 +160,7 @@ def test_bytes_and_floats_mean_the_same():
 
 
 def test_flows_of_a_simulated_scene_explain_its_motion():
-    """Forward and backward flows are those of the scene, and what moves is compared too."""
+    """Forward and backward flow come from the scene, and moving pixels are compared too."""
     sequence = articulated(0, frames=9, width=120, height=90, cameras=1)
     video = np.stack([sequence.image(t, 0) for t in (5, 6, 7)])
     pairs = ((5, 6), (6, 7))

@@ -1,4 +1,4 @@
-"""What tests of least squares share: the solvers, and many updates on one batch."""
+"""Shared by tests of least squares: the solvers, and many updates on one batch."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ SOLVERS = {
 
 
 def scanned(step, params, batch, num):
-    """Infos of `num` updates on one batch, stacked, after the last parameters."""
+    """The final parameters and the stacked infos of `num` updates on one batch."""
 
     def body(carry, i):
         *carry, info = step.update(*carry, batch, step=i, key=None)
@@ -27,5 +27,5 @@ def scanned(step, params, batch, num):
 
 
 def falls(losses) -> bool:
-    """Never up, but for the rounding of two ways to compute one image."""
+    """Whether losses never rise, except by the rounding of two ways to compute one image."""
     return bool((np.diff(losses) <= 1e-6 * losses[:-1]).all())

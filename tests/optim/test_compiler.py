@@ -1,4 +1,4 @@
-"""What makes programs faster on the host changes none of what they give."""
+"""What makes programs faster on the host does not change their results."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from gsjax.optim.compiler import forget_programs, in_memory
 
 
 def read(image, x, finite):
-    """The sum of the two pixels around each place."""
+    """The sum of the two pixels around each position."""
     pixel = jnp.floor(x).astype(jnp.int32)
     pixel = pixel if finite is None else in_memory(pixel, finite)
     return image[pixel] + image[pixel + 1]
@@ -29,16 +29,16 @@ def test_what_is_written_to_memory_is_the_same_mapped_and_differentiated():
     np.testing.assert_allclose(*slopes, rtol=1e-6)
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere it is nothing")
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="does nothing on other platforms")
 def test_the_compiler_keeps_the_branch():
-    """It would drop jax.lax.optimization_barrier. The flag is of no axis that is mapped over."""
+    """It would drop jax.lax.optimization_barrier. The flag does not depend on the mapped axis."""
     image, x = jnp.ones((50, 4)), jnp.ones((3, 20))
     mapped = jax.jit(jax.vmap(read, in_axes=(None, 0, None)))
     assert " conditional(" in mapped.lower(image, x, jnp.ones(1)).compile().as_text()
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere it is nothing")
-def test_what_is_not_finite_after_all_is_not_hidden():
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="does nothing on other platforms")
+def test_a_flag_that_is_not_finite_is_not_hidden():
     costs, pixels = in_memory((jnp.ones(3), jnp.arange(3)), jnp.array([jnp.nan, 1.0]))
     assert jnp.isnan(costs).all()
     np.testing.assert_array_equal(pixels, 0)
@@ -54,30 +54,31 @@ print(place)
 """
 
 
-def test_programs_are_kept_where_nothing_else_was_said(tmp_path):
-    """In processes of their own, as JAX is told once."""
+def test_programs_are_cached_unless_jax_is_already_configured(tmp_path):
+    """In separate processes, because JAX is configured once per process."""
 
-    def said(place, **given):
+    def run_program(place, **given):
         others = {k: v for k, v in os.environ.items() if "COMPILATION_CACHE" not in k}
         command = [sys.executable, "-c", PROGRAM, str(place)]
         return subprocess.run(command, env=others | given, check=True, capture_output=True, text=True)
 
-    kept = said(tmp_path / "cache").stdout.strip()
+    kept = run_program(tmp_path / "cache").stdout.strip()
     assert kept.startswith(str(tmp_path / "cache" / f"programs-jax-{jax.__version__}-"))
     assert list((tmp_path / "cache").glob("*/*-cache"))
-    assert said(tmp_path / "no", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own")).stdout.strip() == "None"
-    assert said(tmp_path / "no", JAX_ENABLE_COMPILATION_CACHE="0").stdout.strip() == "None"
+    own = run_program(tmp_path / "no", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own"))
+    assert own.stdout.strip() == "None"
+    assert run_program(tmp_path / "no", JAX_ENABLE_COMPILATION_CACHE="0").stdout.strip() == "None"
     for mark in (tmp_path / "cache").glob("*/*-atime"):
-        mark.unlink()  # as a kill leaves it, or a full disk
-    said(tmp_path / "cache")
+        mark.unlink()  # as after a kill or on a full disk
+    run_program(tmp_path / "cache")
     assert list((tmp_path / "cache").glob("*/*-atime"))
     (tmp_path / "file").touch()
-    assert said(tmp_path / "file").stdout.strip() == "None"
+    assert run_program(tmp_path / "file").stdout.strip() == "None"
     assert not (tmp_path / "no").exists()
 
 
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux tells")
-def test_programs_are_forgotten_only_where_there_are_too_many():
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux's /proc")
+def test_programs_are_dropped_only_if_there_are_too_many():
     twice = jax.jit(lambda x: 2 * x)
     twice(1.0)
     assert not forget_programs(10**9)

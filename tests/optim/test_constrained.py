@@ -1,4 +1,4 @@
-"""Projection on the simplex against all its faces tried in turn, and descent to corners, edges and within."""
+"""Projection onto the simplex against brute force over its faces; descent to corners, edges and inside."""
 
 import itertools
 import re
@@ -25,7 +25,7 @@ rows = st.integers(1, 5).flatmap(lambda size: st.lists(entries, min_size=size, m
 
 
 def nearest(values):
-    """By trying all faces: the nearest point of each one's plane, if it lies on the simplex."""
+    """By brute force over all faces: the nearest point of each face's plane, if it lies on the simplex."""
     found = []
     for size in range(1, len(values) + 1):
         for face in map(list, itertools.combinations(range(len(values)), size)):
@@ -68,7 +68,7 @@ class TestProjection:
         values = np.random.default_rng(seed).normal(size=(3, 5))
         point = np.asarray(project(jnp.asarray(values)))
         taken = np.max(values - point, axis=1, keepdims=True, where=point > 0, initial=-np.inf)
-        assert (np.abs(values - taken) > 1e-3).all()  # none is about to come to 0 or to leave it
+        assert (np.abs(values - taken) > 1e-3).all()  # no entry is about to reach or leave 0
         check_grads(project, (values,), order=1, modes=["fwd", "rev"], eps=1e-5)
 
     def test_a_batch_is_a_loop(self):
@@ -79,7 +79,7 @@ class TestProjection:
 
 
 def test_large_values_lose_nothing_in_float32():
-    """Where float32 has only halves, a sum of two values has only whole numbers."""
+    """At this size float32 resolves only halves, and sums of two values only whole numbers."""
     point = project(jnp.array([0.5, 0.0, -5.0], jnp.float32) + 2.0**22)
     assert point.dtype == jnp.float32
     np.testing.assert_allclose(point, [0.75, 0.25, 0.0], atol=1e-6)
@@ -93,10 +93,10 @@ def test_what_is_not_finite_stays_in_its_row():
 
 
 def least_squares(seed, num=20, parts=4):
-    """|A w - b|^2 / 2 a row, where the best w of the simplex are known: on its corners, edges, faces, within.
+    """|A w - b|^2 / 2 per row, with known optima w on the simplex: on corners, edges, faces and inside.
 
-    b is chosen such that the gradient there is what Karush, Kuhn and Tucker ask for: one number on the
-    entries above 0, and more on the others. That number is large, as where all handles err the same way.
+    b is chosen such that the gradient there meets the Karush-Kuhn-Tucker conditions: one number on the
+    entries above 0, and more on the others. That number is large, as when all handles err the same way.
     """
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(num, parts, parts)) + 2 * np.eye(parts)
@@ -126,7 +126,7 @@ def run(step: Step, weights, batch, count):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_it_descends_to_the_best_weights_and_never_leaves_the_simplex(seed):
-    """However unlike the rows' scales are: some Gaussians cover few pixels and some many."""
+    """Whatever the scales of the rows: some Gaussians cover few pixels and some many."""
     A, b, best = least_squares(seed)
     scale = 10 ** jnp.linspace(-2.0, 2.0, len(best))[:, None]
     step = gradient_step(misfit, simplex_descent(optax.cosine_decay_schedule(0.1, 500)))
@@ -139,7 +139,7 @@ def test_it_descends_to_the_best_weights_and_never_leaves_the_simplex(seed):
 
 
 def test_adam_alone_before_the_projection_stops_at_wrong_places():
-    """Why `simplex_descent` has one second moment a row: see its docstring."""
+    """The reason why `simplex_descent` has one second moment per row: see its docstring."""
     A, b, best = least_squares(0)
     onto = optax.stateless(lambda u, w: project_simplex(w + u) - w)
     adam = gradient_step(misfit, optax.chain(optax.adam(optax.cosine_decay_schedule(0.1, 500)), onto))
@@ -147,7 +147,7 @@ def test_adam_alone_before_the_projection_stops_at_wrong_places():
     assert np.abs(path[-1] - best).max() > 0.1
 
 
-def test_what_depends_on_sums_of_rows_alone_does_not_matter():
+def test_loss_terms_that_depend_only_on_row_sums_do_not_matter():
     A, b, best = least_squares(1)
     start = jnp.full(best.shape, 1 / best.shape[1])
 
@@ -161,7 +161,7 @@ def test_what_depends_on_sums_of_rows_alone_does_not_matter():
     np.testing.assert_allclose(plain[-1], shifted[-1], atol=1e-5)
 
 
-def test_the_first_step_is_of_the_rate_and_from_weights_off_the_simplex_it_comes_to_it():
+def test_the_first_step_has_the_length_of_the_rate_and_leads_onto_the_simplex():
     step = gradient_step(lambda w, batch, *, step, key: (1e-6 * w[0, 0], {}), simplex_descent(0.01))
     weights = jnp.full((1, 2), 0.5)
     new, _, _ = step.update(weights, step.init(weights), None, step=0, key=None)
@@ -198,7 +198,7 @@ def test_it_serves_one_field_among_others():
     for i in range(60):
         scene, state, info = update(scene, state, jnp.array([0.1, 0.5, 1.2]), step=i, key=None)
     assert info["loss"] < 1e-3
-    assert scene.places[1] > 1.1  # no weights reach what lies beyond all places
+    assert scene.places[1] > 1.1  # no weights reach beyond the outermost place
     np.testing.assert_allclose(scene.weights.sum(1), 1, atol=1e-6)
 
 
@@ -212,7 +212,7 @@ def test_no_other_module_imports_jaxopt():
     assert [file.relative_to(package).as_posix() for file in users] == ["optim/constrained.py"]
 
 
-def test_what_is_not_allowed_is_as_if_it_were_not_there():
+def test_entries_that_are_not_allowed_act_as_if_absent():
     A, b, best = least_squares(2)
     optimizer, allowed = simplex_descent(0.05), jnp.array([True, True, True, True, False])
     start = jnp.full(best.shape, 1 / best.shape[1])

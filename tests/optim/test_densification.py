@@ -1,4 +1,4 @@
-"""Relocation keeps the picture, fills only what may be filled, and its noise leaves alone what is opaque."""
+"""Relocation keeps the picture and fills only allowed slots, and its noise spares opaque Gaussians."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.optim.densification import DEAD, EMPTY_LOGIT, divided, exploration, forgotten, is_alive, relocate
+from gsjax.optim.densification import (
+    DEAD,
+    EMPTY_LOGIT,
+    exploration,
+    is_alive,
+    relocate,
+    reset_rows,
+    split_into_copies,
+)
 from gsjax.optim.step import per_field_adam
 from gsjax.scene.gaussians import Gaussians
 
 
 def some(opacities, seed=0) -> Gaussians:
-    """Gaussians of these opacities, anywhere."""
+    """Gaussians with these opacities at random places."""
     random, count = np.random.default_rng(seed), len(opacities)
     opacities = jnp.asarray(opacities, jnp.float32)
     logits = jnp.where(opacities > 0, jnp.log(opacities) - jnp.log1p(-opacities), EMPTY_LOGIT)
@@ -28,13 +36,13 @@ def some(opacities, seed=0) -> Gaussians:
 
 @pytest.mark.usefixtures("x64")
 @given(st.floats(0.01, 0.999), st.integers(1, 20))
-def test_copies_at_one_place_let_as_little_light_through_as_the_one_they_were(opacity, copies):
+def test_copies_at_one_place_transmit_as_much_light_as_the_original(opacity, copies):
     """Eq. 8: the integrals of 1 - (1 - o' G(x / s'))^n and of o G(x) are equal."""
-    each, factor = (float(a[0]) for a in divided(jnp.array([opacity]), jnp.array([copies])))
+    each, factor = (float(a[0]) for a in split_into_copies(jnp.array([opacity]), jnp.array([copies])))
     x = np.linspace(-12, 12, 20_001)
     one = opacity * np.exp(-(x**2) / 2)
     together = 1 - (1 - each * np.exp(-((x / factor) ** 2) / 2)) ** copies
-    if each > DEAD:  # below, opacities are kept alive
+    if each > DEAD:  # lower opacities are clipped to DEAD
         np.testing.assert_allclose(np.trapezoid(together, x), np.trapezoid(one, x), rtol=1e-4)
         np.testing.assert_allclose(1 - (1 - each) ** copies, opacity, rtol=1e-6)
 
@@ -43,8 +51,8 @@ def test_copies_at_one_place_let_as_little_light_through_as_the_one_they_were(op
 def test_single_precision_is_enough_for_many_copies(copies):
     opacities = jnp.array([0.01, 0.5, 0.99, 1.0])
     with jax.enable_x64(True):
-        exact = divided(jnp.asarray(np.asarray(opacities), float), jnp.full(4, copies))
-    for found, wanted in zip(divided(opacities, jnp.full(4, copies)), exact, strict=True):
+        exact = split_into_copies(jnp.asarray(np.asarray(opacities), float), jnp.full(4, copies))
+    for found, wanted in zip(split_into_copies(opacities, jnp.full(4, copies)), exact, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=2e-2)
 
 
@@ -81,12 +89,12 @@ def test_where_all_are_dead_or_none_is_nothing_moves(opacities):
     jax.tree.map(np.testing.assert_array_equal, moved, gaussians)
 
 
-def test_an_optimizer_forgets_rows_alone():
+def test_only_the_given_rows_of_an_optimizer_are_reset():
     gaussians = some([0.5] * 4)
     optimizer = per_field_adam({"means": 0.1, "logit_opacities": 0.2})
     _, state = optimizer.update(jax.tree.map(jnp.ones_like, gaussians), optimizer.init(gaussians), gaussians)
     rows = jnp.array([False, True, False, True])
-    after = forgotten(state, rows)
+    after = reset_rows(state, rows)
     known = 0
     for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
         if old.ndim == 0:

@@ -1,4 +1,4 @@
-"""Least squares: it agrees with scipy, stays on manifolds, and refuses what overflowed or is no number."""
+"""Least squares: agrees with scipy, stays on manifolds, and rejects what overflowed or is not a number."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ from tests.optim.iterations import SOLVERS, falls, scanned
 
 
 def curve(params, batch, *, step, key):
-    """y = a exp(-b x); nothing is known of b > limit, where it "overflows"."""
+    """y = a exp(-b x), which "overflows" for b > limit."""
     values = params["a"] * jnp.exp(-params["b"] * batch["x"]) - batch["y"]
     overflow = jnp.stack([params["b"] > batch.get("limit", jnp.inf), jnp.array(False)])
     return {"curve": values}, {"overflow": overflow, "needed": jnp.int32(params["b"] * 100)}
@@ -107,7 +107,7 @@ def test_one_step_after_another_is_what_optimistix_does():
     batch = points()
     stepped, infos = scanned(least_squares_step(curve, SOLVERS["LM"]), start(), batch, 3)
     assert infos["accepted"].all()
-    # Its first iteration only looks, so that four of its are three of ours.
+    # Its first iteration only evaluates, so four of its iterations are three of ours.
     solved, info = solve(curve, start(), batch, solver=SOLVERS["LM"], max_steps=4)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), stepped, solved)
     assert not info["converged"]
@@ -157,7 +157,7 @@ def test_huber_has_its_slope_on_both_sides_of_delta_and_leaves_infinity():
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_start_that_is_not_finite_or_overflows_is_kept_and_said(name):
+def test_a_start_that_is_not_finite_or_overflows_is_kept_and_reported(name):
     for bad in ({"y": points()["y"].at[0].set(jnp.nan)}, {"limit": jnp.array(0.0)}):
         batch = points() | {"limit": jnp.array(jnp.inf)} | bad
         step = least_squares_step(curve, SOLVERS[name])
@@ -172,7 +172,7 @@ def test_a_start_that_is_not_finite_or_overflows_is_kept_and_said(name):
         jax.tree.map(np.testing.assert_array_equal, solved, start())
 
 
-def test_a_move_into_overflow_is_rejected_said_and_tried_shorter():
+def test_a_move_into_overflow_is_rejected_reported_and_shortened():
     batch = points() | {"limit": jnp.array(0.6)}  # the curve's own b is 0.7
     step = least_squares_step(curve, SOLVERS["LM"], damping=0.1)
     params, infos = scanned(step, start(), batch, 30)
@@ -189,7 +189,7 @@ def test_a_move_into_overflow_is_rejected_said_and_tried_shorter():
     assert not info["converged"]
 
 
-def test_gauss_newton_stands_still_before_what_overflows():
+def test_gauss_newton_does_not_move_into_overflow():
     batch = points() | {"limit": jnp.array(0.3)}
     params, infos = scanned(least_squares_step(curve, SOLVERS["GN"]), start(), batch, 3)
     jax.tree.map(np.testing.assert_array_equal, params, start())
@@ -237,8 +237,8 @@ def test_vmap_is_the_loop():
     assert info["converged"].all()
 
 
-def test_what_cannot_be_asked_for_is_named():
-    with pytest.raises(ValueError, match="jac is"):
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="jac must be"):
         solve(curve, start(), points(), jac="forward")
     with pytest.raises(ValueError, match="damping must be above 0"):
         least_squares_step(curve, damping=0.0)
@@ -250,7 +250,7 @@ def test_what_cannot_be_asked_for_is_named():
 
 @pytest.mark.parametrize("damping", [1.0, 1e-3])
 def test_a_search_that_the_plan_ended_has_not_converged(damping):
-    """The optimum, 3, lies behind 1, where the plan overflows: the search stops short of that and says so."""
+    """The optimum, 3, lies beyond 1, where the plan overflows: the search stops short and reports it."""
 
     def residual(x, batch, *, step, key):
         full = jnp.any(x > batch)
@@ -268,8 +268,8 @@ def test_a_search_that_the_plan_ended_has_not_converged(damping):
     assert info["needed"] == 1
 
 
-def test_a_start_that_is_no_number_is_said_where_residuals_do_not_show_it():
-    """As of a camera that is not finite: it sees nothing, so the image is finite."""
+def test_a_start_that_is_not_a_number_is_reported_even_if_residuals_are_finite():
+    """For example a camera that is not finite sees nothing, so its image is finite."""
 
     def residual(x, batch, *, step, key):
         return jnp.where(jnp.isfinite(x), x, 1.0), {}
@@ -292,7 +292,8 @@ def test_a_residual_of_another_form_is_named():
 def test_observations_have_the_form_of_images():
     with pytest.raises(ValueError, match=r"the shape of rendered, \(2, 4, 5, 3\); got \(4,"):
         difference.__wrapped__(jnp.zeros((2, 4, 5, 3)), jnp.zeros((4, 5, 3)))
-    with pytest.raises(ValueError, match=r"observed must hold floats.*got uint8: of 8 bits, divide by 255"):
+    says = r"observed must hold floats.*got uint8: divide 8-bit colours by 255"
+    with pytest.raises(ValueError, match=says):
         difference.__wrapped__(jnp.zeros((4, 3)), jnp.zeros((4, 3), jnp.uint8))
 
 

@@ -1,4 +1,4 @@
-"""Least squares through the rasterizer finds poses, intrinsics and Gaussians, and refuses what overflows."""
+"""Least squares through the rasterizer finds poses, intrinsics and Gaussians, and rejects overflow."""
 
 import dataclasses
 
@@ -154,7 +154,7 @@ def test_gaussians_that_outgrow_the_plan_are_rejected(scene, forward):
     assert not first["accepted"]
     assert (first["needed"] > tight.capacity).all()
     assert not infos["skipped"].any()
-    assert infos["accepted"].any()  # shorter ones were taken
+    assert infos["accepted"].any()  # shorter moves were accepted
     assert 1.0 < size < 1.4
     assert np.isfinite(infos["loss"]).all()
     beyond, infos = run(jnp.full((), 1.7), batch)  # the plan is too small to begin with

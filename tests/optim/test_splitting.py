@@ -1,4 +1,4 @@
-"""Where the projected means are pulled hard there is more than before; what is not needed goes."""
+"""Adaptive density control: Gaussians with large projected gradients multiply; unneeded ones are pruned."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from gsjax.optim.densification import EMPTY_LOGIT, is_alive
-from gsjax.optim.splitting import RESET_OPACITY, SHRINK, Pull, divide, wanted, watch_pull, with_low_opacities
+from gsjax.optim.splitting import (
+    RESET_OPACITY,
+    SHRINK,
+    Pull,
+    divide,
+    reset_opacities,
+    strongly_pulled,
+    watch_pull,
+)
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 
@@ -18,11 +26,11 @@ class Params(NamedTuple):
     nudges: jax.Array
 
 
-HOW = {"threshold": 1.0, "large": 0.1, "too_large": 1.0}
+OPTIONS = {"threshold": 1.0, "large": 0.1, "too_large": 1.0}
 
 
 def scene(scales, slots: int) -> Gaussians:
-    """One Gaussian a scale, all of opacity 0.6, in a row; the other slots are empty."""
+    """One Gaussian per scale, all with opacity 0.6, in a row; the other slots are empty."""
     count = len(scales)
     means = np.arange(slots)[:, None] * np.array([[1.0, 0.0, 0.0]])
     sizes = np.concatenate([scales, np.full(slots - count, 0.01)])
@@ -40,7 +48,7 @@ def pulled(*mean: float, slots: int) -> Pull:
 
 def test_a_small_one_is_cloned_and_a_large_one_split():
     before = scene([0.05, 0.5, 0.05], slots=6)
-    after, touched = divide(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **HOW)
+    after, touched = divide(before, pulled(2.0, 3.0, 0.5, slots=6), jax.random.key(0), 6, **OPTIONS)
     np.testing.assert_array_equal(is_alive(after), [True] * 5 + [False])
     # The hardest pulled, 1, takes the first vacant slot, 3; 0 takes slot 4.
     np.testing.assert_array_equal(touched, [False, True, False, True, True, False])
@@ -52,30 +60,30 @@ def test_a_small_one_is_cloned_and_a_large_one_split():
     assert away[0] != away[1]
 
 
-def test_halves_are_drawn_from_the_whole():
+def test_halves_are_sampled_from_the_original():
     slots = 4000
     before = scene([0.5] * (slots // 2), slots)
-    after, _ = divide(before, pulled(*[2.0] * (slots // 2), slots=slots), jax.random.key(1), slots, **HOW)
+    after, _ = divide(before, pulled(*[2.0] * (slots // 2), slots=slots), jax.random.key(1), slots, **OPTIONS)
     origin = np.concatenate([before.means[: slots // 2]] * 2)
     away = np.asarray(after.means) - origin
     np.testing.assert_allclose(away.std(0), 0.5, rtol=0.05)
     np.testing.assert_allclose(away.mean(0), 0.0, atol=0.05)
 
 
-def test_what_is_transparent_or_too_large_leaves_its_slot_which_is_filled_at_once():
+def test_pruned_gaussians_vacate_slots_that_are_filled_at_once():
     before = scene([0.05, 2.0, 0.05], slots=3)
-    after, touched = divide(before, pulled(2.0, 9.0, slots=3), jax.random.key(0), 3, **HOW)
+    after, touched = divide(before, pulled(2.0, 9.0, slots=3), jax.random.key(0), 3, **OPTIONS)
     np.testing.assert_array_equal(touched, [False, True, False])
     np.testing.assert_array_equal(after.means[1], before.means[0])
-    nobody, _ = divide(before, pulled(slots=3), jax.random.key(0), 3, **HOW)
-    np.testing.assert_array_equal(is_alive(nobody), [True, False, True])
-    assert float(nobody.logit_opacities[1]) == EMPTY_LOGIT
+    unpulled, _ = divide(before, pulled(slots=3), jax.random.key(0), 3, **OPTIONS)
+    np.testing.assert_array_equal(is_alive(unpulled), [True, False, True])
+    assert float(unpulled.logit_opacities[1]) == EMPTY_LOGIT
 
 
 @pytest.mark.parametrize(("slots", "filled"), [(3, []), (4, [2]), (5, [2, 1]), (6, [2, 1, 0])])
 def test_where_slots_are_few_the_hardest_pulled_come_first(slots, filled):
     before = scene([0.05] * 3, slots=6)
-    after, touched = divide(before, pulled(2.0, 3.0, 4.0, slots=6), jax.random.key(0), slots, **HOW)
+    after, touched = divide(before, pulled(2.0, 3.0, 4.0, slots=6), jax.random.key(0), slots, **OPTIONS)
     assert int(touched.sum()) == len(filled)
     for place, source in enumerate(filled, start=3):
         np.testing.assert_array_equal(after.means[place], before.means[source])
@@ -88,7 +96,7 @@ def test_pull_is_the_mean_over_the_steps_that_pulled_and_moves_nothing():
 
     params = Params(a=jnp.asarray(1.0), nudges=jnp.zeros((1, 3, 2)))
     step = gradient_step(
-        lambda p, b, **how: loss(p._asdict(), b, **how),
+        lambda p, b, **options: loss(p._asdict(), b, **options),
         per_field_adam({"a": 0.1}, others={"nudges": watch_pull()}),
     )
     state = step.init(params)
@@ -103,10 +111,10 @@ def test_pull_is_the_mean_over_the_steps_that_pulled_and_moves_nothing():
     np.testing.assert_array_equal(params.nudges, 0.0)
     assert float(params.a) < 1.0
     alive = scene([0.05] * 3, slots=3)
-    np.testing.assert_array_equal(wanted(alive, pull, 5.0), [True, False, False])
+    np.testing.assert_array_equal(strongly_pulled(alive, pull, 5.0), [True, False, False])
 
 
 def test_a_reset_lowers_opacities_and_raises_none():
     before = scene([0.05] * 2, slots=3)
-    after = with_low_opacities(before)
+    after = reset_opacities(before)
     np.testing.assert_allclose(after.opacities, [RESET_OPACITY, RESET_OPACITY, 1e-6], rtol=1e-4)

@@ -12,7 +12,7 @@ RED, WHITE, YELLOW = (200, 30, 25), (235, 235, 235), (240, 200, 20)
 
 @pytest.fixture(scope="module")
 def table():
-    """A picture of a long red thing, a white square and a small yellow disc, and their labels 1, 2, 3."""
+    """An image of a long red bar, a white square and a small yellow disc, and their labels 1, 2, 3."""
     labels = np.zeros((120, 160), int)
     labels[10:30, 10:110] = 1
     labels[50:80, 20:50] = 2
@@ -22,7 +22,7 @@ def table():
 
 
 def ask(vocabulary, table, text):
-    """The best label for a text, and whether it is good enough."""
+    """The best label for a text, and whether its score is sufficient."""
     scores = vocabulary.embed_objects(*table, 3) @ vocabulary.embed_text(text)
     return int(scores.argmax()) + 1, bool(scores.max() >= vocabulary.min_score)
 
@@ -69,7 +69,7 @@ def test_longer_names_come_first():
     objects = vocabulary.embed_objects(np.zeros((2, 13, 3), np.uint8), labels, 12)
     for text, label in [("object 12", 12), ("object 1", 1), ("the red bull", 3)]:
         assert int((objects @ vocabulary.embed_text(text)).argmax()) + 1 == label
-    with pytest.raises(ValueError, match="want each of them once"):
+    with pytest.raises(ValueError, match="expected distinct names"):
         ClosedVocabulary({1: "can", 2: "Can"})
 
 
@@ -119,5 +119,5 @@ def test_without_sizes_a_thing_is_the_same_in_any_company():
 
 @pytest.mark.parametrize("names", [None, {1: "object 1", 2: "object 2"}])
 def test_where_nothing_has_a_name_colours_are_advised(names):
-    with pytest.raises(ValueError, match=r"no word 'mug'.*Nothing has a name here.*\"the blue one\""):
+    with pytest.raises(ValueError, match=r"no word 'mug'.*No object has a name here.*\"the blue one\""):
         ClosedVocabulary(names).embed_text("mug")

@@ -1,4 +1,4 @@
-"""Names have vectors of their own, and nobody else's."""
+"""Every name has its own vector, and shares it with no other."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_objects_have_the_vectors_of_their_names():
     assert rows.shape == (5, DIMENSION)
     np.testing.assert_array_equal(rows[1], encoder.embed_text("Laptop Lid"))
     np.testing.assert_array_equal(rows[3], encoder.embed_text("faucet_handle"))
-    np.testing.assert_array_equal(rows[[2, 4]], 0)  # one without a name, one without a pixel
+    np.testing.assert_array_equal(rows[[2, 4]], 0)  # one without a name, one without pixels
     cosines = rows[[0, 1, 3]] @ rows[[0, 1, 3]].T
     np.testing.assert_allclose(np.diag(cosines), 1, atol=1e-6)
     assert np.abs(cosines - np.eye(3)).max() < 0.2
@@ -28,12 +28,12 @@ def test_a_name_has_the_same_vector_wherever_it_occurs():
     np.testing.assert_array_equal(one.embed_text("milk"), other.embed_text("Milk"))
 
 
-def test_what_has_no_name_is_told():
+def test_an_unknown_name_is_an_error():
     with pytest.raises(
-        ValueError, match=r"no class 'fridge'; .* there are: drawer, laptop lid, faucet handle"
+        ValueError, match=r"no class 'fridge'; .* only names: drawer, laptop lid, faucet handle\."
     ):
         ClassCodebook(NAMES).embed_text("fridge")
-    with pytest.raises(ValueError, match="want each of them once"):
+    with pytest.raises(ValueError, match="expected distinct names"):
         ClassCodebook({1: "Box", 2: "box"})
-    with pytest.raises(ValueError, match="names: expected those of labels, found none"):
+    with pytest.raises(ValueError, match="names: expected a name for at least one label, found none"):
         ClassCodebook({})

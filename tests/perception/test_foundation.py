@@ -63,7 +63,7 @@ def clip_folder(tmp_path_factory):
 
 
 @needs_foundation
-def test_clip_is_that_of_transformers(clip_folder):
+def test_clip_agrees_with_transformers(clip_folder):
     import torch
     from transformers import CLIPImageProcessorPil, CLIPModel, CLIPTokenizer
 
@@ -92,7 +92,7 @@ def test_clip_sees_a_square_around_each_object(clip_folder):
     side, start = 13, (8, 18)  # 10 pixels, and 15% more on each side, rounded up
     crop = IMAGE[start[0] : start[0] + side, start[1] : start[1] + side]
     np.testing.assert_allclose(vectors[2], encoder.embed_images([crop])[0], atol=1e-6)
-    with pytest.raises(ValueError, match="got nothing"):
+    with pytest.raises(ValueError, match="expected words that describe an object, found an empty text"):
         encoder.embed_text("  ")
 
 
@@ -133,7 +133,7 @@ def test_maskclip_is_the_values_of_clips_last_layer(clip_folder):
 
 @needs_foundation
 @pytest.mark.parametrize("registers", [0, 3])
-def test_dinov2_is_that_of_transformers(tmp_path, registers):
+def test_dinov2_agrees_with_transformers(tmp_path, registers):
     import torch
     from transformers import (
         BitImageProcessorPil,
@@ -213,7 +213,7 @@ def sam_folders(tmp_path_factory):
 
 
 @needs_foundation
-def test_grounded_sam_is_that_of_transformers(sam_folders):
+def test_grounded_sam_agrees_with_transformers(sam_folders):
     import dataclasses
 
     import torch
@@ -231,7 +231,7 @@ def test_grounded_sam_is_that_of_transformers(sam_folders):
     loaded = load_grounded_sam(dino, sam)
     assert isinstance(loaded, Segmenter)
     assert loaded.prompt == "object"
-    # Random weights are sure of nothing.
+    # Random weights give low scores.
     adapter = dataclasses.replace(loaded, min_box_score=0.0, min_text_score=0.0, min_pixels=1)
     found = adapter.find(IMAGE)
 
@@ -277,8 +277,8 @@ def test_grounded_sam_that_finds_nothing_labels_nothing(sam_folders):
 def test_of_two_masks_the_smaller_is_on_top_and_doubles_are_dropped():
     masks = np.zeros((5, 20, 20), bool)
     masks[0, 2:12, 2:12] = True  # a tray
-    masks[1, 4:8, 4:8] = True  # a thing in it
-    masks[2, 4:8, 4:9] = True  # the same thing again, with a lower score
+    masks[1, 4:8, 4:8] = True  # an object in it
+    masks[2, 4:8, 4:9] = True  # the same object again, with a lower score
     masks[3] = True  # the table
     scores = np.array([0.6, 0.9, 0.5, 0.99, 0.8])  # the last mask is empty
     labels = labels_of_masks(masks, scores, max_fraction=0.5, max_overlap=0.7)
@@ -291,7 +291,7 @@ LOADERS = [load_clip, load_dinov2, load_sam, load_sam2, lambda path: load_ground
 
 
 @pytest.mark.parametrize("load", LOADERS)
-def test_a_wrong_path_says_what_was_looked_for_and_how_to_get_it(load, tmp_path):
+def test_a_wrong_path_says_what_was_expected_and_how_to_get_it(load, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere: expected a folder of .*config\.json.*hf download"):
         load(tmp_path / "nowhere")
     (tmp_path / "config.json").write_text("{}")
@@ -305,7 +305,7 @@ def save_placeholders(folder, *names):
 
 
 @pytest.mark.parametrize("load", LOADERS)
-def test_weights_that_are_a_pickle_are_refused_and_how_to_convert_them_is_said(load, tmp_path):
+def test_pickled_weights_are_refused_with_advice_on_how_to_convert_them(load, tmp_path):
     save_placeholders(tmp_path, "pytorch_model.bin")
     with pytest.raises(
         FileNotFoundError,
@@ -339,24 +339,24 @@ def test_files_that_lead_to_a_pickle_are_refused(tmp_path, name, holds, says):
 
 
 @pytest.mark.parametrize("load", LOADERS)
-def test_transformers_is_told_to_unpickle_nothing_and_to_run_nothing(load, tmp_path, monkeypatch):
+def test_transformers_is_asked_to_unpickle_and_to_run_nothing(load, tmp_path, monkeypatch):
     save_placeholders(tmp_path, "model.safetensors")
     modules = __import__("sys").modules
     for name in ("torch", "transformers"):
         module = ModuleType(name)
-        module.__getattr__ = MagicMock()  # PEP 562: whatever is asked of it
+        module.__getattr__ = MagicMock()  # PEP 562: any attribute
         monkeypatch.setitem(modules, name, module)
     load(tmp_path)
-    asked = modules["transformers"].__getattr__
-    loads = [call for call in asked.return_value.mock_calls if call[0] == "from_pretrained"]
-    assert all(told["local_files_only"] is True for _, _, told in loads)
+    accessed = modules["transformers"].__getattr__
+    loads = [call for call in accessed.return_value.mock_calls if call[0] == "from_pretrained"]
+    assert all(options["local_files_only"] is True for _, _, options in loads)
     models = [
-        call.args[0] for call in asked.call_args_list if "Model" in call.args[0] or "For" in call.args[0]
+        call.args[0] for call in accessed.call_args_list if "Model" in call.args[0] or "For" in call.args[0]
     ]
-    safe = [told for _, _, told in loads if told.get("use_safetensors") is True]
+    safe = [options for _, _, options in loads if options.get("use_safetensors") is True]
     assert len(safe) == len(models) > 0
-    autos = [call.args[0] for call in asked.call_args_list if call.args[0].startswith("Auto")]
-    assert sum(told.get("trust_remote_code") is False for _, _, told in loads) >= len(autos)
+    autos = [call.args[0] for call in accessed.call_args_list if call.args[0].startswith("Auto")]
+    assert sum(options.get("trust_remote_code") is False for _, _, options in loads) >= len(autos)
 
 
 @pytest.mark.parametrize("load", LOADERS)

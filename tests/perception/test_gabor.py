@@ -7,7 +7,7 @@ from gsjax.perception.gabor import GaborEncoder
 
 @pytest.fixture(scope="module")
 def stripes():
-    """Grey; left half fine stripes, right half coarse ones, of the same brightness."""
+    """Grey stripes: fine in the left half, coarse in the right, with the same mean brightness."""
     x = np.arange(96)
     wave = np.where(x < 48, np.sin(2 * np.pi * x / 4), np.sin(2 * np.pi * x / 16))
     return np.broadcast_to(0.5 + 0.3 * wave[None, :, None], (64, 96, 3)).copy()
@@ -20,7 +20,7 @@ def test_texture_of_one_colour_is_told_apart(stripes):
 
 
 def test_it_does_not_matter_which_way_stripes_run(stripes):
-    """Another camera may look from another side."""
+    """Another camera may be rotated."""
     upright, lying = GaborEncoder()(np.stack([stripes[:, :64], stripes[:, :64].transpose(1, 0, 2)]))
     np.testing.assert_allclose(upright[20:44, 20:44], lying[20:44, 20:44].transpose(1, 0, 2), atol=1e-4)
 
@@ -45,5 +45,5 @@ def test_bytes_and_floats_mean_the_same_and_nothing_is_not_finite(stripes):
     broken = stripes.copy()
     broken[5, 5] = np.nan
     assert np.isfinite(GaborEncoder()(broken[None])).all()
-    with pytest.raises(ValueError, match="got none"):
+    with pytest.raises(ValueError, match="images: expected at least one, found none"):
         GaborEncoder()(np.zeros((0, 20, 20, 3)))

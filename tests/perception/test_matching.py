@@ -1,4 +1,4 @@
-"""Points from posed photographs of a wall of which all is known."""
+"""Points from posed photographs of a wall with known geometry."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ K = intrinsics(150.0, WIDTH, HEIGHT)
 
 
 def wall_seen_from(eyes, seed=0):
-    """Pictures of a patterned square of 2 m at z = 0, and the cameras' matrices."""
+    """Images of a patterned square of 2 m at z = 0, with view matrices and intrinsics."""
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(0, 255, (40, 40, 3)).astype(np.uint8)
     texture = cv2.resize(coarse, (800, 800), interpolation=cv2.INTER_CUBIC)
@@ -22,7 +22,9 @@ def wall_seen_from(eyes, seed=0):
     for viewmat in viewmats:
         plane = np.stack([viewmat[:3, 0], viewmat[:3, 1], viewmat[:3, 3]], axis=1)
         homography = np.diag([1.0, 1.0, 1.0]) @ K @ plane @ on_wall
-        shifted = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]]) @ homography  # OpenCV counts from centres
+        shifted = (
+            np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]]) @ homography
+        )  # OpenCV's pixel centres are at integers
         pictures.append(cv2.warpPerspective(texture, shifted, (WIDTH, HEIGHT), flags=cv2.INTER_AREA))
     return pictures, viewmats, np.tile(K, (len(eyes), 1, 1))
 
@@ -39,7 +41,7 @@ def test_points_lie_where_photographs_meet(wall):
     _, viewmats, Ks = wall
     matched = match_points(*wall)
     assert len(matched.points) > 100
-    assert np.median(np.abs(matched.points[:, 2])) < 0.003  # 13 mm if pixels were half a one off
+    assert np.median(np.abs(matched.points[:, 2])) < 0.003  # 13 mm if pixel centres were off by half a pixel
     assert np.quantile(np.abs(matched.points[:, 2]), 0.95) < 0.05
     for v, rows in enumerate(matched.shown):
         assert len(rows) > 10
@@ -82,8 +84,8 @@ def test_photographs_that_share_nothing(wall):
     same_place = np.tile(viewmats[:1], (4, 1, 1))
     assert len(match_points(pictures, same_place, Ks).points) == 0
     others = wall_seen_from(EYES[1:2], seed=1)[0]
-    unexplained_pixels = match_points([pictures[0], *others], viewmats[:2], Ks[:2])
-    assert len(unexplained_pixels.points) < 5
+    unrelated = match_points([pictures[0], *others], viewmats[:2], Ks[:2])
+    assert len(unrelated.points) < 5
     alone = match_points(pictures[:1], viewmats[:1], Ks[:1])
     assert len(alone.points) == 0
 

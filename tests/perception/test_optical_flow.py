@@ -1,4 +1,4 @@
-"""DIS flow of pictures that were moved by a known way."""
+"""DIS flow of images that were shifted by a known amount."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def textured():
 
 @given(st.floats(-5, 5), st.floats(-4, 4))
 def test_a_shift_is_found(textured, x, y):
-    """The flow points to where the content has gone, x before y."""
+    """The flow points to where the content moved, x before y."""
     moved = shift(textured, (y, x, 0), order=3, mode="nearest")
     errors = np.linalg.norm(DisFlow()(textured, np.clip(moved, 0, 1)) - [x, y], axis=-1)[12:-12, 12:-12]
     assert np.median(errors) < 0.1
@@ -27,7 +27,7 @@ def test_a_shift_is_found(textured, x, y):
 
 
 def test_what_is_hidden_fails_the_way_back(textured):
-    """A square goes 6 pixels to the right over what stands still."""
+    """A square moves 6 pixels to the right over a static background."""
     square = textured[::-1, ::-1][20:50, 30:60]
     before, after = textured.copy(), textured.copy()
     before[20:50, 30:60], after[20:50, 36:66] = square, square

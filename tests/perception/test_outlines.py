@@ -1,4 +1,4 @@
-"""Outlines of masks are put on a picture's edges."""
+"""Outlines of masks snap to edges of the image."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from gsjax.perception.outlines import snap_outlines
 
 
 def picture():
-    """A disc, a bar three pixels wide, and nothing else; and their true labels."""
+    """An image of a disc and a bar three pixels wide, and their true labels."""
     labels = np.zeros((60, 80), np.int64)
     cv2.circle(disc := np.zeros((60, 80), np.uint8), (25, 30), 15, 1, -1)
     labels[disc > 0] = 7

@@ -1,4 +1,4 @@
-"""Labels carried through made-up pictures whose motion is known."""
+"""Labels propagated through synthetic images with known motion."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ COLORS = np.array([(0.45, 0.45, 0.45), (0.75, 0.3, 0.2), (0.2, 0.35, 0.75)])
 
 
 def texture(seed, size, color):
-    """A speckled picture [H, W, 3] around one colour."""
+    """A speckled image [H, W, 3] around one colour."""
     noise = gaussian_filter(np.random.default_rng(seed).normal(size=size), 1.0)
     return np.clip(color + 0.08 * (noise / noise.std())[..., None], 0, 1)
 
 
 def squares(*corners, seed=0):
-    """Image and labels 1, 2, ... of a speckled wall with squares at (row, column), each over those before."""
+    """Image and labels 1, 2, ... of squares at (row, column) on a speckled wall, later ones on top."""
     image = texture(seed, (HEIGHT, WIDTH), COLORS[0])
     labels = np.zeros((HEIGHT, WIDTH), np.int32)
     for name, (row, column) in enumerate(corners, start=1):
@@ -34,7 +34,7 @@ def squares(*corners, seed=0):
 
 
 def movie(*paths):
-    """Images and labels [V, H, W, ...] of squares whose corners are [V, 2]."""
+    """Images and labels [V, H, W, ...] of squares with corners [V, 2]."""
     views = [squares(*corners) for corners in zip(*paths, strict=True)]
     return tuple(np.stack(part) for part in zip(*views, strict=True))
 
@@ -89,7 +89,7 @@ def test_what_leaves_too_fast_for_the_flow_leaves_no_label_behind():
     images, true = movie(path((30, 90), (0, 6), 9), path((50, 20), (0, 0), 9))
     found = FlowPropagator()(images, true[0])
     assert not ((found == 1) & (true != 1))[3:].any()
-    # Only the colours tell that nothing came from where the flow says.
+    # Only the colours show that the flow is wrong.
     blind = FlowPropagator(max_color_change=1e3)(images, true[0])
     assert (blind[-1] == 1).any()
 
@@ -102,14 +102,14 @@ def test_what_is_hidden_leaves_nothing_on_what_hides_it():
 
 
 def hide(hidden):
-    """A flow of a still scene that is not known in some places [H, W]."""
+    """Zero flow that is unknown where `hidden` [H, W]."""
     return lambda image, other: np.where(hidden[..., None], np.nan, still(image, other))
 
 
 def test_what_is_not_known_is_flooded_up_to_edges_of_colour():
     image, labels = squares((20, 20), (50, 80))
     hidden = np.zeros((HEIGHT, WIDTH), bool)
-    hidden[15:55, 35:55] = True  # the right half of a square, with the wall beside it
+    hidden[15:55, 35:55] = True  # the right half of a square, and the wall next to it
     hidden[70:90, 60:100] = True  # the lower left of the other
     found = FlowPropagator(flow=hide(hidden))(np.stack([image, image]), labels)[1]
     np.testing.assert_array_equal(found[~hidden], labels[~hidden])
@@ -146,5 +146,7 @@ def test_labels_are_names_and_bytes_mean_the_same_as_floats():
 def test_one_picture_is_done_and_labels_of_another_size_are_refused():
     image, labels = squares((20, 20))
     np.testing.assert_array_equal(FlowPropagator()(image[None], labels), labels[None])
-    with pytest.raises(ValueError, match=r"labels: expected shape \(96, 128\) as images, found \(95, 128\)"):
+    with pytest.raises(
+        ValueError, match=r"labels: expected shape \(96, 128\) like images, found \(95, 128\)"
+    ):
         FlowPropagator()(image[None], labels[1:])

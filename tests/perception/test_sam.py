@@ -28,7 +28,7 @@ MEAN, STD = [0.5, 0.4, 0.3], [0.2, 0.3, 0.4]
 
 
 def greedy_suppression(boxes, scores, max_overlap):
-    """The rows that are left when each, from the best on, removes those that overlap it too much."""
+    """The rows left after each, from the best on, removes those that overlap it too much."""
     left, kept = list(np.argsort(-scores, kind="stable")), []
     while left:
         best = left.pop(0)
@@ -56,7 +56,7 @@ def sam_folder(tmp_path_factory):
     model = SamModel(
         SamConfig(vision_config=vision, mask_decoder_config=decoder, prompt_encoder_config=prompt)
     )
-    torch.manual_seed(7)  # with most others all masks are as large as the picture
+    torch.manual_seed(7)  # with most other seeds, all masks are as large as the image
     for weights in model.parameters():
         if weights.ndim > 1:
             torch.nn.init.normal_(weights, std=0.6)
@@ -71,14 +71,14 @@ def sam_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sam(sam_folder):
-    """Random weights are sure of little."""
+    """Random weights give low scores, so the thresholds are lower."""
     limits = {"min_score": 0.8, "min_stability": 0.6, "max_box_overlap": 0.9, "max_fraction": 1.0}
     points = {"points_per_side": 6, "points_per_batch": 10}
     return dataclasses.replace(load_sam(sam_folder), **limits, **points, min_pixels=1)
 
 
 @needs_foundation
-def test_everything_is_what_sam_says_at_a_grid_of_points(sam, sam_folder):
+def test_everything_agrees_with_sam_on_a_grid_of_points(sam, sam_folder):
     import torch
     from transformers import SamImageProcessorPil, SamModel
 
@@ -111,7 +111,7 @@ def test_everything_is_what_sam_says_at_a_grid_of_points(sam, sam_folder):
 
 
 @needs_torchvision
-def test_everything_is_that_of_the_pipeline_of_transformers(sam, sam_folder):
+def test_everything_agrees_with_the_pipeline_of_transformers(sam, sam_folder):
     from transformers import SamImageProcessorPil, SamModel, pipeline
 
     model, pictures = (kind.from_pretrained(sam_folder) for kind in (SamModel, SamImageProcessorPil))
@@ -138,7 +138,7 @@ def test_labels_are_named_by_size_and_a_difference_is_a_picture_as_any(sam):
 
 
 @needs_foundation
-def test_where_sam_is_sure_of_nothing_there_are_no_labels(sam):
+def test_without_confident_masks_there_are_no_labels(sam):
     assert not dataclasses.replace(sam, min_score=1e9)(IMAGE).any()
     assert dataclasses.replace(sam, min_score=1e9).find(IMAGE).masks.shape == (0, HEIGHT, WIDTH)
 
@@ -183,7 +183,7 @@ def test_each_label_of_clicks_has_the_mask_that_sam_gives_for_them(sam, sam_fold
         ([(52, 10, 1)], r"expected x in \[0, 52\) and y in \[0, 37\), found \(52, 10, 1\)"),
         ([(5, 5, 1), (5, -1, 2)], r"found \(5, -1, 2\)"),
         ([(5, 5, -3)], "labels of 0 or more"),
-        ([(5, 5, 0)], "all have label 0"),
+        ([(5, 5, 0)], "found only label 0"),
     ],
 )
 def test_clicks_on_nothing_are_refused(clicks, says):
@@ -198,7 +198,7 @@ def picture_settings():
 
 
 def save_sam2_settings(folder, one_file):
-    """As the hub has them, or as newer releases of transformers write them."""
+    """In the hub's layout, or in that of newer releases of transformers."""
     picture = {**picture_settings(), "image_processor_type": "Sam2ImageProcessor"}
     video = {**picture_settings(), "video_processor_type": "Sam2VideoVideoProcessor"}
     whole = {"processor_class": "Sam2VideoProcessor", "point_pad_value": -10, "target_size": SIDE}
@@ -248,7 +248,7 @@ def sam2_folder(tmp_path_factory):
     for weights in model.mask_decoder.parameters():
         if weights.ndim > 1:
             torch.nn.init.normal_(weights, std=0.1)
-    model.mask_decoder.pred_obj_score_head.proj_out.bias.data.fill_(100.0)  # no object is ever out of sight
+    model.mask_decoder.pred_obj_score_head.proj_out.bias.data.fill_(100.0)  # every object is always visible
     model.save_pretrained(folder)
     save_sam2_settings(folder, one_file=False)
     return folder
@@ -256,7 +256,7 @@ def sam2_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def views():
-    """Three pictures larger than the model sees them, and labels 3 and 7 in the first; 7 is a comb."""
+    """Three images larger than the model's input, and labels 3 and 7 of the first; 7 is a comb."""
     image = np.random.default_rng(1).integers(0, 256, (96, 130, 3), dtype=np.uint8)
     labels = np.zeros(image.shape[:2], np.int32)
     labels[12:50, 20:75] = 3
@@ -265,7 +265,7 @@ def views():
 
 
 @needs_foundation
-def test_sam2_says_what_that_of_transformers_does(sam2_folder, views):
+def test_sam2_agrees_with_transformers(sam2_folder, views):
     import torch
     from transformers import Sam2VideoInferenceSession, Sam2VideoModel, Sam2VideoProcessor
 
@@ -301,11 +301,11 @@ def test_sam2_says_what_that_of_transformers_does(sam2_folder, views):
 
 
 @needs_torchvision
-def test_sam2_says_what_the_whole_processor_of_transformers_leads_to(sam2_folder, views):
+def test_sam2_agrees_with_the_complete_processor_of_transformers(sam2_folder, views):
     import torch
     from transformers import Sam2VideoModel, Sam2VideoProcessor
 
-    # Of the model's own size, because PIL and torchvision do not round alike when they resize.
+    # At the model's own size, because PIL and torchvision round differently when they resize.
     images, labels = views[0][:, :SIDE, 30 : 30 + SIDE], views[1][:SIDE, 30 : 30 + SIDE]
     processor = Sam2VideoProcessor.from_pretrained(sam2_folder)
     session = processor.init_video_session(video=list(images), dtype=torch.float32)
@@ -334,5 +334,7 @@ def test_without_objects_sam2_is_not_asked_and_labels_of_another_size_are_refuse
     images, labels = views
     propagate = Sam2Propagator(None, None, None, None)
     assert not propagate(images, 0 * labels).any()
-    with pytest.raises(ValueError, match=r"labels: expected shape \(96, 130\) as images, found \(95, 130\)"):
+    with pytest.raises(
+        ValueError, match=r"labels: expected shape \(96, 130\) like images, found \(95, 130\)"
+    ):
         propagate(images, labels[1:])

@@ -1,4 +1,4 @@
-"""Depth by matching two eyes, against the exact depth of a simulated endoscope."""
+"""Stereo depth against the exact depth of a simulated endoscope."""
 
 import cv2
 import numpy as np
@@ -10,13 +10,13 @@ from gsjax.perception.stereo import StereoConfig, stereo_depth
 
 @pytest.fixture(scope="module")
 def eyes():
-    """The first frame of built-in tissue: pictures, view matrices, K, and the left eye's exact depth."""
+    """The first frame of built-in tissue: images, view matrices, Ks, and the left camera's exact depth."""
     seen = gsjax.open_sequence("simulated:tissue?width=240&height=192&frames=1")
     return seen.image(0, 0), seen.image(0, 1), seen.viewmats[0], seen.Ks[0], seen.depth(0, 0)
 
 
 def errors(found, true):
-    """Millimetres, where there is depth, and the share of pixels that have some."""
+    """Errors in millimetres where there is depth, and the fraction of pixels with depth."""
     known = (found > 0) & (true > 0)
     return 1e3 * np.abs(found - true)[known], known.sum() / (true > 0).sum()
 
@@ -34,7 +34,7 @@ def about(axis, degrees):
 
 
 def seen_turned(image, turn, K):
-    """What a camera sees that is turned on the spot: the picture through K R K^-1."""
+    """The image of a camera rotated about its centre: the homography K R K^-1."""
     centers = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     warp = centers @ K @ turn @ np.linalg.inv(K) @ np.linalg.inv(centers)
     return cv2.warpPerspective(image, warp, image.shape[1::-1], flags=cv2.INTER_CUBIC)
@@ -44,7 +44,7 @@ class TestDepth:
     def test_is_that_of_the_simulation(self, eyes):
         left, right, viewmats, Ks, true = eyes
         off, covered = errors(stereo_depth(left, right, viewmats, Ks), true)
-        assert np.median(off) < 0.6  # of 105; a sixteenth of a pixel is 0.75
+        assert np.median(off) < 0.6  # at 105 mm, where 1/16 pixel is 0.75 mm
         assert np.quantile(off, 0.95) < 3
         assert covered > 0.9
 
@@ -57,7 +57,7 @@ class TestDepth:
 
     @pytest.mark.parametrize("turn", [about("z", 3.0), about("x", 1.5)])
     def test_of_an_eye_that_is_turned(self, eyes, turn):
-        """It looks elsewhere, and its picture is brought back."""
+        """The rotated camera's image is rectified."""
         left, right, viewmats, Ks, true = eyes
         askew = np.stack([viewmats[0], turned(viewmats[1], turn)])
         off, covered = errors(stereo_depth(left, seen_turned(right, turn, Ks[1]), askew, Ks), true)
@@ -65,7 +65,7 @@ class TestDepth:
         assert covered > 0.85
 
     def test_of_eyes_one_above_the_other(self, eyes):
-        """Both on their side: depth is that of the picture on its side."""
+        """Both cameras rotated by 90 degrees: the depth is that of the rotated image."""
         left, right, viewmats, Ks, true = eyes
         quarter, height = about("z", 90.0), left.shape[0]
         K = np.stack([[[k[1, 1], 0, height - k[1, 2]], [0, k[0, 0], k[0, 2]], [0, 0, 1]] for k in Ks])
@@ -100,17 +100,17 @@ class TestDepth:
 
 def test_what_cannot_be_matched_is_named(eyes):
     left, right, viewmats, Ks, _ = eyes
-    with pytest.raises(ValueError, match="right: expected pixels"):
+    with pytest.raises(ValueError, match="right: expected shape"):
         stereo_depth(left, right[1:], viewmats, Ks)
     with pytest.raises(ValueError, match="found both at one place"):
         stereo_depth(left, right, viewmats[[0, 0]], Ks)
     behind = viewmats.copy()
     behind[1] = behind[0]
     behind[1, 2, 3] += 0.01
-    with pytest.raises(ValueError, match="found one before the other"):
+    with pytest.raises(ValueError, match="found one in front of the other"):
         stereo_depth(left, right, behind, Ks)
     away = np.stack([viewmats[0], turned(viewmats[1], about("x", 120.0))])
-    with pytest.raises(ValueError, match="look about the same way"):
+    with pytest.raises(ValueError, match="look in similar directions"):
         stereo_depth(left, right, away, Ks)
     with pytest.raises(ValueError, match="block: expected an odd number"):
         StereoConfig(block=4)

@@ -1,4 +1,4 @@
-"""Small scenes, and annotations switched off where the package's own errors must speak."""
+"""Small scenes, and annotations switched off where the package's own errors are tested."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from gsjax.rasterize.plan import DEFAULT_LIMITS
 
 @pytest.fixture(scope="session")
 def small():
-    """make(seed, **case fields) -> (case, scene in float32): 40 Gaussians on 33 x 17 pixels unless told."""
+    """make(seed, **case fields) -> (case, scene in float32): 40 Gaussians on 33 x 17 pixels by default."""
 
     def make(seed: int = 0, dtype=np.float32, **fields) -> tuple[Case, dict]:
         plain = {"width": 33, "height": 17, "render_mode": "RGB", "rasterize_mode": "classic"}
@@ -24,6 +24,6 @@ def small():
 
 @pytest.fixture(scope="session")
 def geometry():
-    """The arguments of `gsjax.plan` out of a scene."""
+    """The arguments of `gsjax.plan` from a scene."""
     names = (*ARRAYS[:4], "viewmats", "Ks")
     return lambda scene: tuple(scene[name] for name in names)

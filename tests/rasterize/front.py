@@ -1,4 +1,4 @@
-"""A few Gaussians before a camera, drawn by the rasterizer and by the float64 reference, with gradients."""
+"""A few Gaussians in front of a camera, drawn by the rasterizer and the float64 reference, with gradients."""
 
 from functools import partial
 
@@ -31,7 +31,7 @@ def drawn(scene, weights, plan):
 
 @partial(jax.jit, static_argnames="plan")
 def reference(scene, weights, plan):
-    """The same by the float64 reference, and the pixels that hang on a rounding."""
+    """The same by the float64 reference, and the pixels that depend on rounding."""
 
     def objective(scene):
         result = rasterization_reference(
@@ -51,7 +51,7 @@ def reference(scene, weights, plan):
 
 
 def scene_before(width=33, height=17, num=12, focal=30.0, depth=2.0, seed=0):
-    """A camera at the origin that looks along z, and Gaussians of a few pixels before it; float32."""
+    """A camera at the origin looking along z, and Gaussians of a few pixels in front of it; float32."""
     rng = np.random.default_rng(seed)
     depths = depth * (1 + 0.5 * (rng.permutation(num) + 0.5) / num)
     pixels = rng.uniform([0, 0], [width, height], (num, 2)) - [width / 2, height / 2]
@@ -77,7 +77,7 @@ def cotangent(width=33, height=17):
 
 
 def gradient_error(gradient, slope, names=TRAINED):
-    # Where the true gradient is 1e-20 (the rotation of a point), no digit of float32's means anything.
+    # Where the true gradient is 1e-20 (the rotation of a point), no digit in float32 is meaningful.
     meaningful = [
         k for k in names if np.abs(slope[k]).max() > FAINT or not np.abs(gradient[k]).max() <= FAINT
     ]

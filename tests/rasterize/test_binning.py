@@ -1,4 +1,4 @@
-"""Tile lists against brute force: no pair that a pixel sees is missing, and all are in order of depth."""
+"""Tile lists against brute force: no pair that a pixel sees is missing, and all are ordered by depth."""
 
 import jax
 import jax.numpy as jnp
@@ -88,8 +88,8 @@ def in_order(spans, by_depth, tiles_x, tiles_y):
     np.testing.assert_array_equal(tile[len(pairs) :], plan.num_tiles)
 
 
-def test_keys_wider_than_32_bits_are_sorted_as_right():
-    # 1e6 Gaussians x 32,400 tiles need 35 bits, and without x64 there is no wider integer to hide in.
+def test_keys_wider_than_32_bits_are_sorted_correctly():
+    # 1e6 Gaussians x 32,400 tiles need 35 bits, and without x64 there is no wider integer.
     assert not jax.config.jax_enable_x64
     rng = np.random.default_rng(0)
     n = 1_000_000

@@ -1,4 +1,4 @@
-"""Wrong arguments: every message names the argument, what it got and what it wants."""
+"""Wrong arguments: every message names the argument, what was found and what was expected."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +68,7 @@ def test_a_wrong_shape_is_named(changes, says):
         call(**changes)
 
 
-def test_what_is_no_plan_is_named():
+def test_a_plan_of_another_type_is_named():
     with pytest.raises(ValueError, match=r"plan must be a gsjax.Plan, from gsjax.plan\(...\); got dict"):
         rasterization(**GOOD, width=20, height=10, plan={})
 
@@ -94,7 +94,7 @@ def test_plan_answers_like_the_call():
 
 def test_more_views_than_indices_reach_are_refused():
     with pytest.raises(
-        ValueError, match=r"2 views of 5 Gaussians and 1073741824 pairs each are more than 32-bit"
+        ValueError, match=r"2 views of 5 Gaussians and 1073741824 pairs each exceed 32-bit indices"
     ):
         rasterization(**GOOD, width=20, height=10, plan=Plan(20, 10, 2**30))
 

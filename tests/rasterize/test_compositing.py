@@ -29,7 +29,7 @@ def grid(size: int = 6):
 
 
 def plain_loop(splats: Splats, pixels, alpha_max=0.99):
-    """(values [channels, pixels], transmittance [pixels]) in the words of the paper."""
+    """(values [channels, pixels], transmittance [pixels]) as the paper defines them."""
     means, conics, opacities, values = map(np.asarray, splats)
     images, left = np.zeros((values.shape[1], len(pixels))), np.ones(len(pixels))
     for p, (x, y) in enumerate(np.asarray(pixels)):
@@ -60,7 +60,7 @@ def test_a_list_of_any_length_equals_the_plain_loop(length, channels):
 
 
 @pytest.mark.usefixtures("x64")
-def test_passing_the_state_on_is_going_through_in_one_go():
+def test_passing_the_state_on_equals_a_single_pass():
     splats = random_list(40)
     whole = composite_tile(splats, grid())
     state = None

@@ -1,4 +1,4 @@
-"""Central differences, jvp against vjp, vmap against loops, permutations, and runs that repeat."""
+"""Central differences, jvp against vjp, vmap against loops, permutations, and repeated runs."""
 
 import dataclasses
 from functools import partial

@@ -1,4 +1,4 @@
-"""The same to the bit: in every run and process, and in every order of the Gaussians."""
+"""Results are equal bit for bit: in every run and process, and for every order of the Gaussians."""
 
 import hashlib
 import subprocess
@@ -11,7 +11,7 @@ from tests.rasterize.front import GAUSSIANS, TRAINED, cotangent, drawn, plan_for
 
 
 def digest() -> str:
-    """Of an image and all gradients, to the bit."""
+    """A digest of an image and all gradients, exact to the bit."""
     image, gradient, _ = drawn(scene_before(), cotangent(), plan_for())
     arrays = [image, *(gradient[key] for key in TRAINED)]
     return hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in arrays)).hexdigest()

@@ -1,4 +1,4 @@
-"""The ends of what floats hold: finite images and gradients, against float64 where defined, or an error.
+"""The limits of floats: finite images and gradients, equal to float64 where defined, or an error.
 
 Poison in every input: test_poison.py and `python -m benchmarks.fuzz`. Figures: docs/numerics.md.
 """
@@ -31,7 +31,7 @@ from tests.rasterize.front import (
 def errors(scene, weights=None, plan=None, certain=None):
     """(image, worst gradient) in float32 against float64, and meta; infinity where anything is not finite.
 
-    Both as parts of the array's largest value; a gradient below 1e-17 throughout counts as equal.
+    Both relative to the array's largest value; a gradient below 1e-17 everywhere counts as equal.
     """
     plan = plan_for() if plan is None else plan
     weights = cotangent(plan.width, plan.height) if weights is None else weights
@@ -46,7 +46,7 @@ def errors(scene, weights=None, plan=None, certain=None):
 
 
 def changed(**changes):
-    """A function that sets rows of a scene: {name: (index, value)}."""
+    """A function that sets rows of a scene, given as name=(index, value)."""
 
     def change(scene):
         scene = {k: v.copy() for k, v in scene.items()}
@@ -58,7 +58,7 @@ def changed(**changes):
 
 
 def with_focal(focal, scene):
-    """The same picture through another lens: the Gaussians come closer to the axis by as much."""
+    """The same picture with another focal length: the Gaussians move closer to the axis in proportion."""
     scene = changed(Ks=((0, [0, 1], [0, 1]), focal))(scene)
     scene["means"][:, :2] *= np.float32(30 / focal)
     scene["scales"] *= np.float32(30 / focal)
@@ -66,7 +66,7 @@ def with_focal(focal, scene):
 
 
 FULL = {"means": (0, (0, 0, 1.5)), "scales": (0, 1e3)}
-# What is drawn, and how far image and gradients may be off the reference, of their largest value.
+# Cases that are drawn, with limits of the errors of image and gradients, relative to their maximum.
 DRAWN = {
     "one that fills the frame": (changed(**FULL), 1e-5, 3e-4),
     "a hair in front of the near plane": (changed(means=(0, (0, 0, 0.0100001))), 1e-4, 1e-3),
@@ -125,7 +125,7 @@ def test_what_cannot_be_drawn_leaves_the_scene_without_it(name):
 
 
 def test_a_needle_longer_than_float64_can_square_equals_itself_in_float64():
-    # The reference multiplies the covariance out, and 1e24 beside 1e-3 is past its digits too.
+    # The reference multiplies out the covariance, and 1e24 beside 1e-3 exceeds its precision too.
     scene = changed(scales=((0, 0), 1e12))(scene_before())
     got, gradient, meta = drawn(scene, cotangent(), plan_for())
     with jax.enable_x64(True):
@@ -154,7 +154,7 @@ def test_no_gaussians_is_the_background():
 
 def test_all_at_equal_depth_are_drawn_in_the_order_of_the_input():
     scene = changed(means=((slice(None), 2), 2.0))(scene_before())
-    image, gradient, _ = errors(scene, certain=np.ones((17, 33, 1), bool))  # exact ties leave no doubt
+    image, gradient, _ = errors(scene, certain=np.ones((17, 33, 1), bool))  # exact ties are not doubtful
     assert image <= 1e-5
     assert gradient <= 1e-3
 
@@ -172,7 +172,7 @@ def test_images_of_any_shape(width, height):
 
 
 @pytest.mark.parametrize("num", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-def test_a_tile_with_endless_layers_equals_the_reference_on_the_layers_that_light_reaches(num):
+def test_a_tile_with_many_layers_equals_the_reference_on_the_layers_that_light_reaches(num):
     reached = 6_000
     scene = scene_before(16, 16, num=num)
     rng = np.random.default_rng(0)
@@ -244,7 +244,7 @@ def test_more_than_2_to_the_31_pairs_saturate_and_are_an_error_for_a_plan():
 
 @pytest.mark.slow
 def test_889536_zero_quaternions_in_one_file(tmp_path):
-    # splat-transform #288: so many stood in one real file. The reader counts them, and so does a call.
+    # splat-transform #288: one real file contained this many. The reader counts them, and so does a call.
     zeros, scene = 889_536, scene_before()
     few = gaussians_from_activated(*(scene[name] for name in GAUSSIANS))
     many = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], zeros, axis=0)]), few)

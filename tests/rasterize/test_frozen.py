@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.rasterize.frozen import filled_up, freeze_views, paint, strip_of
+from gsjax.rasterize.frozen import freeze_views, padded_view, paint, strip_of
 from gsjax.rasterize.rasterization import rasterization
 
 
@@ -35,11 +35,11 @@ def test_what_is_painted_is_what_the_rasterizer_draws(frozen, channels):
         np.testing.assert_allclose(opacity, alphas[c], atol=2e-5)
 
 
-def test_what_a_view_is_filled_up_with_is_not_seen(frozen):
+def test_the_padding_of_a_view_is_not_seen(frozen):
     scene, views, plan = frozen
     view = jax.tree.map(lambda a: a[1], views)
     seen, pairs = len(view.rows) + 7, len(view.ids) + 50
-    longer = jax.tree.map(jnp.asarray, filled_up(view, seen, pairs))
+    longer = jax.tree.map(jnp.asarray, padded_view(view, seen, pairs))
     assert {len(a) for a in (longer.rows, longer.means2d, longer.conics, longer.opacities)} == {seen}
     assert len(longer.ids) == pairs
     values = jnp.asarray(np.random.default_rng(4).normal(size=(len(scene["means"]), 3)), jnp.float32)
@@ -82,7 +82,7 @@ def test_slopes_by_the_values_are_those_of_the_whole_rasterizer_and_nothing_else
             of_plan = dataclasses.replace(plan, capacity=4096)
             return (rasterization(**shapes, colors=values, width=33, height=17, plan=of_plan)[0][0] * w).sum()
 
-        # By everything, which takes another way back; and by the values alone.
+        # Gradients by everything, which use another backward pass, and by the values alone.
         both = jax.jit(jax.grad(whole, argnums=(0, 1), allow_int=True))(scene, values)[1]
         np.testing.assert_allclose(slope, both, atol=2e-4)
         np.testing.assert_allclose(jax.jit(jax.grad(whole, argnums=1))(scene, values), both, atol=2e-4)

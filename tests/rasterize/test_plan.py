@@ -1,4 +1,4 @@
-"""Plans: the ladder, what may travel where, contradictions, overflow, and what compiles when."""
+"""Plans: the ladder, use under transformations, contradictions, overflow, and what compiles when."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ def draw(scene, this, **options):
     return rasterization(**scene, width=this.width, height=this.height, **options)
 
 
-def test_the_ladder_is_geometric_and_holds_what_it_is_asked_for():
+def test_the_ladder_is_geometric_and_holds_what_is_requested():
     rungs = sorted({rung(pairs) for pairs in np.geomspace(1, 1e8, 2000)})
     assert rungs[0] == rung(0) == 4096
     assert len(rungs) < 32
@@ -149,7 +149,7 @@ def test_eager_grad_without_a_plan_plans_by_itself(small, geometry):
     assert np.isfinite(value)
 
 
-def test_overflow_draws_nothing_says_so_and_a_larger_plan_mends_it(small, geometry):
+def test_overflow_draws_nothing_and_is_reported_and_a_larger_plan_fixes_it(small, geometry):
     this, scene = small(channels=3)
     p = plan(*geometry(scene), this.width, this.height)
     want, _, meta = draw(scene, this, plan=p)

@@ -1,4 +1,4 @@
-"""Values that cannot be drawn, in each input: neighbours do not notice, and nothing turns non-finite."""
+"""Values that cannot be drawn, in each input: neighbours are unaffected, and everything stays finite."""
 
 import math
 
@@ -43,7 +43,7 @@ def weights():
 
 
 def busiest(scene, weights) -> int:
-    """The Gaussian whose absence changes most: a visible one."""
+    """The Gaussian whose removal changes the image most: a visible one."""
     return int(jnp.abs(run(scene, weights)[1]["opacities"]).argmax())
 
 
@@ -57,7 +57,7 @@ def assert_finite(tree):
     [(name, value, 1) for name in PER_GAUSSIAN for value in (np.nan, np.inf, -np.inf)]
     + [(name, 1e38, 1) for name in ("quats", "scales", "colors", "features")]
     + [("quats", 0.0, 1), ("quats", TINY, 1), ("quats", 1e-7, 1), ("scales", 1e12, 1)]
-    # Refused for where they are, or for being too faint: not counted.
+    # Not drawn because of their position or faintness: not counted.
     + [
         ("means", 1e38, 0),
         ("means", -1e38, 0),
@@ -115,7 +115,7 @@ def test_a_camera_beyond_what_can_be_squared_has_finite_gradients(scene, weights
 
 
 def place(scene, k, depth, sideways=0.0):
-    """The scene with Gaussian k at `depth` before the camera."""
+    """The scene with Gaussian k at `depth` in front of the camera."""
     viewmat = np.float64(scene["viewmats"][0])
     world = (np.array([sideways, 0.0, depth]) - viewmat[:3, 3]) @ viewmat[:3, :3]
     return scene | {"means": scene["means"].at[k].set(jnp.asarray(world, scene["means"].dtype))}
@@ -135,7 +135,7 @@ def test_at_and_behind_the_near_plane_nothing_is_drawn(scene, weights, depth):
 @pytest.mark.parametrize(
     "change",
     [
-        # A hair in front of the near plane, with the camera inside the Gaussian.
+        # Just beyond the near plane, with the camera inside the Gaussian.
         lambda s: place(s, 0, 0.0101),
         lambda s: place(s, 0, 0.0101, sideways=1e30),
         lambda s: place(s, 0, 1e6),
@@ -213,7 +213,7 @@ def assert_sound(case):
     assert not failure, f"python -m benchmarks.fuzz --case '{case}'  # {failure}"
 
 
-# One mode through matmuls and one pushed forward here; every other in the slow test.
+# Here one mode with matmuls and one with forward derivatives; all others are in the slow test.
 @settings(max_examples=150)
 @given(poisons(["channels", "forward"]))
 def test_poison_anywhere_is_culled_and_counted_or_drawn_as_the_reference_draws_it(case):

@@ -1,4 +1,4 @@
-"""What few digits cost: far from the origin in float32, and of colours in half precision.
+"""The cost of low precision: far from the origin in float32, and for colours in half precision.
 
 Figures: docs/numerics.md.
 """
@@ -26,11 +26,11 @@ def far_away(distance: float):
     got, gradient, meta = drawn(rounded, cotangent(), plan_for())
     assert all(np.isfinite(gradient[key]).all() for key in TRAINED)
     assert np.isfinite(got).all()
-    # The colours: an expected depth jumps from nothing to metres where a footprint ends.
+    # Only the colours: an expected depth jumps from nothing to metres where a footprint ends.
     return float(np.abs(meta.means2d - exact.means2d).max()), relative_error(got[..., :3], want[..., :3])
 
 
-# float32 holds a coordinate to 6e-8 of itself: at 1e4 m to half a millimetre, which here is 0.003 pixels.
+# float32 has a relative precision of 6e-8: half a millimetre at 1e4 m, which here is 0.003 pixels.
 @pytest.mark.parametrize(("distance", "pixels"), [(1.0, 1e-4), (1e2, 1e-3), (1e4, 0.1), (1e6, 10.0)])
 def test_the_error_in_pixels_grows_with_the_distance_from_the_origin(distance, pixels):
     error, _ = far_away(distance)
@@ -38,7 +38,7 @@ def test_the_error_in_pixels_grows_with_the_distance_from_the_origin(distance, p
 
 
 def half_precision(dtype, scene, this):
-    """(image, colours' gradient, other gradients) off float32, of the largest value, with `dtype` colours."""
+    """Errors of (image, colours' gradient, other gradients) with `dtype` colours, relative to the maximum."""
     weights = cotangent(this.width, this.height)
     halved = scene | {"colors": jnp.asarray(scene["colors"], dtype)}
     want, slope, _ = drawn(scene, weights, this)
@@ -48,7 +48,7 @@ def half_precision(dtype, scene, this):
     return relative_error(got, want), relative_error(gradient["colors"], slope["colors"]), others
 
 
-# Half the spacing of values: 2^-9 of a bfloat16, 2^-12 of a float16.
+# Half the spacing of values: 2^-9 for bfloat16, 2^-12 for float16.
 @pytest.mark.parametrize(
     ("dtype", "spacing"), [(jnp.bfloat16, 2**-9), pytest.param(jnp.float16, 2**-12, marks=pytest.mark.slow)]
 )

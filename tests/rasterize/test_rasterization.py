@@ -69,7 +69,7 @@ def test_opacity_0_and_1_at_their_ends_have_their_gradients():
 
     steps = jnp.float32(1.0), jnp.float32(1.0 - 1e-3)
     at_end, inside = (jax.grad(brightness)(o) for o in steps)
-    np.testing.assert_allclose(at_end, inside, rtol=0.01)  # not halved, as a clip at its very bound would be
+    np.testing.assert_allclose(at_end, inside, rtol=0.01)  # not halved, as with clip at its bound
     assert float(jax.grad(brightness)(jnp.float32(1.5))) == 0.0
     assert float(brightness(jnp.float32(1.5))) == float(brightness(jnp.float32(1.0)))
 

@@ -1,7 +1,7 @@
-"""Many devices give what one gives: four virtual ones, and two real processes over `jax.distributed`.
+"""Many devices give the same as one: four virtual ones, and two real processes over `jax.distributed`.
 
-How many devices a process has is settled when JAX starts, so this file is also the program that the tests
-start: it draws and trains with and without a mesh and prints how far the two are apart.
+The number of devices of a process is fixed when JAX starts, so this file is also the program that the tests
+start: it draws and trains with and without a mesh and prints the differences.
 """
 
 import functools
@@ -36,7 +36,7 @@ TIMEOUT = 600  # seconds; on two idle cores the programs take some 40
 
 
 def a_scene(lead: tuple[int, ...], cameras: int, extras: bool) -> dict[str, np.ndarray]:
-    """Gaussians in a ball and cameras around it; `extras` are the inputs that few calls have."""
+    """Gaussians in a ball and cameras around it; `extras` adds the rarely used inputs."""
     rng = np.random.default_rng(0)
     angles = rng.uniform(0, 2 * np.pi, (*lead, cameras))
     eyes = 1.5 * np.stack([np.cos(angles), np.sin(angles), 0.5 + 0 * angles], -1)
@@ -61,7 +61,7 @@ def a_scene(lead: tuple[int, ...], cameras: int, extras: bool) -> dict[str, np.n
 
 
 def place(scene: dict, mesh, **axes) -> dict:
-    """The scene over the mesh; every process holds only the parts that are its own."""
+    """The scene placed on the mesh; every process holds only its own shards."""
     plan = gsjax.Plan(WIDTH, HEIGHT, 0)
     axes = {
         name: (axis,) if axis else () for name, axis in ({"cameras": None, "scenes": None} | axes).items()
@@ -97,12 +97,12 @@ def train(draw, scene: dict, plan):
 
 
 def whole(tree):
-    """What all processes hold together, as numpy arrays."""
+    """The global arrays of all processes, as numpy arrays."""
     return jax.tree.map(lambda a: np.asarray(multihost_utils.process_allgather(a, tiled=True)), tree)
 
 
 def difference(many, one, relative: bool = False) -> float:
-    """The largest over all arrays; infinite where shapes or types differ, or anything is not finite."""
+    """The largest difference over all arrays; infinite if shapes or types differ or a value is not finite."""
 
     def apart(a, b):
         b = np.asarray(b)
@@ -123,7 +123,7 @@ def compare_training(mesh, scene: dict, **axes) -> dict:
     part = [list(shard.data.shape) for shard in outcome[2].addressable_shards]
     names = ("params", "grads", "images", "alphas", "meta")
     many = dict(zip(names, map(whole, outcome), strict=True))
-    if jax.process_index() > 0:  # one process is enough to judge
+    if jax.process_index() > 0:  # one process is enough to compare
         return {"part": part}
     expected, _ = train(gsjax.rasterization, jax.tree.map(jnp.asarray, scene), plan)
     one = dict(zip(names, expected, strict=True))
@@ -147,7 +147,7 @@ def compare_training(mesh, scene: dict, **axes) -> dict:
 
 
 def sent(program: str) -> dict[str, int]:
-    """Values that each kind of collective of a compiled program passes between devices."""
+    """Number of values passed between devices by each kind of collective of a compiled program."""
     total: dict[str, int] = {}
     kinds = r"= ([^=\n]*?) (all-reduce|all-gather|all-to-all|reduce-scatter|collective-[a-z]+)(?:-start)?\("
     for shapes, kind in re.findall(kinds, program):
@@ -159,7 +159,7 @@ def sent(program: str) -> dict[str, int]:
 
 
 def compare_overflow(mesh) -> dict:
-    """A plan that is too small for two cameras and enough for two that look away."""
+    """A plan that is too small for two cameras and large enough for two that look away."""
     scene = a_scene((), 4, extras=False)
     scene["viewmats"][1::2, 2, 3] = -9.0
     plan = gsjax.Plan(WIDTH, HEIGHT, 16)
@@ -216,7 +216,7 @@ def two_processes(process: int, port: int) -> dict:
 
 
 def run_program(*argument_lists: tuple) -> list[dict]:
-    """Start this file once for each list of arguments, all at once; what each prints."""
+    """Start this file once for each list of arguments, all in parallel; returns what each prints."""
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     environment |= {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     start = functools.partial(
@@ -229,7 +229,7 @@ def run_program(*argument_lists: tuple) -> list[dict]:
         pytest.fail(f"{len(programs)} program(s) had not ended after {TIMEOUT} s: {argument_lists}")
     finally:
         for program in programs:
-            program.kill()  # nothing happens to one that has ended
+            program.kill()  # does nothing to one that has ended
     for program, (_, errors), arguments in zip(programs, outputs, argument_lists, strict=True):
         assert program.returncode == 0, f"program {arguments} failed:\n{errors[-4000:]}"
     return [json.loads(out.splitlines()[-1]) for out, _ in outputs]
@@ -242,7 +242,7 @@ def on_four():
 
 @pytest.fixture(scope="module")
 def more_on_four():
-    """What takes another half a minute."""
+    """Comparisons that take another half minute."""
     return run_program(("four", "cameras", "forward"))[0]
 
 
@@ -267,7 +267,7 @@ def test_scenes_and_cameras_over_two_by_two_devices(on_four):
     assert on_four["scenes"]["part"] == [[1, 1, HEIGHT, WIDTH, 4]] * 4
 
 
-def test_every_device_says_when_its_plan_is_too_small(on_four):
+def test_every_device_reports_when_its_plan_is_too_small(on_four):
     assert on_four["overflow"] == {"flags": [True, False, True, False], "counts": 0}
 
 
@@ -325,7 +325,7 @@ def test_a_plan_without_a_capacity_keeps_its_options(one_device_mesh):
     plan = gsjax.Plan(WIDTH, HEIGHT, 0, near_plane=1.4, render_mode="RGB+ED", tile_size=16)
     options = {"width": WIDTH, "height": HEIGHT, "plan": plan}
     apart = difference(whole(draw(**scene, **options)), gsjax.rasterization(**scene, **options))
-    assert apart <= 5e-5  # which is rounding where nothing is optimised
+    assert apart <= 5e-5  # rounding of programs compiled without optimisation
 
 
 @pytest.mark.usefixtures("as_users_run")

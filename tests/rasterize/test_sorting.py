@@ -1,4 +1,4 @@
-"""The host's sorts and sums are XLA's, faster: same results, in every transformation and on one core."""
+"""The host's sorts and sums equal XLA's: same results, under every transformation and on one core."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ SORTS = ("host", "device")
 
 
 def test_the_host_sort_is_there():
-    # If XLA's interface changes all still works, but slower: whoever upgrades JAX should notice.
+    # If XLA's interface changes, everything still works, but slower: an upgrade of JAX should reveal it.
     assert sorting._AVAILABLE
 
 
@@ -71,8 +71,8 @@ def test_vmap_repeats_every_row():
 
 
 @pytest.mark.parametrize("error", [MemoryError("no room"), KeyboardInterrupt("no room")])
-def test_a_failure_on_the_host_is_an_error_with_its_words(error):
-    """Ctrl-C too: what a callback of C raises is printed and lost, and its result would be garbage."""
+def test_a_failure_on_the_host_is_an_error_with_its_message(error):
+    """Ctrl-C too: an exception in a C callback is printed and lost, and the result would be garbage."""
 
     def fail(keys, out):
         raise error
@@ -112,7 +112,7 @@ def test_one_core_does_not_hang():
 
 
 def test_a_program_may_end_while_a_call_is_under_way():
-    # The host's work needs the interpreter, which is gone by then unless it is waited for.
+    # The host's work needs the interpreter, which is gone by then unless the exit waits for it.
     program = (
         "import jax, jax.numpy as jnp\n"
         "from gsjax.rasterize.sorting import sort_keys\n"

@@ -1,4 +1,4 @@
-"""Deformation: both papers' formulas, what is left alone, and that asking in fewer places changes no more."""
+"""Deformation: both papers' formulas, what stays unchanged, and evaluation at selected rows or nodes."""
 
 import equinox as eqx
 import jax
@@ -37,7 +37,7 @@ def scene(seed=0, num=6, features=None):
 
 
 def moving(field, seed=1):
-    """The field with a last layer that says something, so that its slopes reach everything."""
+    """The field with a random last layer, so that its gradients reach everything."""
     rng = np.random.default_rng(seed)
     last = jax.tree.map(
         lambda leaf: jnp.asarray(0.3 * rng.normal(size=leaf.shape), leaf.dtype), field.layers[-1]
@@ -71,7 +71,7 @@ class TestDeform:
         assert jnp.isfinite(found.quats).all()
         np.testing.assert_allclose(jnp.linalg.norm(found.quats, axis=1), 1.0)
 
-    def test_what_nobody_changes_is_the_same(self):
+    def test_fields_without_offsets_are_unchanged(self):
         gaussians = scene(features=2)
         found = deform(gaussians, Offsets(*(jnp.ones((6, 3)),) * 3))
         for name in ("logit_opacities", "sh0", "features"):
@@ -102,7 +102,7 @@ class TestField:
         config = self.config(kind, semantic=True, color=True, opacity=True, feature=True)
         field = moving(init_deformation(jax.random.key(0), config, BOX, 2))
         field = jax.tree.map(lambda a: a.astype(jnp.float64), field)
-        # The network's ReLU has no slope at its knee; these values are away from it.
+        # The network's ReLU has no derivative at its kink; these values are away from it.
         check_grads(
             jax.jit(lambda f, g, t: jax.tree.leaves(deform_rows(g, f, t))),
             (field, gaussians, jnp.asarray(TIME)),
@@ -112,7 +112,7 @@ class TestField:
         )
 
     def test_units_of_length_do_not_matter(self, kind):
-        """A scene in millimetres moves a thousand times as many of them."""
+        """A scene in millimetres moves by a thousand times as many units."""
         gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene())
         field = moving(init_deformation(jax.random.key(0), self.config(kind), BOX))
         larger = moving(init_deformation(jax.random.key(0), self.config(kind), 1000 * BOX))
@@ -124,7 +124,7 @@ class TestField:
         gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene())
         field = moving(init_deformation(jax.random.key(0), self.config(kind), BOX))
         whole = deform_rows(gaussians, field, jnp.asarray(TIME))
-        rows = jnp.array([4, 1, gaussians.num, gaussians.num])  # the last two fill up the list
+        rows = jnp.array([4, 1, gaussians.num, gaussians.num])  # the last two pad the list
         some = deform_rows(gaussians, field, jnp.asarray(TIME), rows)
         np.testing.assert_allclose(some.means[rows[:2]], whole.means[rows[:2]], atol=1e-6)
         still = np.array([0, 2, 3, 5])
@@ -144,7 +144,7 @@ class TestField:
             np.testing.assert_allclose(one, other, atol=1e-5)
 
 
-def test_a_place_that_is_no_number_leaves_the_slopes_of_others():
+def test_a_position_that_is_not_a_number_leaves_the_gradients_of_others():
     gaussians = jax.tree.map(lambda a: a.astype(jnp.float32), scene())
     broken = eqx.tree_at(lambda g: g.means, gaussians, gaussians.means.at[2].set(jnp.nan))
     field = moving(init_deformation(jax.random.key(0), DeformationConfig(**SMALL), BOX))
@@ -172,7 +172,7 @@ def test_a_field_of_features_needs_them():
     with pytest.raises(ValueError, match="feature_size"):
         init_deformation(jax.random.key(0), config, BOX)
     field = init_deformation(jax.random.key(0), config, BOX, 2)
-    with pytest.raises(ValueError, match="features: this field"):
+    with pytest.raises(ValueError, match="features: expected an array, as this field"):
         field(jnp.zeros((1, 3)), jnp.asarray(0.0))
     with pytest.raises(ValueError, match="bounds"):
         init_deformation(jax.random.key(0), DeformationConfig(**SMALL), np.array([[0, 0, 0], [1, 0, 1]]))

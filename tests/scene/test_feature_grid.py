@@ -1,4 +1,4 @@
-"""The grid against its formula in loops; dense levels have no collisions, cells meet, and NaN stays alone."""
+"""The grid against its formula in loops; dense levels have no collisions, cells join, and NaN stays local."""
 
 import itertools
 import re
@@ -24,20 +24,20 @@ seeds = st.integers(0, 10_000)
 
 
 def some_grid(config=SMALL, outputs=3, seed=0):
-    """With features of the order of 1, so that what they do is seen."""
+    """A grid with features of order 1, so that their effect is visible."""
     grid = init_feature_grid(jax.random.key(seed), config, outputs, BOUNDS)
     return eqx.tree_at(lambda g: g.table, grid, 1e4 * grid.table)
 
 
 def some_positions(num, seed=0, beyond=0.0):
-    """Anywhere in the box, and by this share of its edges beyond."""
+    """Random positions in the box, extended by this share of its edges."""
     low, high = BOUNDS
     share = np.random.default_rng(seed).uniform(-beyond, 1 + beyond, (num, 3))
     return jnp.asarray(low + share * (high - low))
 
 
 def by_loops(grid, position):
-    """Features of one position, as instant-ngp's paper and code have them, in Python's own numbers."""
+    """Features of one position, as in instant-ngp's paper and code, with plain Python numbers."""
     low, high = grid.bounds
     begins, features = 0, []
     size = 2**grid.config.log2_entries
@@ -75,7 +75,7 @@ class TestConfig:
         assert finer.resolutions[::5] == (16, 32, 64, 128, 256, 512, 1024)
 
     @given(st.integers(2, 64), st.integers(2, 300), st.integers(0, 5000), st.integers(3, 24))
-    def test_they_are_the_formula_and_reach_from_the_least_to_the_most(self, levels, least, more, log2):
+    def test_resolutions_follow_the_formula_from_the_least_to_the_most(self, levels, least, more, log2):
         config = FeatureGridConfig(levels, least, least + more, log2)
         resolutions = np.array(config.resolutions)
         assert (resolutions[0], resolutions[-1]) == (least, least + more)
@@ -133,7 +133,7 @@ class TestInit:
         np.testing.assert_allclose([one.table.min(), one.table.max()], [-1e-4, 1e-4], rtol=0.01)
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             assert not (a == b).any()
-        assert not (one.layers[1].weight == one.layers[2].weight).any()  # of one shape
+        assert not (one.layers[1].weight == one.layers[2].weight).any()  # layers of equal shape
 
     @pytest.mark.parametrize(
         "bounds",
@@ -145,11 +145,11 @@ class TestInit:
         ],
         ids=["flat", "of a plane", "nan", "flat in float32"],
     )
-    def test_boxes_that_are_none_are_refused(self, bounds):
+    def test_invalid_boxes_are_refused(self, bounds):
         with pytest.raises(ValueError, match=r"^bounds: expected \[2, 3\].*give a flat scene a margin"):
             init_feature_grid(jax.random.key(0), SMALL, 3, np.array(bounds))
 
-    def test_outputs_are_wanted(self):
+    def test_outputs_are_required(self):
         with pytest.raises(ValueError, match=r"^outputs: expected at least 1, found 0"):
             init_feature_grid(jax.random.key(0), SMALL, 0, BOUNDS)
 
@@ -174,8 +174,8 @@ class TestFormula:
         np.testing.assert_array_equal(grid(some_positions(10)), grid.at(located))
 
     @given(seeds)
-    def test_weights_are_a_partition_of_unity_that_finds_the_place_again(self, seed):
-        """Weighted by them, the vertices of a dense level are where the position is."""
+    def test_weights_are_a_partition_of_unity_that_reproduces_the_position(self, seed):
+        """The weighted mean of a dense level's vertices is the position."""
         config = FeatureGridConfig(1, 4, 4, 9)
         grid = some_grid(config)
         positions = some_positions(5, seed)
@@ -187,8 +187,8 @@ class TestFormula:
         low, high = BOUNDS
         np.testing.assert_allclose((found - 0.5) / 3 * (high - low) + low, positions, atol=1e-12)
 
-    def test_nothing_jumps_where_cells_meet_but_slopes_do(self):
-        """Half-way along x, where the levels of 4, 6, 10 and 18 all have a vertex."""
+    def test_outputs_are_continuous_where_cells_meet_but_derivatives_jump(self):
+        """Halfway along x, where the levels of 4, 6, 10 and 18 all have a vertex."""
         grid = some_grid()
         low, high = BOUNDS
         middle = some_positions(1).at[0, 0].set((low[0] + high[0]) / 2)
@@ -218,7 +218,7 @@ class TestFormula:
 
 
 class TestEntries:
-    """In 32 bits, as they are used: a hash overflows them."""
+    """Indices in 32 bits, as they are used: the hash overflows them."""
 
     def test_dense_levels_have_no_collisions(self):
         config = FeatureGridConfig(levels=3, least_resolution=3, most_resolution=7, log2_entries=9)
@@ -231,7 +231,7 @@ class TestEntries:
         begins = np.cumsum([0, *config.entries])
         for level in range(3):
             used = np.asarray(located.indices[:, level])
-            assert len(np.unique(used, axis=0)) == config.resolutions[level] ** 3  # one set a cell
+            assert len(np.unique(used, axis=0)) == config.resolutions[level] ** 3  # one set per cell
             np.testing.assert_array_equal(np.unique(used), np.arange(begins[level], begins[level + 1]))
 
     @pytest.mark.parametrize("log2", [3, 19])
@@ -244,12 +244,12 @@ class TestEntries:
             rows = np.asarray(indices[:, level]) - level * 2**log2
             assert rows.min() >= 0
             assert rows.max() < 2**log2
-            # So many of m entries does a fair hash use for n vertices.
+            # The number of m entries that a uniform hash uses for n vertices.
             fair = 2**log2 * -np.expm1(-len(np.unique(rows, axis=0)) * 8 / 2**log2)
             assert len(np.unique(rows)) > 0.95 * fair
 
     def test_the_corners_of_the_box_at_the_most_resolution(self):
-        """Where float32 is at its limit, no vertex lies beyond the last."""
+        """At the limit of float32, no vertex lies beyond the last."""
         config = FeatureGridConfig(2, 2, 2**20, 10, features=1, hidden=1)
         grid = init_feature_grid(jax.random.key(0), config, 1, BOUNDS)
         located = locate(grid, jnp.asarray(BOUNDS, jnp.float32))
@@ -260,7 +260,7 @@ class TestEntries:
 class TestDerivatives:
     @pytest.mark.usefixtures("x64")
     def test_by_everything_against_finite_differences(self):
-        """Away from faces of cells and from ReLU's kink, where there are one-sided ones only."""
+        """Away from faces of cells and from ReLU's kink, which have only one-sided derivatives."""
         config = FeatureGridConfig(2, 4, 10, 9, features=2, hidden=3)
         grid = some_grid(config, outputs=2)
         positions = some_positions(4, seed=3)
@@ -277,7 +277,7 @@ class TestDerivatives:
 
     @pytest.mark.usefixtures("x64")
     @pytest.mark.parametrize("seed", range(3))
-    def test_jvp_is_vjp_turned_over(self, seed):
+    def test_jvp_is_the_transpose_of_vjp(self, seed):
         grid, positions = some_grid(seed=seed), some_positions(6, seed, beyond=0.1)
         key = jax.random.key(seed)
         tangents = jax.tree.map(
@@ -289,7 +289,7 @@ class TestDerivatives:
         products = jax.tree.map(jnp.vdot, tangents, pull(cotangent))
         np.testing.assert_allclose(jnp.vdot(cotangent, forward), sum(jax.tree.leaves(products)), rtol=1e-10)
 
-    def test_only_the_entries_around_a_position_are_pulled(self):
+    def test_only_the_entries_around_a_position_have_gradients(self):
         grid, positions = some_grid(), some_positions(2).astype(jnp.float32)
         located = locate(grid, positions)
         pulled = jax.jit(jax.grad(lambda g: jnp.sum(g.at(located) ** 2)))(grid).table
@@ -326,8 +326,8 @@ def test_nan_makes_one_row_nan_and_touches_no_gradient(axis):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradients, wanted)
 
 
-def test_it_learns_who_is_where():
-    """Warmed up as skinning weights are: two halves of the box belong to two parts."""
+def test_it_learns_a_segmentation_of_the_box():
+    """As in the warm-up of skinning weights: two halves of the box belong to two parts."""
     config = FeatureGridConfig(4, 4, 18, 9, features=2, hidden=16)
     grid = init_feature_grid(jax.random.key(0), config, 2, BOUNDS)
     located = locate(grid, some_positions(200).astype(jnp.float32))

@@ -1,4 +1,4 @@
-"""The Gaussians pytree: activation and its inverse, shapes that do not fit, rows joined, taken and culled."""
+"""The Gaussians pytree: activation and its inverse, wrong shapes, and joining, taking and culling rows."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""Handles move Gaussians: rigidly where one does, smoothly between several, and never to nowhere."""
+"""Handles move Gaussians: rigidly for one handle, smoothly between several, and always to finite values."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ seeds = st.integers(0, 10_000)
 
 
 def made_up(seed, num=7, parts=3, most=2.0):
-    """Gaussians, weights, centres and a pose; `most`: radians that a handle turns."""
+    """Random Gaussians, weights, centres and a pose; handles turn by at most `most` radians."""
     rng = np.random.default_rng(seed)
     shapes = ((num, 3), (num, 4), (num, 3), (num,), (num, 1, 3))
     gaussians = Gaussians(*(jnp.asarray(rng.normal(size=shape)) for shape in shapes))
@@ -60,7 +60,7 @@ class TestLaws:
 
     @given(seed=seeds)
     def test_handles_that_move_as_one_need_no_weights(self, blend, seed):
-        """The same motion of the world, told about three places."""
+        """The same motion of the world, expressed about three centres."""
         gaussians, weights, centers, pose = made_up(seed, most=3.1)
         R = quats_to_matrices(pose.quats[0])
         together = pose.translations[0] + jnp.einsum("ij,pj->pi", R - jnp.eye(3), centers - centers[0])
@@ -105,7 +105,7 @@ class TestLaws:
             np.testing.assert_allclose(batch.quats[i], one.quats, atol=1e-12)
 
     def test_handles_that_look_opposite_ways_give_numbers(self, blend):
-        """Half a turn apart and of equal weight, no rotation lies between them more than another."""
+        """Half a turn apart and with equal weights, no rotation between them is preferred."""
         gaussians, _, centers, pose = made_up(1)
         opposite = HandlePose(jnp.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]), pose.translations)
         weights = jnp.tile(jnp.array([0.5, 0.5, 0.0]), (7, 1))
@@ -132,7 +132,7 @@ def test_polar_is_the_nearest_rotation(seed):
 @pytest.mark.usefixtures("x64")
 @given(seeds, st.floats(0.0, 1.0))
 def test_between_two_turns_about_one_axis_all_blends_turn_about_it(seed, share):
-    """Dual quaternions keep distances to the axis; sums of points, as everybody's, cut the corner."""
+    """Dual quaternions keep distances to the axis; linear blends of points cut the corner."""
     rng = np.random.default_rng(seed)
     axis, angle = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]), rng.uniform(0.2, 2.5)
     point = axis * rng.normal()

@@ -1,4 +1,4 @@
-"""First scenes: points from depth, their sizes and normals, ."""
+"""Initial scenes: points from depth, and the sizes and normals of their Gaussians."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -86,12 +86,12 @@ def test_normals_of_a_tilted_plane():
     assert estimate_normals(points[:2]).shape == (2, 3)
 
 
-def test_a_lone_point_gets_no_giant():
+def test_an_isolated_point_does_not_become_huge():
     grid = np.stack(np.meshgrid(*[np.arange(6) * 0.01] * 2, [0.0]), axis=-1).reshape(-1, 3)
     scales = spacing_scales(np.concatenate([grid, [[5.0, 5.0, 5.0]]]))
     np.testing.assert_allclose(scales, 0.01, rtol=0.25)
     few = spacing_scales(np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [9.0, 9, 9]]))
-    assert few.max() < 10  # its neighbours are far themselves; finite and positive is all that can be asked
+    assert few.max() < 10  # its neighbours are far apart too; only finite and positive can be expected
     assert few.min() > 0
 
 
@@ -136,7 +136,7 @@ def test_given_normals_follow_their_points_through_thinning():
         ({"normals": np.ones((2, 3))}, r"normals: got shape \(2, 3\), want \(4, 3\)"),
     ],
 )
-def test_what_makes_no_cloud_is_refused(change, message):
+def test_bad_arguments_are_refused(change, message):
     arguments = {"points": np.random.default_rng(0).normal(size=(4, 3)), "colors": np.ones((4, 3))} | change
     with pytest.raises(ValueError, match=message):
         gaussians_from_points(arguments.pop("points"), arguments.pop("colors"), **arguments)

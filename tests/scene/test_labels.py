@@ -1,4 +1,4 @@
-"""Labels of a first scene: lifted from one view, and inherited along surfaces by what it does not see."""
+"""Labels of an initial scene: lifted from one view, and inherited along surfaces by points out of sight."""
 
 import warnings
 
@@ -27,7 +27,7 @@ def test_labels_are_lifted_only_where_the_depth_agrees():
     points = np.array(
         [
             [0.0, 0.0, 1.0],  # on the box
-            [0.0, 0.0, 1.01],  # a hair behind its surface
+            [0.0, 0.0, 1.01],  # just behind its surface
             [0.0, 0.0, 1.05],  # inside the box
             [0.0, 0.0, 2.0],  # on the wall, behind the box
             [0.7, 0.0, 2.0],  # on the wall, in sight
@@ -62,7 +62,7 @@ def test_invalid_depth_lifts_nothing():
         lift_labels(np.array([[0.0, 0, 1.0]]), mask, 0 * depth, np.eye(4), K)
 
 
-def test_a_mask_of_another_size_and_a_label_without_pixels_are_told():
+def test_a_mask_of_another_size_and_a_label_without_pixels_are_reported():
     depth, mask = box_before_wall()
     points = np.array([[0.0, 0.0, 1.0]])
     with pytest.raises(ValueError, match=r"mask: got shape \(23, 32\), want \(24, 32\)"):
@@ -75,7 +75,7 @@ def test_a_mask_of_another_size_and_a_label_without_pixels_are_told():
 
 
 def sheet(origin, one, other, spacing=0.005):
-    """Points of a parallelogram, and its normal, one each."""
+    """Points of a parallelogram, and a normal for each."""
     one, other = np.asarray(one, float), np.asarray(other, float)
     a = np.arange(0, np.linalg.norm(one), spacing)[:, None, None] * one / np.linalg.norm(one)
     b = np.arange(0, np.linalg.norm(other), spacing)[None, :, None] * other / np.linalg.norm(other)
@@ -85,7 +85,7 @@ def sheet(origin, one, other, spacing=0.005):
 
 
 def box_on_table():
-    """A box of 10 cm: its top and one side, and the table before that side; names by sheet."""
+    """A box of 10 cm: its top and one side, and the table in front of that side; sheets by name."""
     top = sheet([0, 0, 0.1], [0.1, 0, 0], [0, 0.1, 0])
     side = sheet([0, 0, 0.005], [0.1, 0, 0], [0, 0, 0.09])  # its normal is -y: outward
     table = sheet([0, -0.3, 0], [0.1, 0, 0], [0, 0.295, 0])
@@ -118,7 +118,7 @@ def test_labels_stop_at_a_distance_and_at_gaps():
     assert inherit_labels(points[:0], labels[:0], normals[:0]).shape == (0,)
 
 
-def test_labels_and_normals_must_be_one_a_point():
+def test_there_must_be_one_label_and_one_normal_per_point():
     points = np.zeros((5, 3))
     with pytest.raises(ValueError, match=r"labels: got shape \(4,\), want \[5\]"):
         inherit_labels(points, np.zeros(4, int), points)

@@ -1,4 +1,4 @@
-"""A scene and cameras to images: the same as the public rasterizer called by hand."""
+"""Rendering a scene in cameras: the same as calling the public rasterizer by hand."""
 
 from dataclasses import replace
 
@@ -91,7 +91,7 @@ def test_the_scenes_own_features_are_taken_unless_others_are_given(scene, camera
     np.testing.assert_allclose(twice.features, 2 * drawn.features, atol=1e-5)
 
 
-def test_visibility_gives_each_camera_opacities_of_its_own(scene, cameras):
+def test_visibility_gives_each_camera_its_own_opacities(scene, cameras):
     visibility = jnp.asarray(np.random.default_rng(2).uniform(size=(2, scene.num)), jnp.float32)
     visibility = visibility.at[0, :10].set(0.0)
     roi = jnp.ones((2, HEIGHT, WIDTH), bool)
@@ -103,7 +103,9 @@ def test_visibility_gives_each_camera_opacities_of_its_own(scene, cameras):
         own = eqx.tree_at(lambda g: g.logit_opacities, scene, logits)
         alone = render(own, one_camera(cameras, c), plan, backgrounds=backgrounds[c : c + 1])
         np.testing.assert_allclose(together.colors[c], alone.colors[0], atol=2e-6)
-        expected = alone.depths[0] * alone.alphas[0]  # not over alpha: rounding grows where that is small
+        expected = (
+            alone.depths[0] * alone.alphas[0]
+        )  # not divided by alpha: rounding grows where that is small
         np.testing.assert_allclose(together.depths[c] * together.alphas[c], expected, atol=3e-6)
         np.testing.assert_allclose(together.alphas[c], alone.alphas[0], atol=2e-6)
 
@@ -148,12 +150,12 @@ def test_a_plan_holds_its_scene_and_takes_options(scene, cameras):
     assert int(drawn.meta.needed.max()) <= plan.capacity
 
 
-def test_under_a_trace_it_asks_for_a_plan(scene, cameras):
+def test_under_a_trace_a_plan_is_required(scene, cameras):
     with pytest.raises(ValueError, match="plan"):
         jax.jit(lambda g: render(g, cameras).colors)(scene)
 
 
-def test_a_plan_is_made_kept_and_grown_as_it_must_be(scene, cameras):
+def test_a_plan_is_made_kept_and_grown_as_needed(scene, cameras):
     wanted = render(scene, cameras).colors
     drawn, plan = render_with_room(scene, cameras)
     np.testing.assert_array_equal(drawn.colors, wanted)
@@ -164,12 +166,12 @@ def test_a_plan_is_made_kept_and_grown_as_it_must_be(scene, cameras):
     bare = eqx.tree_at(
         lambda g: g.shN, scene, jnp.zeros((scene.num, 3, 3)), is_leaf=lambda leaf: leaf is None
     )
-    assert render_with_room(bare, cameras, plan)[1].sh_degree == 1  # another degree asks for another plan
+    assert render_with_room(bare, cameras, plan)[1].sh_degree == 1  # another degree requires another plan
 
 
-def test_what_is_nearer_than_the_camera_looks_is_not_drawn():
-    """A plan has it from the cameras that it is made for."""
-    means = jnp.array([[0.0, 0.0, 0.3], [0.0, 0.0, 2.0]])  # the first right before the camera
+def test_nothing_before_the_cameras_near_plane_is_drawn():
+    """A plan takes the near plane from the cameras that it is made for."""
+    means = jnp.array([[0.0, 0.0, 0.3], [0.0, 0.0, 2.0]])  # the first is right in front of the camera
     scene = gaussians_from_activated(
         means, np.tile([1.0, 0, 0, 0], (2, 1)), np.full((2, 3), 0.2), np.full(2, 0.99), np.eye(3)[:2]
     )

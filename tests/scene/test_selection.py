@@ -38,7 +38,7 @@ def test_only_and_without_share_the_scene(scene):
     assert only(scene, SELECTED).shN is None or only(scene, SELECTED).shN.shape == (7, 3, 3)
 
 
-def test_hidden_are_as_many_and_cannot_be_seen(scene):
+def test_hidden_keeps_the_number_and_cannot_be_seen(scene):
     found = hidden(scene, SELECTED)
     np.testing.assert_array_equal(found.means, scene.means)
     np.testing.assert_array_equal(found.opacities[7:], scene.opacities[7:])
@@ -66,8 +66,8 @@ def test_tinted_has_the_colour_on_average_and_keeps_shades(scene):
 
 
 @pytest.mark.parametrize("dark", [0.0, 0.004])
-def test_what_is_black_has_the_colour_too(scene, dark):
-    """Shades of next to nothing are noise."""
+def test_black_objects_are_tinted_too(scene, dark):
+    """Shades of almost black are noise."""
     random = np.random.default_rng(1)
     black = rgb_to_sh0(jnp.asarray(random.uniform(0, 1, (20, 3)) * dark))[:, None]
     found = tinted(eqx.tree_at(lambda g: g.sh0, scene, black), SELECTED, jnp.array([0.1, 0.9, 0.2]))

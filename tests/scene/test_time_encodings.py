@@ -1,4 +1,4 @@
-"""Planes, sines and voxels of place and time: what they give, and their slopes."""
+"""Planes, sinusoids and voxels of position and time: their values and gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def random_planes(seed=0, resolution=5, times=4, levels=2, channels=3):
 
 
 def by_hand(planes, place, time):
-    """Bilinear interpolation of each plane, and the product of the six, one place at a time in numpy."""
+    """Bilinear interpolation of each plane, and the product of the six, one position at a time in numpy."""
 
     def between(x, size):
         first = min(int(np.floor(x * (size - 1))), size - 2)
@@ -48,7 +48,7 @@ def test_places_in_a_box():
     np.testing.assert_allclose(inside, [[0.5, 0.5, 0.5], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]])
 
 
-def test_slopes_of_places_reach_the_surface_and_end_there():
+def test_gradients_of_positions_reach_the_surface_and_end_there():
     slope = jax.vmap(jax.grad(lambda x: within(x[None], BOX).sum()))
     found = slope(jnp.array([[-1.0, 0.5, 2.0], [-1.1, 0.6, 1.9], [jnp.nan, 0.25, 2.5]]))
     np.testing.assert_allclose(found, [[0.5, 2, 1], [0, 0, 0], [0, 2, 1]])
@@ -102,7 +102,7 @@ class TestSinusoids:
 
 
 class TestVoxels:
-    def test_the_place_is_apart_from_the_time(self):
+    def test_position_and_time_are_encoded_separately(self):
         voxels = init_voxels(jax.random.key(0), 4, 3, 2, outputs=5)
         places = jnp.asarray(np.random.default_rng(5).uniform(size=(6, 3)), jnp.float32)
         early, late = voxels(places, jnp.asarray(0.2)), voxels(places, jnp.asarray(0.9))

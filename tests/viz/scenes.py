@@ -1,4 +1,4 @@
-"""What tests of the viewer share: clouds, a scene that moves, photographs around it, a stand-in for viser."""
+"""Shared by tests of the viewer: clouds, a moving scene, photographs around it, a stand-in for viser."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from gsjax.viz.viewer.cameras import browser_camera
 
 
 def cloud(count=24, seed=0, **more):
-    """Gaussians of all shapes, about a metre before the camera of `ahead`."""
+    """Gaussians of all shapes, about two metres in front of the camera of `ahead`."""
     rng = np.random.default_rng(seed)
     return gaussians_from_activated(
         np.array([0, 0, 2]) + rng.normal(0, 0.3, (count, 3)),
@@ -32,7 +32,7 @@ def made(means, quats, scales, opacities, colors):
 
 
 class Api:
-    """Stands for viser's scene: keeps what is added, counts what is sent."""
+    """A stand-in for viser's scene: keeps what is added, records what is sent."""
 
     def __init__(self):
         self.nodes, self.sent = {}, []

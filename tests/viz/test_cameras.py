@@ -1,4 +1,4 @@
-"""The drawing of cameras and points: what is in it, at which scale, and what it says is not."""
+"""The drawing of cameras and points: its content, its scale, and its count of what is left out."""
 
 import numpy as np
 import pytest
@@ -58,12 +58,12 @@ def test_a_few_far_points_do_not_shrink_the_rest_and_are_counted():
     assert above.get_xlabel() == "x (m)"
     (points,) = [item for item in above.collections if not isinstance(item, LineCollection)]
     assert len(points.get_offsets()) == 990
-    said = [text.get_text() for text in figure.texts]
-    assert "1,000 points, 1.0% of them beyond the edges" in said
+    captions = [text.get_text() for text in figure.texts]
+    assert "1,000 points, 1.0% of them beyond the edges" in captions
 
 
 def test_a_world_that_lies_on_its_side_is_set_upright():
-    """-y is up, as structure from motion often has it: heights are drawn upwards."""
+    """With -y up, as structure from motion often has it, heights are drawn upwards."""
     turn = np.eye(4)
     turn[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # new coordinates to old ones: z = -y, y = z
     _, side = cameras_and_points({"fitted": group(turn=turn)}).axes

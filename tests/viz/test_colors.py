@@ -19,7 +19,7 @@ def test_ten_labels_in_a_row_differ():
 
 
 def test_palette_stays_apart_for_colour_blind_eyes():
-    """Deuteranopia and protanopia (Vienot et al. 1999, linear RGB) leave the first labels distinct."""
+    """Under deuteranopia and protanopia (Vienot et al. 1999, linear RGB) the first labels stay distinct."""
     rgb = (np.array(colors.PALETTE[:6]) / 255) ** 2.2
     deutan = np.array([[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]])
     protan = np.array([[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]])
@@ -93,7 +93,7 @@ def test_features_of_few_dimensions_are_drawn(size):
     features = np.linspace(0, 1, 20 * size).reshape(20, size)
     picture = colors.colorize_features(features[None], colors.fit_pca_colors(features))
     assert len(np.unique(picture[..., 0])) > 10
-    with pytest.raises(ValueError, match="got 2 of which none is finite"):
+    with pytest.raises(ValueError, match="expected at least one finite feature, found none among 2"):
         colors.fit_pca_colors(np.full((2, size), np.nan))
 
 

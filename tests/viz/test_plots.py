@@ -12,9 +12,9 @@ def texts(figure) -> str:
 
 
 def test_update_time_names_its_lines():
-    said = texts(plots.update_time(TIMES))
-    assert f"median {np.median(TIMES) * 1e3:.0f} ms" in said
-    assert "30 Hz" in said
+    labels = texts(plots.update_time(TIMES))
+    assert f"median {np.median(TIMES) * 1e3:.0f} ms" in labels
+    assert "30 Hz" in labels
 
 
 def test_update_time_with_a_slow_first_frame_is_logarithmic():
@@ -22,7 +22,7 @@ def test_update_time_with_a_slow_first_frame_is_logarithmic():
     assert plots.update_time(TIMES).axes[0].get_yscale() == "linear"
 
 
-def test_error_has_a_line_an_object_in_the_colour_of_its_label():
+def test_error_has_one_line_per_object_in_the_colour_of_its_label():
     errors = {"cup": TIMES, "box": TIMES * 2}
     figure = plots.error_over_frames(errors, labels={"cup": 2, "box": 5}, limit_mm=5)
     cup, box, _limit = figure.axes[0].get_lines()
@@ -32,7 +32,7 @@ def test_error_has_a_line_an_object_in_the_colour_of_its_label():
     assert "5 mm" in texts(figure)
 
 
-def test_psnr_tells_tracked_from_held_out():
+def test_psnr_distinguishes_tracked_from_held_out():
     figure = plots.psnr_over_frames({"camera 0": TIMES}, {"camera 2": TIMES})
     assert [line.get_label() for line in figure.axes[0].get_lines()] == [
         "camera 0 (tracked)",
@@ -41,7 +41,7 @@ def test_psnr_tells_tracked_from_held_out():
     assert figure.axes[0].get_lines()[1].get_linestyle() == "--"
 
 
-def test_curves_of_fits_leave_out_where_nobody_looked():
+def test_curves_of_fits_leave_out_rows_without_evaluation():
     rows = [{"seconds": 60.0 * i, "test_psnr": 20.0 + i if i % 2 else None} for i in range(6)]
     figure = plots.fit_curves({"a": rows, "never judged": rows[:1]})
     curve, end, *never = figure.axes[0].get_lines()

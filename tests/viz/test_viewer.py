@@ -1,4 +1,4 @@
-"""The viewer's scenes, words, player and port, without a browser."""
+"""The viewer's scenes, texts, player and port, without a browser."""
 
 import threading
 import time
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsjax.viz.colors import label_color
-from gsjax.viz.viewer import Shots, Viewable, moved, words
+from gsjax.viz.viewer import Shots, Viewable, markup, moved
 from gsjax.viz.viewer.page import over, unique
 from gsjax.viz.viewer.pick import Picked
 from gsjax.viz.viewer.player import Player, frame_pause
@@ -31,8 +31,8 @@ def test_frames_move_the_first_gaussians_only():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"labels": np.zeros(3, int)}, r"labels: got shape \(3,\), want \(24,\)"),
-        ({"times": np.zeros(2)}, r"times: got shape \(2,\), want \(1,\)"),
+        ({"labels": np.zeros(3, int)}, r"labels: expected shape \(24,\), found \(3,\)"),
+        ({"times": np.zeros(2)}, r"times: expected shape \(1,\), found \(2,\)"),
     ],
 )
 def test_bad_scenes_are_refused(change, says):
@@ -41,9 +41,9 @@ def test_bad_scenes_are_refused(change, says):
 
 
 def test_bad_motions_are_refused():
-    with pytest.raises(ValueError, match=r"\[T,M,3\], T from 1 on, M to 24"):
+    with pytest.raises(ValueError, match=r"\[T,M,3\], T at least 1 and M at most 24"):
         moved(cloud(), np.zeros((2, 25, 3)), np.zeros((2, 25, 4)))
-    with pytest.raises(ValueError, match="quats: got shape"):
+    with pytest.raises(ValueError, match="quats: expected shape"):
         moved(cloud(), np.zeros((2, 5, 3)), np.zeros((2, 4, 4)))
 
 
@@ -54,7 +54,7 @@ def test_what_cannot_be_drawn_is_refused():
         Viewable("x", made(means, broken.quats, broken.scales, [0.5] * 24, means))
     with pytest.raises(ValueError, match="found none"):
         Viewable("x", cloud(0))
-    with pytest.raises(ValueError, match="Ks: got shape"):
+    with pytest.raises(ValueError, match="Ks: expected shape"):
         Shots(("a",), np.eye(4)[None, None], np.zeros((1, 2, 3, 3)), np.array([[4, 3]]))
 
 
@@ -62,17 +62,17 @@ def test_what_cannot_be_drawn_is_refused():
 
 
 def test_play_stop_play_at_once_is_one_player():
-    """The first has not heard yet that it is to stop when the second begins."""
-    waits, told = [], []
+    """The first thread has not yet noticed that it should stop when the second starts."""
+    waits, changes = [], []
 
     def pause():
         waits.append(threading.current_thread())
         return 0.3
 
-    player = Player(lambda: None, pause, told.append)
+    player = Player(lambda: None, pause, changes.append)
     for _ in range(3):
         player.toggle()
-    assert told == [True, False, True]
+    assert changes == [True, False, True]
     until = time.monotonic() + 30
     while len(set(waits)) < 2 or sum(thread.is_alive() for thread in set(waits)) > 1:
         assert time.monotonic() < until, "two play"
@@ -82,45 +82,45 @@ def test_play_stop_play_at_once_is_one_player():
         thread.join(30)
         assert not thread.is_alive()
     player.toggle()
-    assert told == [True, False, True]
+    assert changes == [True, False, True]
 
 
-# words
+# texts
 
 
-def test_a_pick_is_told_in_full():
+def test_a_pick_is_described_in_full():
     scene = Viewable("x", cloud(), np.full(24, 2), {2: "can|*top*"}, unit="m")
-    told = words.described(scene, Picked(7, 1.2345, np.zeros(3), 0.61, 0.9), 0)
+    table = markup.describe_pick(scene, Picked(7, 1.2345, np.zeros(3), 0.61, 0.9), 0)
     x, y, z = np.asarray(scene.gaussians.means)[7]
-    assert f"| centre | {x:.3f}, {y:.3f}, {z:.3f} m |" in told
-    assert "| Gaussian | 7 of 24 |" in told
-    assert r"| label | can\|\*top\* (2) |" in told
-    assert f"| opacity | {float(scene.gaussians.opacities[7]):.2f} |" in told
-    assert "| distance | 1.23 m |" in told
-    assert "| share of colour | 61 % |" in told
-    assert "label" not in words.described(Viewable("x", cloud()), Picked(7, 1, np.zeros(3), 1, 1), 0)
-    assert "Nothing there" in words.described(scene, None, 0)
+    assert f"| centre | {x:.3f}, {y:.3f}, {z:.3f} m |" in table
+    assert "| Gaussian | 7 of 24 |" in table
+    assert r"| label | can\|\*top\* (2) |" in table
+    assert f"| opacity | {float(scene.gaussians.opacities[7]):.2f} |" in table
+    assert "| distance | 1.23 m |" in table
+    assert "| share of colour | 61 % |" in table
+    assert "label" not in markup.describe_pick(Viewable("x", cloud()), Picked(7, 1, np.zeros(3), 1, 1), 0)
+    assert "Nothing there" in markup.describe_pick(scene, None, 0)
 
 
 def test_legends_name_what_colours_mean():
     scene = Viewable("x", cloud(), np.arange(24) % 3, {1: "<b>mug</b>"}, unit="m")
-    html = words.legend(scene, "label", None, [0, 1, 2])
+    html = markup.legend(scene, "label", None, [0, 1, 2])
     assert "&lt;b&gt;mug&lt;/b&gt;" in html
     assert "<b>" not in html
     assert "background" in html
     assert "object 2" in html
     assert "rgb({}, {}, {})".format(*label_color(1)) in html
-    assert "and 6 more" in words.legend(scene, "label", None, range(30))
-    assert "bright: 0.5 m away, dark: 2.25 m" in words.legend(scene, "depth", (0.5, 2.25))
-    assert words.legend(scene, "colour", (0.5, 2.25)) == ""
+    assert "and 6 more" in markup.legend(scene, "label", None, range(30))
+    assert "bright: 0.5 m away, dark: 2.25 m" in markup.legend(scene, "depth", (0.5, 2.25))
+    assert markup.legend(scene, "colour", (0.5, 2.25)) == ""
 
 
-def test_the_heading_says_what_there_is():
+def test_the_heading_describes_the_scene():
     scene = moving_scene()
-    assert "**24** Gaussians, SH degree 0, 4 frames." in words.heading(scene, 24)
-    assert "the 10 most opaque" in words.heading(scene, 10)
-    assert words.moment(scene, 2) == "0.20 s of 0.30 s"
-    assert "photographs" in words.heading(Viewable("x", cloud(), shots=shots_around([0, 0, 1])), 24)
+    assert "**24** Gaussians, SH degree 0, 4 frames." in markup.heading(scene, 24)
+    assert "the 10 most opaque" in markup.heading(scene, 10)
+    assert markup.frame_label(scene, 2) == "0.20 s of 0.30 s"
+    assert "photographs" in markup.heading(Viewable("x", cloud(), shots=shots_around([0, 0, 1])), 24)
 
 
 # the rest of the page
@@ -160,7 +160,7 @@ def test_loopback():
     assert not any(map(is_loopback, ("0.0.0.0", "192.168.1.5", "::", "example.org")))
 
 
-def test_a_port_in_use_is_said_and_the_next_one_taken(monkeypatch):
+def test_a_port_in_use_is_reported_and_the_next_one_taken(monkeypatch):
     import socket
 
     with socket.socket() as busy:
@@ -174,5 +174,5 @@ def test_a_port_in_use_is_said_and_the_next_one_taken(monkeypatch):
     assert free_port("127.0.0.1", 0) > 0
     with pytest.raises(ValueError, match="port: expected"):
         free_port("127.0.0.1", 70_000)
-    with pytest.raises(OSError, match="no address of this machine"):
+    with pytest.raises(OSError, match="not an address of this machine"):
         free_port("no-such-host.invalid", None)

@@ -1,4 +1,4 @@
-"""Questions on the page: typed, answered, shown as heat or in parts, kept. Who answers is made up here."""
+"""Queries on the page: typed, answered, shown as heat or in parts, saved. The answers are made up here."""
 
 import threading
 from dataclasses import replace
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsjax.scene.gaussians import concatenate
-from gsjax.viz.viewer import Asking, Found, Viewable, moved, open_viewer
+from gsjax.viz.viewer import Answer, Asking, Viewable, moved, open_viewer
 from gsjax.viz.viewer.ask_folder import heat_of
 from gsjax.viz.viewer.viewable import redone
 from tests.viz.test_viewer_edit import GREEN, RED, ball, rising
@@ -21,8 +21,8 @@ HEAT, ONLY, WITHOUT, SCENE = "heat of the scores", "only what was found", "all b
 
 
 class Answers:
-    """`green` means the second half of the Gaussians, by 0.9, and from frame 2 on the first; others are
-    refused."""
+    """`green` scores 0.9 on the second half of the Gaussians, and from frame 2 on, on the first half; other
+    queries are refused."""
 
     def __init__(self):
         self.asked, self.saved = [], []
@@ -35,11 +35,11 @@ class Answers:
         if text != "green":
             raise ValueError(f"no class <{text}>")
         scores = np.repeat([0.1, 0.9] if frame < 2 else [0.9, 0.1], 150)
-        return Found(text, scores, 0.5, "better than each negative", 0.02)
+        return Answer(text, scores, 0.5, "better than each negative", 0.02)
 
     def like(self, row, frame):
         self.asked.append(row)
-        return Found(
+        return Answer(
             f"like {row}", np.repeat([0.9, 0.1] if row < 150 else [0.1, 0.9], 150), 0.5, "Otsu", 0.01
         )
 
@@ -62,7 +62,7 @@ def scene(answers):
     return Viewable("balls", both, np.repeat([1, 2], 150), shots=shots, asking=answers.asking())
 
 
-def test_a_question_is_answered_shown_and_kept(scene, answers):
+def test_a_query_is_answered_shown_and_saved(scene, answers):
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions
         folder._text.value = "green"
@@ -70,7 +70,7 @@ def test_a_question_is_answered_shown_and_kept(scene, answers):
         assert answers.asked == ["green"]
         assert folder._threshold.value == 0.5
         until(lambda: max(color_share(page._picture, GREEN).values()) < 0.001)  # heat in its place
-        # What was found alone, and then the rest, in their own colours.
+        # Only what was found, then the rest, in their own colours.
         folder._showing.value = ONLY
         until(lambda: "all 150 Gaussians" in page._status.content)
         until(lambda: max(color_share(page._picture, GREEN).values()) > 0.02)
@@ -83,28 +83,28 @@ def test_a_question_is_answered_shown_and_kept(scene, answers):
         until(lambda: "nothing is left" in folder._count.content)
         folder._threshold.value = 0.5
         until(lambda: "150 of 300" in folder._count.content)
-        # It is kept once; then the disk is full, which is said.
-        folder._keep("object")
-        assert "kept as" in folder._kept.content
+        # It is saved once; then the disk is full, which is reported.
+        folder._save_part("object")
+        assert "saved as" in folder._save_status.content
         rows, name, _ = answers.saved[0]
         np.testing.assert_array_equal(rows, np.arange(150, 300))
         assert name == "green object"
-        folder._keep("rest")
-        assert "no space" in folder._kept.content
+        folder._save_part("rest")
+        assert "no space" in folder._save_status.content
         # The scene again.
         folder._showing.value = SCENE
         until(lambda: page._now.scene is scene)
 
 
-def test_what_cannot_be_answered_is_said(scene, answers):
+def test_a_query_that_cannot_be_answered_is_reported(scene, answers):
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions
-        folder._keep("object")
-        assert "ask something first" in folder._kept.content
-        folder._like()
-        assert "pick something first" in folder._told.content
+        folder._save_part("object")
+        assert "enter a query first" in folder._save_status.content
+        folder._ask_similar()
+        assert "pick something first" in folder._status.content
         folder._text.value = "spoon"
-        until(lambda: "no class &lt;spoon&gt;" in folder._told.content)
+        until(lambda: "no class &lt;spoon&gt;" in folder._status.content)
         assert page._now.scene is scene
 
 
@@ -128,13 +128,13 @@ def test_an_answer_that_comes_late_does_not_replace_a_newer_one(scene, answers):
             thread.start()
             assert begun.wait(30)
         folder._picked = lambda: 7
-        folder._like()
+        folder._ask_similar()
         assert folder._found.what == "like 7"
         go_on.set()
         for thread in (late, wrong):
             thread.join(30)
         assert folder._found.what == "like 7"
-        assert "like 7" in folder._told.content
+        assert "like 7" in folder._status.content
 
 
 def test_heat_is_shown_whatever_gaussians_were_coloured_by(scene, answers):
@@ -143,14 +143,14 @@ def test_heat_is_shown_whatever_gaussians_were_coloured_by(scene, answers):
         page._questions._text.value = "green"
         until(lambda: "150 of 300" in page._questions._count.content)
         assert page._coloring.value == "colour"
-        # Who then wants labels has them, also of what was found alone.
+        # Labels can be selected afterwards, also when only what was found is shown.
         page._coloring.value = "label"
         page._questions._showing.value = ONLY
         until(lambda: page._now.scene.gaussians.num == 150)
         assert page._coloring.value == "label"
 
 
-def test_what_is_picked_is_asked_for_by_its_row_in_the_whole_scene(scene, answers):
+def test_the_pick_is_queried_by_its_row_in_the_whole_scene(scene, answers):
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._questions
         folder._text.value = "green"
@@ -158,12 +158,12 @@ def test_what_is_picked_is_asked_for_by_its_row_in_the_whole_scene(scene, answer
         folder._showing.value = ONLY
         until(lambda: page._now.scene.gaussians.num == 150)
         folder._picked = lambda: 7
-        folder._like()
+        folder._ask_similar()
         assert answers.asked[-1] == 157
 
 
-def test_what_moves_is_asked_too(scene, answers):
-    """An answer is shown in all frames, and moves along; another frame may have another answer."""
+def test_a_moving_scene_can_be_queried(scene, answers):
+    """An answer is shown in all frames and moves along; another frame may have another answer."""
     moving = replace(rising(scene.gaussians, 4), labels=scene.labels, asking=answers.asking())
     with open_viewer(moving, port=0) as viewer, browser(viewer, moving) as (page, _):
         folder = page._questions
@@ -179,10 +179,10 @@ def test_what_moves_is_asked_too(scene, answers):
         until(lambda: page._splats._nodes["moving"].centers[:, 2].mean() * page._splats._scale > 1.1)
         until(lambda: color_share(page._picture, GREEN)["above"] > 0.02)
         assert max(color_share(page._picture, RED).values()) < 0.001
-        folder._keep("object")
+        folder._save_part("object")
         np.testing.assert_array_equal(answers.saved[0][0], np.arange(150, 300))
         assert answers.saved[0][2] == 3
-        # Asked again in this frame, it is the other ball.
+        # Asked again in this frame, the answer is the other ball.
         folder._ask()
         until(lambda: max(color_share(page._picture, RED).values()) > 0.02)
         assert page._slider.value == 3
@@ -190,8 +190,8 @@ def test_what_moves_is_asked_too(scene, answers):
         until(lambda: page._now.scene is moving)
 
 
-def test_a_part_of_a_scene_of_which_some_moves(scene):
-    """Those that move stay the first ones."""
+def test_a_part_of_a_partly_moving_scene(scene):
+    """The moving Gaussians stay first."""
     means = np.asarray(scene.gaussians.means)[None, :100] + np.array([0.0, 1.0])[:, None, None]
     quats = np.tile(np.asarray(scene.gaussians.quats)[None, :100], (2, 1, 1))
     some = replace(scene, motion=moved(scene.gaussians, means.astype(np.float32), quats))
@@ -202,8 +202,8 @@ def test_a_part_of_a_scene_of_which_some_moves(scene):
     )
 
 
-def test_heat_is_bright_where_meant_and_grey_elsewhere(scene):
-    found = Found("x", np.linspace(0, 1, 300), 0.5, "", 0.0)
+def test_heat_is_bright_above_the_threshold_and_grey_below(scene):
+    found = Answer("x", np.linspace(0, 1, 300), 0.5, "", 0.0)
     colors = heat_of(scene.gaussians, found, found.scores > 0.5)
     assert colors.shape == (300, 3)
     assert colors[found.scores > 0.5].mean() > 2 * colors[found.scores < 0.3].mean()

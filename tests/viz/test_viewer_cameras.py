@@ -1,4 +1,4 @@
-"""The viewer's cameras: what is up, where it looks from at first, and what the browser's camera sees."""
+"""The viewer's cameras: the up direction, the initial pose, and what the browser's camera sees."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_a_scene_says_what_is_up():
     assert scene_up(Viewable("x", cloud(), up=np.array([0, -2.0, 0]))).tolist() == [0, -1, 0]
 
 
-def test_it_is_looked_at_from_where_a_photograph_was_taken():
+def test_the_first_pose_is_that_of_a_photograph():
     rng = np.random.default_rng(0)
     ball = made(
         rng.normal(0, 0.2, (300, 3)), rng.normal(size=(300, 4)), np.full((300, 3), 0.1), [0.9] * 300,
@@ -86,7 +86,7 @@ def test_pictures_have_about_the_windows_shape():
     assert picture_size(160, (5000, 10)) == (160, 8)
 
 
-def test_the_scale_of_depth_is_of_what_is_seen():
+def test_the_depth_scale_covers_what_is_seen():
     means = np.array([[0, 0, 1.0], [0, 0, 2], [0, 0, 3], [50, 0, 4], [0, 0, -5]])
     near, far = depth_range(means, np.eye(4), 1.0, 1.0)
     assert (near, far) == pytest.approx((1.04, 2.96))

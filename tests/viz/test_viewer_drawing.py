@@ -1,4 +1,4 @@
-"""The viewer's own pictures: few programs, right colours, and a thread that draws what was asked for last."""
+"""The viewer's own pictures: few programs, right colours, and a thread that merges requests."""
 
 import threading
 
@@ -10,15 +10,15 @@ import pytest
 import gsjax.viz.viewer.drawing
 from gsjax.scene.render import plan_render, render
 from gsjax.viz.viewer.cameras import browser_camera
+from gsjax.viz.viewer.debounce import Debouncer
 from gsjax.viz.viewer.drawing import Drawer, Drawn, picture_of, recolored
-from gsjax.viz.viewer.newest import Newest
 from tests.viz.scenes import ahead, cloud
 
 # our picture
 
 
 def counted(monkeypatch):
-    """How often the program that draws was traced."""
+    """A list that grows each time the program that draws is traced."""
     traces = []
 
     def draw(*arguments, **options):
@@ -30,7 +30,7 @@ def counted(monkeypatch):
 
 
 def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
-    """From far away few tiles are touched, from near by all: that asks for another plan."""
+    """From far away few tiles are touched, from close by all of them, which requires another plan."""
     traces, drawer = counted(monkeypatch), Drawer((0.2, 0.4, 0.6))
     gaussians = cloud(400)
 
@@ -60,7 +60,7 @@ def test_moving_compiles_nothing_unless_a_plan_grows(monkeypatch):
 
 @pytest.mark.slow
 def test_scenes_of_fewer_gaussians_compile_nothing(monkeypatch):
-    """Nor does one of a few more, once there was one of more; and their pictures are their own."""
+    """Nor does a slightly larger scene after a larger one; and every scene gets its own picture."""
     traces, drawer = counted(monkeypatch), Drawer()
     for count, compiled in ((100, 1), (60, 1), (120, 2), (140, 2), (100, 2), (1, 2)):
         gaussians = cloud(count)
@@ -91,7 +91,7 @@ def test_recoloured_gaussians_have_that_colour_from_all_sides():
 # threads
 
 
-def test_what_was_asked_for_while_busy_is_done_once():
+def test_requests_made_while_busy_are_merged():
     begun, go, done, runs = threading.Event(), threading.Event(), threading.Event(), []
 
     def work():
@@ -102,24 +102,24 @@ def test_what_was_asked_for_while_busy_is_done_once():
         else:
             done.set()
 
-    worker = Newest(work)
-    worker.ask()
+    worker = Debouncer(work)
+    worker.request()
     assert begun.wait(30)
     for _ in range(5):
-        worker.ask()
+        worker.request()
     go.set()
     assert done.wait(30)
     worker.close()
-    worker.ask()
+    worker.request()
     assert runs == [0, 1]
 
 
-def test_what_never_settles_is_done_at_last():
+def test_requests_that_never_settle_are_served_in_the_end():
     done = threading.Event()
-    worker = Newest(done.set, settle_s=60.0, patience_s=0.2)
-    worker.ask()
+    worker = Debouncer(done.set, settle_s=60.0, patience_s=0.2)
+    worker.request()
     for _ in range(2000):
-        worker.ask()
+        worker.request()
         if done.wait(0.01):
             break
     assert done.is_set()

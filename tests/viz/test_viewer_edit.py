@@ -1,4 +1,4 @@
-"""Edits on the page: put together, previewed, refused, kept. What edits do is made up here."""
+"""Edits on the page: composed, previewed, refused, saved. The edits themselves are made up here."""
 
 import threading
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsjax.scene.gaussians import gaussians_from_activated, take
-from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable, moved, open_viewer, words
-from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
+from gsjax.viz.viewer import Editing, Motion, Preview, Shots, Viewable, markup, moved, open_viewer
+from gsjax.viz.viewer.splat_nodes import Appearance, Displayed, SplatNodes
 from gsjax.viz.viewer.splats import Palette
 from tests.viz.scenes import Api
 from tests.viz.test_viewer_page import (
@@ -41,7 +41,7 @@ def ball(color, x, count=150):
 
 
 def rising(gaussians, frames, editing=None):
-    """They go up by 1.2 metres in so many frames, before a camera at (0, -4, 0)."""
+    """Gaussians that rise by 1.2 metres over the given number of frames, before a camera at (0, -4, 0)."""
     means = np.asarray(gaussians.means)[None] + np.linspace(0, 1.2, frames)[:, None, None] * [0, 0, 1.0]
     quats = np.tile(np.asarray(gaussians.quats)[None], (frames, 1, 1))
     motion = moved(gaussians, means.astype(np.float32), quats)
@@ -53,8 +53,8 @@ def rising(gaussians, frames, editing=None):
 
 
 class Edits:
-    """`longer` makes a film of 8 frames of a green ball, `fewer` one of 2 frames of less of it, which stands
-    still; others are refused."""
+    """`longer` makes a film of 8 frames of a green ball, `fewer` one of 2 frames of a smaller, still part of
+    it; other edits are refused."""
 
     def __init__(self):
         self.asked, self.saved, self.go, self.went_on = [], [], threading.Event(), []
@@ -89,7 +89,7 @@ class Edits:
         return Path("edit") / name
 
 
-def test_a_list_is_put_together_previewed_and_reset():
+def test_a_list_is_composed_previewed_and_reset():
     edits = Edits()
     scene = rising(ball(RED, 0.0), 4, edits.editing())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
@@ -102,37 +102,37 @@ def test_a_list_is_put_together_previewed_and_reset():
         page._slider.value = 3
         folder._add()
         assert folder._list.value == "longer:parts=all"
-        until(lambda: "8 frames, 150 Gaussians" in folder._told.content)
+        until(lambda: "8 frames, 150 Gaussians" in folder._status.content)
         assert page._slider.max == 7
-        assert "it goes &lt;far&gt; beyond" in folder._told.content
+        assert "it goes &lt;far&gt; beyond" in folder._status.content
         assert page._moment.content == "0.30 s of 0.70 s"
         until(lambda: max(color_share(page._picture, GREEN).values()) > 0.02)
         until(lambda: page._splats._nodes["moving"].rgbs[0, 1] > 150)
         page._slider.value = 7
         until(lambda: page._splats._nodes["moving"].centers[:, 2].mean() * page._splats._scale > 1.1)
-        # What cannot be done is said, and the last preview stays.
+        # An edit that cannot be done is reported, and the last preview stays.
         folder._operation.value, folder._line.value = "fewer", "fever:  parts=1"
         folder._add()
-        until(lambda: "found &lt;fever&gt;" in folder._told.content)
+        until(lambda: "found &lt;fever&gt;" in folder._status.content)
         assert edits.asked[-1] == ["longer:parts=all", "fever: parts=1"]
         assert (page._slider.max, page._now.scene.num_frames) == (7, 8)
-        # A line that is left out is not asked for; what does not move is sent as such.
+        # A disabled line is not previewed; Gaussians that do not move are sent as such.
         folder._list.value = "# longer:parts=all\n\n  fewer:parts=1\n"
-        until(lambda: "2 frames, 40 Gaussians" in folder._told.content)
+        until(lambda: "2 frames, 40 Gaussians" in folder._status.content)
         assert page._slider.max == 1
         assert edits.asked[-1] == ["fewer:parts=1"]
         assert page._frame == 1
         until(lambda: set(page._splats._nodes) == {"still"})
         until(lambda: "all 40 Gaussians" in page._status.content)
-        # Reset is the recorded motion.
+        # Resetting restores the recorded motion.
         folder._list.value = ""
-        until(lambda: "editing" not in folder._told.content and "frames" not in folder._told.content)
+        until(lambda: "editing" not in folder._status.content and "frames" not in folder._status.content)
         assert page._slider.max == 3
         assert page._now.scene is scene
         until(lambda: set(page._splats._nodes) == {"moving"})
 
 
-def test_playing_goes_on_with_what_is_previewed():
+def test_playback_continues_with_the_preview():
     scene = rising(ball(RED, 0.0), 4, Edits().editing())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         page._player.toggle()
@@ -145,58 +145,58 @@ def test_playing_goes_on_with_what_is_previewed():
         page._player.toggle()
 
 
-def test_a_film_is_kept_with_its_progress():
+def test_a_film_is_saved_with_its_progress():
     edits = Edits()
     scene = rising(ball(RED, 0.0), 4, edits.editing())
     with open_viewer(scene, port=0) as viewer, browser(viewer, scene) as (page, _):
         folder = page._edits
-        folder._keep()
-        assert "expected edits in the list, found none" in folder._kept.content
-        folder._list.value = "# of no account\nlonger:"
+        folder._save_film()
+        assert "expected edits in the list, found none" in folder._save_status.content
+        folder._list.value = "# disabled\nlonger:"
         folder._name.value, folder._camera.value = " mine ", "camera 0"
-        keeping = threading.Thread(target=folder._keep)
+        keeping = threading.Thread(target=folder._save_film)
         keeping.start()
         until(lambda: folder._progress.value == 50)
-        assert folder._save.disabled
+        assert folder._save_button.disabled
         assert folder._progress.visible
-        folder._keep()
-        assert "one film at a time" in folder._kept.content
+        folder._save_film()
+        assert "one film at a time" in folder._save_status.content
         edits.go.set()
         keeping.join(60)
         assert edits.saved == [(["longer:"], "mine", "camera 0")]
-        assert "kept as edit/mine" in folder._kept.content
-        assert not folder._save.disabled
+        assert "saved as edit/mine" in folder._save_status.content
+        assert not folder._save_button.disabled
         assert not folder._progress.visible
         folder._name.value = "full"
-        folder._keep()
-        assert "no space" in folder._kept.content
-        assert not folder._save.disabled
+        folder._save_film()
+        assert "no space" in folder._save_status.content
+        assert not folder._save_button.disabled
 
 
 @pytest.mark.filterwarnings("ignore:Queued a GuiUpdateMessage")  # to the browser that left
-def test_a_viewer_that_is_closed_ends_films_and_one_browser_that_leaves_does_not():
+def test_closing_the_viewer_ends_films_and_one_leaving_browser_does_not():
     edits = Edits()
     scene = rising(ball(RED, 0.0), 4, edits.editing())
     with open_viewer(scene, port=0) as viewer:
         with browser(viewer, scene) as (page, _):
             page._edits._list.value = "longer:"
-            keeping = threading.Thread(target=page._edits._keep)
+            keeping = threading.Thread(target=page._edits._save_film)
             keeping.start()
             until(lambda: edits.went_on == [True])
         until(lambda: not viewer._pages)
-        assert page._edits._filmed(1, 2)
+        assert page._edits._report_progress(1, 2)
         threading.Timer(0.5, edits.go.set).start()
     assert edits.went_on == [True, False]  # closing waited for it
 
 
-def test_another_scene_takes_the_place_of_what_a_browser_has():
+def test_a_new_scene_replaces_what_the_browser_has():
     api = Api()
     first = rising(ball(RED, 0.0), 4)
     nodes = SplatNodes(api, first, 1000)
     fewer = Viewable("fewer", ball(GREEN, 1.0, 60))
 
     def show(scene, frame):
-        nodes.show(Present(scene, Palette(scene), frame, scene.at(frame)), Look("colour"))
+        nodes.show(Displayed(scene, Palette(scene), frame, scene.at(frame)), Appearance("colour"))
 
     show(first, 0)
     show(fewer, 0)
@@ -209,11 +209,11 @@ def test_another_scene_takes_the_place_of_what_a_browser_has():
     assert api.nodes.keys() == {"/splats/moving"}
 
 
-def test_words_of_films():
+def test_texts_of_films():
     scene = rising(ball(RED, 0.0), 4)
-    assert words.length_of(scene) == "0.30 s, 4 frames, 150 Gaussians"
-    assert "&lt;i&gt;" in words.lines(["<i>"], "red")
-    assert "<b>to</b>" in words.explained(["It goes on after `to`."])
+    assert markup.film_summary(scene) == "0.30 s, 4 frames, 150 Gaussians"
+    assert "&lt;i&gt;" in markup.as_lines(["<i>"], "red")
+    assert "<b>to</b>" in markup.operation_help(["It goes on after `to`."])
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
-"""The page itself on viser's server: to a stand-in for a browser that says no more than where its camera is,
-and, where there is one, to a headless Chromium."""
+"""The page itself on viser's server: with a stand-in for a browser that reports only its camera, and, if
+there is one, with a headless Chromium."""
 
 import io
 import shutil
@@ -33,8 +33,8 @@ def look(eye, target, up):
 
 @pytest.fixture(scope="module")
 def scene() -> Viewable:
-    """A red ball on the left and a green one on the right, 4 metres away; over four frames the red one goes
-    up by 1.2 metres. Two photographs: from the front and from the left."""
+    """A red ball on the left and a green one on the right, 4 metres away; over four frames the red one rises
+    by 1.2 metres. Two photographs: from the front and from the left."""
     rng = np.random.default_rng(0)
     shell = rng.normal(size=(150, 3))
     shell *= 0.35 / np.linalg.norm(shell, axis=1, keepdims=True)
@@ -82,7 +82,7 @@ def scene() -> Viewable:
 
 
 class Saved:
-    """Keeps screenshots in memory, as `save` of `open_viewer`."""
+    """Keeps screenshots in memory; passed as `save` to `open_viewer`."""
 
     def __init__(self):
         self.pictures = []
@@ -96,7 +96,7 @@ class Saved:
 
 @contextmanager
 def browser(viewer, scene):
-    """A stand-in for a browser; gives its page on our side, once it has drawn."""
+    """A stand-in for a browser; yields its page on our side once it has drawn, and its socket."""
     from websockets.sync.client import connect
 
     pose = first_pose(scene)
@@ -111,7 +111,7 @@ def browser(viewer, scene):
 
 
 def camera_message(position, fov, wxyz=(0.5**0.5, -(0.5**0.5), 0, 0)):
-    """What a browser says of its camera, which looks along +y unless told, in a window of 600x400."""
+    """A browser's message about its camera (default: looking along +y) in a window of 600x400."""
     where = {"wxyz": wxyz, "position": tuple(map(float, position)), "look_at": (0.0, 0.0, 0.0)}
     lens = {"fov": fov, "near": 0.01, "far": 1000.0, "image_height": 400, "image_width": 600}
     return message("ViewerCameraMessage", up_direction=(0.0, 0.0, 1.0), **where, **lens)
@@ -128,7 +128,7 @@ def until(true, seconds=120.0):
     """Wait for something that another thread does."""
     end = time.monotonic() + seconds
     while not true():
-        assert time.monotonic() < end, "it never came to pass"
+        assert time.monotonic() < end, "timed out waiting for a condition"
         time.sleep(0.02)
 
 
@@ -141,7 +141,7 @@ def drawn_after(page, change):
 
 
 def color_share(picture, color):
-    """Share of pixels of about a colour, in each quarter: left and right, above and below the middle."""
+    """Share of pixels of about a colour, in each half: left and right, above and below the middle."""
     near = np.abs(picture.astype(int) - np.array(color) * 255).max(-1) < 60
     h, w = near.shape[0] // 2, near.shape[1] // 2
     parts = {"left": near[:, :w], "right": near[:, w:], "above": near[:h], "below": near[h:]}
@@ -170,7 +170,7 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         turned = (0.5, -0.5, 0.5, -0.5)
         picture = drawn_after(page, lambda: socket.send(camera_message((-4, 0, 0), 0.64, turned)))
         assert color_share(picture, RED)["above"] > 0.02
-        # Other things are shown, in another size.
+        # Other channels are shown, in another size.
         picture = drawn_after(page, lambda: setattr(page._shown, "value", "alpha"))
         assert (picture[..., 0] == picture[..., 1]).all()
         picture = drawn_after(page, lambda: setattr(page._shown, "value", "label"))
@@ -179,27 +179,27 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         assert picture.shape == (104, 160, 3)
         picture = drawn_after(page, lambda: setattr(page._shown, "value", "depth"))
         assert "bright: " in page._status.content
-        # So are splats.
+        # Splats too have other colorings.
         assert page._coloring.options == ("colour", "depth", "label", "features")
         for coloring, says in (("label", "green ball"), ("depth", "away"), ("features", "principal")):
             page._coloring.value = coloring
             until(lambda says=says: says in page._legend.content)
         assert nodes["still"].rgbs.std() > 10
-        # What is clicked is told and marked.
+        # What is clicked is described and marked.
         ray = {"ray_origin": (0.8, -4.0, 0.0), "ray_direction": (0.0, 1.0, 0.0), "screen_pos": ((0.6, 0.5),)}
         socket.send(message("ScenePointerMessage", event_type="click", modifier=None, **ray))
-        until(lambda: "green ball" in page._told.content)
+        until(lambda: "green ball" in page._picked_info.content)
         assert page._client.scene.get_handle_by_name("/picked/shape") is not None
         page._slider.value = 0
         until(lambda: page._client.scene.get_handle_by_name("/picked/shape") is None)
-        # Time goes on by itself, and stops.
+        # Playback starts and stops.
         page._player.toggle()
         assert page._play.label == "Stop"
         until(lambda: page._frame == 3)
         until(lambda: page._frame == 0)
         page._player.toggle()
         until(lambda: page._play.label == "Play")
-        # Photographs: where they were taken, and going there.
+        # Photographs: their frustums, and moving the camera there.
         page._shots.show(True, 0)
         frustum = page._client.scene.get_handle_by_name("/photographs/1")
         np.testing.assert_allclose(frustum.position, (-4, 0, 0), atol=1e-9)
@@ -209,21 +209,21 @@ def test_a_page_from_the_first_picture_to_the_last_screenshot(scene):
         assert page._photograph.label == "photograph front"
         np.testing.assert_allclose(page._client.camera.position, (0, -4, 0), atol=1e-6)
         np.testing.assert_allclose(page._client.camera.fov, 2 * np.arctan(1 / 3), atol=1e-6)
-        # One that cannot be read is said, and the page goes on.
+        # An unreadable one is reported, and the page goes on.
         page._visited.value = "left"
         until(lambda: not page._photograph.visible)
         np.testing.assert_allclose(page._client.camera.position, (-4, 0, 0), atol=1e-6)
-        # What is shown can be kept.
-        page._keep("render", page._picture)
+        # What is shown can be saved.
+        page._save_screenshot("render", page._picture)
         assert saved.pictures[0][0] == "render"
         assert saved.pictures[0][1].shape == (104, 160, 3)
 
 
-def test_a_page_can_be_touched_while_it_is_built(scene, monkeypatch):
+def test_a_page_can_be_used_while_it_is_built(scene, monkeypatch):
     built = Page._build_shots
 
     def touched(page, nodes):
-        """The slider and the colours are there, the render is not yet."""
+        """The slider and the colorings exist; the render does not yet."""
         built(page, nodes)
         page._slider.value = 2
         page._coloring.value = "label"
@@ -254,7 +254,7 @@ def test_two_browsers_have_pages_of_their_own_and_leave_nothing(scene):
         until(lambda: not viewer._pages)
 
 
-def test_what_cannot_be_drawn_is_said_on_the_page(scene, monkeypatch):
+def test_what_cannot_be_drawn_is_reported_on_the_page(scene, monkeypatch):
     def fail(*_):
         raise ValueError("these Gaussians touch too many tiles")
 
@@ -308,7 +308,7 @@ def seen(page) -> np.ndarray:
 
 
 def middle_of(picture, color):
-    """Row and column of the middle of the pixels of about a colour; None where there are few."""
+    """Mean row and column of the pixels of about a colour; None if there are few."""
     rows, columns = np.nonzero(np.abs(picture.astype(int) - np.array(color) * 255).max(-1) < 60)
     return None if len(rows) < 150 else (rows.mean(), columns.mean())
 
@@ -332,7 +332,7 @@ def test_in_a_browser(scene, chromium):
             ours = middle_of(np.repeat(np.repeat(picture, 2, 0), 2, 1), color)
             assert ours[0] / 2 / picture.shape[0] == pytest.approx(row / shown.shape[0], abs=0.04)
             assert ours[1] / 2 / picture.shape[1] == pytest.approx(column / shown.shape[1], abs=0.06)
-        # The slider moves the red ball up, and no other.
+        # The slider moves the red ball up, and not the other.
         chromium.locator(".mantine-NumberInput-input:visible").first.fill("3")
         chromium.keyboard.press("Enter")
         until(lambda: page._frame == 3)
@@ -342,7 +342,7 @@ def test_in_a_browser(scene, chromium):
         # A click on the green ball names it.
         chromium.mouse.click(360 + green[1], green[0])
         until(lambda: chromium.get_by_text("green ball (2)").count() > 0)
-        # The browser's own picture can be kept.
+        # The browser's own picture can be saved.
         chromium.get_by_text("Save the view").click()
         until(lambda: page._shared.save.pictures)
         kind, kept = page._shared.save.pictures[0]

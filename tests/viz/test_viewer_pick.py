@@ -1,4 +1,4 @@
-"""What a click in the viewer meets, against rays followed in small steps, and against the picture."""
+"""What a click in the viewer hits, against densely sampled rays, and against the picture."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from tests.viz.scenes import ahead, cloud, made
 
 
 def brute_force(gaussians, origin, direction):
-    """Row and share of what a ray meets: densities sampled along it, one Gaussian at a time."""
+    """The Gaussian that a ray hits, all shares, and the total alpha, from densities sampled along the ray."""
     from scipy.spatial.transform import Rotation
 
     direction = direction / np.linalg.norm(direction)
@@ -69,12 +69,12 @@ def test_pick_agrees_with_the_picture():
         ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1.0]
         picked = pick(gaussians, np.zeros(3), ray)
         same += picked is not None and picked.index == weights[y, x].argmax()
-    # A picture sorts by the centres' depths and projects to an ellipse; a ray meets the density itself.
+    # A picture sorts by the centres' depths and projects to an ellipse; a ray samples the density itself.
     assert clear > 60
     assert same > 0.9 * clear
 
 
-def test_pick_meets_nothing_behind_or_beside():
+def test_pick_hits_nothing_behind_or_beside():
     gaussians = cloud(count=3)
     assert pick(gaussians, np.zeros(3), np.array([0, 0, -1.0])) is None
     assert pick(gaussians, np.array([50.0, 0, 0]), np.array([0, 0, 1.0])) is None

@@ -1,10 +1,10 @@
-"""What the viewer sends to a browser: splats in its unit, their colours, and only what differs."""
+"""What the viewer sends to a browser: splats in a scaled unit, their colours, and only what differs."""
 
 import numpy as np
 
 from gsjax.viz.colors import label_color
 from gsjax.viz.viewer import Viewable
-from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
+from gsjax.viz.viewer.splat_nodes import Appearance, Displayed, SplatNodes
 from gsjax.viz.viewer.splats import Palette, browser_scale, splats
 from gsjax.viz.viewer.viewable import most_opaque
 from tests.viz.scenes import Api, ahead, cloud, made, moving_scene
@@ -66,16 +66,16 @@ def test_a_scene_offers_only_what_it_has():
 
 
 def now(scene, frame):
-    """A frame of a scene, as it is shown."""
-    return Present(scene, Palette(scene), frame, scene.at(frame))
+    """A frame of a scene, as it is displayed."""
+    return Displayed(scene, Palette(scene), frame, scene.at(frame))
 
 
 def test_only_what_differs_is_sent_again():
     scene, api = moving_scene(), Api()
     nodes = SplatNodes(api, scene, 1000)
-    look = Look("colour")
+    look = Appearance("colour")
     nodes.show(now(scene, 0), look)
-    nodes.show(now(scene, 0), Look("colour"))
+    nodes.show(now(scene, 0), Appearance("colour"))
     assert api.sent == ["/splats/moving", "/splats/still"]
     nodes.show(now(scene, 2), look)
     assert api.sent[2:] == ["/splats/moving"]
@@ -83,16 +83,16 @@ def test_only_what_differs_is_sent_again():
     there = np.asarray(scene.gaussians.means)[:8] + np.array([0.4, 0, 0])
     np.testing.assert_allclose(api.nodes["/splats/moving"][0] * scale, there, atol=1e-5)
     viewmat = np.asarray(ahead().viewmat[0], float)
-    nodes.show(now(scene, 2), Look("depth", viewmat, (1.0, 3.0)))
-    nodes.show(now(scene, 2), Look("depth", viewmat.copy(), (1.0, 3.0)))
+    nodes.show(now(scene, 2), Appearance("depth", viewmat, (1.0, 3.0)))
+    nodes.show(now(scene, 2), Appearance("depth", viewmat.copy(), (1.0, 3.0)))
     assert api.sent[3:] == ["/splats/moving", "/splats/still"]
-    nodes.show(now(scene, 2), Look("depth", viewmat + 0.1, (1.0, 3.0)))
+    nodes.show(now(scene, 2), Appearance("depth", viewmat + 0.1, (1.0, 3.0)))
     assert api.sent[5:] == ["/splats/moving", "/splats/still"]
 
 
 def test_thinned_splats_keep_the_moving_ones_apart():
     scene, api = moving_scene(), Api()
-    SplatNodes(api, scene, 10).show(now(scene, 0), Look("colour"))
+    SplatNodes(api, scene, 10).show(now(scene, 0), Appearance("colour"))
     sizes = {name: len(arrays[0]) for name, arrays in api.nodes.items()}
     assert sum(sizes.values()) == 10
     assert sizes["/splats/moving"] == (most_opaque(scene.gaussians, 10) < 8).sum()

@@ -1,6 +1,6 @@
-"""Built-in scenes: a ray-caster of textured, shadowed solids that move rigidly, twist and bend, by seed.
+"""Built-in scenes: ray-cast, textured and shadowed solids that move rigidly, twist and bend, seeded.
 
-They are no Gaussians, so a reconstruction of them cannot be right by accident; and they need no download.
+They are not made of Gaussians, so no reconstruction can fit them by construction, and need no download.
 """
 
 from gsjax.data.simulated.articulated import articulated

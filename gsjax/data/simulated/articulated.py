@@ -9,7 +9,7 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.motion import coast, minimum_jerk, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
-from gsjax.data.simulated.simulation import expect_counts, simulated_sequence, viewmats_around
+from gsjax.data.simulated.simulation import check_counts, simulated_sequence, viewmats_around
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics
 from gsjax.geometry.joints import Joint
@@ -19,7 +19,7 @@ PARTS = ("drawer", "door", "lid", "box", "shut door")
 
 _WORLD, _DRAWER, _DOOR, _LID, _BOX, _SHUT, _CABINET, _CHEST = range(8)  # bodies; labels are the same numbers
 _UP, _FORWARD, _LEFT = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-_WALL = 0.008  # half of a board's thickness
+_WALL = 0.008  # half the thickness of a board
 
 # Half sizes and centres, metres; the floor is z = 0, and everything opens towards +x.
 _CABINET_SIZE, _CABINET_AT = (0.16, 0.26, 0.27), (0.0, -0.22, 0.27)
@@ -32,14 +32,14 @@ _LIGHT = Light(position=(1.3, 0.9, 1.9), radius=0.03)
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the seed decides: how far each joint opens and when it begins, and where the box goes."""
+    """Random parameters drawn from the seed: opening and start frame of each joint, and the box's motion."""
 
-    slide: float  # metres
-    swing: float  # radians, of the door
-    lift: float  # radians, of the lid
-    begins: Float[np.ndarray, "4"]  # frames: drawer, door, lid, box
+    slide: float  # metres, the drawer's
+    swing: float  # radians, the door's
+    lift: float  # radians, the lid's
+    starts: Float[np.ndarray, "4"]  # frames: drawer, door, lid, box
     box_from: Float[np.ndarray, "2"]
-    box_way: Float[np.ndarray, "2"]
+    box_path: Float[np.ndarray, "2"]
     box_turn: float
 
 
@@ -55,22 +55,22 @@ def articulated(
     """Furniture that opens, seen from all around: RGB-D, labels, optical flow, exact poses and joints; 15 Hz.
 
     Labels are 0 scene, 1 drawer (slides), 2 door (turns), 3 lid (turns), 4 box (slides and turns freely),
-    5 shut door (never moves), 6 cabinet, 7 chest. Not all begin at once: one part moves from the first frame
-    on, the last one begins by frame 16. A sequence of fewer frames is the beginning of the longer one; after
-    frame 36 all is at rest.
+    5 shut door (never moves), 6 cabinet, 7 chest. The parts start at different times: one moves from the
+    first frame, the last one starts by frame 16. A sequence of fewer frames is a prefix of the longer one;
+    after frame 36 everything is at rest.
 
     Args:
-        seed: how far things open, when, and their patterns.
-        frames: how many.
+        seed: seed of the openings, the start times, and the patterns.
+        frames: number of frames.
         width: pixels.
         height: pixels.
-        cameras: how many, in a circle around the furniture, by turns lower and higher.
+        cameras: number of cameras, in a circle around the furniture, alternately lower and higher.
         still: nothing moves.
 
     Raises:
         ValueError: a count is below 1.
     """
-    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
+    check_counts(frames=frames, width=width, height=height, cameras=cameras)
     motion = _draw_motion(seed)
     poses, joints = _poses(motion, np.zeros(frames) if still else np.arange(frames, dtype=np.float64))
     scene = Scene(
@@ -90,20 +90,20 @@ def articulated(
 
 def _draw_motion(seed: int) -> _Motion:
     rng = np.random.default_rng(seed)
-    begins = rng.permutation([0.0, 4.0, 9.0, 16.0])
+    starts = rng.permutation([0.0, 4.0, 9.0, 16.0])
     return _Motion(
         slide=rng.uniform(0.16, 0.24),
         swing=np.deg2rad(rng.uniform(70, 110)),
         lift=np.deg2rad(rng.uniform(55, 85)),
-        begins=begins,
+        starts=starts,
         box_from=np.array([0.42, 0.0]) + rng.uniform(-0.04, 0.04, 2),
-        box_way=np.array([rng.uniform(-0.05, 0.05), rng.uniform(0.20, 0.28)]),
+        box_path=np.array([rng.uniform(-0.05, 0.05), rng.uniform(0.20, 0.28)]),
         box_turn=rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2),
     )
 
 
 def _rest() -> Float[np.ndarray, "bodies 3"]:
-    """Where the middle of each body is while all is shut; the box stands at its own start."""
+    """Centre of each body while everything is shut; that of the box is relative to its start."""
     x, y, _ = _CABINET_AT
     front = x + _CABINET_SIZE[0]
     above = (_SHELF_Z + 2 * _CABINET_AT[2]) / 2
@@ -126,11 +126,11 @@ def _poses(
     motion: _Motion, moments: Float[np.ndarray, "t"]
 ) -> tuple[Float[np.ndarray, "t bodies 4 4"], tuple[Joint | None, ...]]:
     """Body-to-world transforms, and the joint of each of PARTS."""
-    rest, begins = _rest(), motion.begins
+    rest, starts = _rest(), motion.starts
     poses = np.broadcast_to(rigid(None, rest), (len(moments), len(rest), 4, 4)).copy()
-    slid = motion.slide * minimum_jerk((moments - begins[0]) / 14.0)
-    swung = motion.swing * minimum_jerk((moments - begins[1]) / 20.0)
-    lifted = motion.lift * minimum_jerk((moments - begins[2]) / 16.0)
+    slid = motion.slide * minimum_jerk((moments - starts[0]) / 14.0)
+    swung = motion.swing * minimum_jerk((moments - starts[1]) / 20.0)
+    lifted = motion.lift * minimum_jerk((moments - starts[2]) / 16.0)
     hinge = rest[_DOOR] + np.array([0.0, _CABINET_SIZE[1] / 2, 0.0])
     back = rest[_LID] + np.array([-_CHEST_SIZE[0], 0.0, -_WALL])
     drawer = Joint("prismatic", np.array(_FORWARD), rest[_DRAWER], slid)
@@ -139,9 +139,9 @@ def _poses(
     shut = Joint("revolute", -np.array(_UP), rest[_SHUT] - (hinge - rest[_DOOR]), 0.0 * swung)
     for body, joint in ((_DRAWER, drawer), (_DOOR, door), (_LID, lid)):
         poses[:, body] = joint.motions() @ poses[:, body]
-    gone = coast(moments, begins[3], 20.0)
-    centers = np.concatenate([motion.box_from + gone[:, None] * motion.box_way, 0 * gone[:, None]], axis=1)
-    poses[:, _BOX] = rigid(turn(_UP, gone * motion.box_turn), centers + rest[_BOX])
+    share = coast(moments, starts[3], 20.0)
+    centers = np.concatenate([motion.box_from + share[:, None] * motion.box_path, 0 * share[:, None]], axis=1)
+    poses[:, _BOX] = rigid(turn(_UP, share * motion.box_turn), centers + rest[_BOX])
     return poses, (drawer, door, lid, None, shut)
 
 
@@ -178,7 +178,7 @@ def _board(body: int, size: tuple, center: tuple, texture: Texture) -> Primitive
 def _case(
     body: int, size: tuple, outside: Texture, inside: Texture, open_side: tuple[int, int]
 ) -> list[Primitive]:
-    """Five boards around a hollow, which is open at the end `open_side` (axis, sign)."""
+    """Five boards of a hollow box that is open at the side `open_side` (axis, sign)."""
     boards = []
     for axis in range(3):
         for sign in (-1, 1):
@@ -191,7 +191,7 @@ def _case(
 
 
 def _drawer(front: Texture, inside: Texture, handle: Texture) -> list[Primitive]:
-    """A tray without a top behind a front that lies before the cabinet's edge."""
+    """An open tray behind a front panel that lies in front of the cabinet."""
     deep, wide, high = _CABINET_SIZE[0], _CABINET_SIZE[1], _SHELF_Z / 2 - 0.006
     tray = (deep - 3 * _WALL, wide - 5 * _WALL, high - 2.5 * _WALL)
     boards = _case(_DRAWER, tray, inside, inside, open_side=(2, 1))

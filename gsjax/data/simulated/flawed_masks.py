@@ -1,4 +1,5 @@
-"""True masks, spoiled as a segmenter's are: outlines off, things run together, in pieces, or overlooked."""
+"""Corruption of true masks by the typical errors of a segmenter: shifted outlines, merged, split or missing
+things."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,20 +8,20 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-_CLOSE = 3  # pixels between things that a segmenter may run together
-_LIKE_ITSELF = 0.6  # of half of a thing; the rest is like another
+_CLOSE = 3  # pixels between things that a segmenter may merge
+_OWN_SHARE = 0.6  # share of its own embedding in that of a split-off piece; the rest is another thing's
 
 
 @dataclass(frozen=True)
 class Flaws:
-    """How often masks are spoiled, and by how much.
+    """Frequency and size of the flaws.
 
     Attributes:
-        outline: largest number of pixels by which a thing is eroded or grown.
-        merged: share of the pictures in which two things are one.
-        split: share of the pictures in which one thing is two.
-        missing: share of the pictures in which a thing that is there is overlooked.
-        smallest: a thing with fewer pixels is always overlooked, as segmenters drop specks.
+        outline: largest number of pixels by which a thing is eroded or dilated.
+        merged: fraction of the pictures in which two things are merged.
+        split: fraction of the pictures in which a thing is split in two.
+        missing: fraction of the pictures that show a thing in which it is missing.
+        smallest: things with fewer pixels are always missing, as segmenters drop specks.
     """
 
     outline: int = 3
@@ -31,17 +32,17 @@ class Flaws:
 
 
 class FlawedMasks(NamedTuple):
-    """What a segmenter might have said of V pictures, and what an encoder of each mask.
+    """Masks of V pictures as a segmenter might produce them, and embeddings as of an encoder of each mask.
 
     Attributes:
-        labels: [H,W] a picture, 0 the background, -1 in no mask.
-        embeddings: of the labels 0 to n, [n+1,D] a picture.
-        said: what was done, in words.
+        labels: [H,W] for each picture; 0 is the background, -1 is in no mask.
+        embeddings: embeddings of the labels 0 to n, [n+1,D] for each picture.
+        notes: descriptions of the flaws.
     """
 
     labels: list[Int[np.ndarray, "..."]]
     embeddings: list[Float[np.ndarray, "..."]]
-    said: list[str]
+    notes: list[str]
 
 
 def flawed_masks(
@@ -50,18 +51,18 @@ def flawed_masks(
     seed: int,
     flaws: Flaws | None = None,
 ) -> FlawedMasks:
-    """Masks of true labels 0 to K, with flaws.
+    """Corrupt masks of true labels 0 to K.
 
-    A mask has the embedding of its label. Two things in one mask have the mean of theirs, by their pixels, as
-    an encoder of crops would say; of one that is two, the smaller piece has one almost halfway to another
-    thing's, for half of a thing looks like something else. Nothing is overlooked in all pictures that show
-    enough of it.
+    A mask has the embedding of its label. Merged things have the mean of their embeddings, weighted by pixel
+    count, as from an encoder of crops. The smaller piece of a split thing has an embedding almost halfway
+    to another thing's, since half of a thing may look like something else. No thing is missing in all of the
+    pictures that show enough of it.
 
     Args:
         masks: labels of each picture, [H,W].
-        codebook: of the labels 0 to K.
-        seed: of all that is random.
-        flaws: how much; the defaults unless given.
+        codebook: embeddings of the labels 0 to K.
+        seed: random seed.
+        flaws: frequency and size of the flaws; default: `Flaws()`.
     """
     flaws, random = flaws or Flaws(), np.random.default_rng(seed)
     count, things = len(masks), range(1, len(codebook))
@@ -72,36 +73,37 @@ def flawed_masks(
         shown = np.flatnonzero(~missing[:, k])
         number = min(int(flaws.missing * len(shown) + random.uniform()), max(len(shown) - 1, 0))
         missing[random.permutation(shown)[:number], k] = True
-    # Of few pictures a share is no whole number: then by chance, so that it holds over seeds.
+    # Stochastic rounding, so that the fractions hold on average over seeds even for few pictures.
     merged, split = (
         set(random.permutation(count)[: int(share * count + random.uniform())].tolist())
         for share in (flaws.merged, flaws.split)
     )
-    labels, embeddings, said = [], [], []
+    labels, embeddings, notes = [], [], []
     for v, mask in enumerate(masks):
         found, rows = _outlined(mask, missing[v], flaws, random), np.array(codebook)
-        if overlooked := [k for k in things if missing[v, k] and (mask == k).any()]:
-            said.append(f"picture {v}: {overlooked} overlooked")
+        if lost := [k for k in things if missing[v, k] and (mask == k).any()]:
+            notes.append(f"picture {v}: {lost} missing")
         if v in merged and (pair := _neighbours(found, random)) is not None:
             one, other = pair
             sizes = np.array([(found == one).sum(), (found == other).sum()])
             rows[one] = _unit(sizes @ rows[[one, other]])
             found[found == other] = one
-            said.append(f"picture {v}: {one} and {other} are one")
-        if v in split and (there := [k for k in things if (found == k).sum() > 1]):
-            whole = int(random.choice(there))
+            notes.append(f"picture {v}: {one} and {other} merged")
+        if v in split and (present := [k for k in things if (found == k).sum() > 1]):
+            whole = int(random.choice(present))
             other = int(random.choice([k for k in range(len(codebook)) if k != whole]))
             found[_smaller_piece(found == whole, random)] = len(rows)
-            mixed = _LIKE_ITSELF * rows[whole] + (1 - _LIKE_ITSELF) * np.asarray(codebook)[other]
+            mixed = _OWN_SHARE * rows[whole] + (1 - _OWN_SHARE) * np.asarray(codebook)[other]
             rows = np.concatenate([rows, _unit(mixed)[None]])
-            said.append(f"picture {v}: {whole} is two, one of which looks almost as much like {other}")
+            notes.append(f"picture {v}: {whole} split, with one piece almost as similar to {other}")
         labels.append(found)
         embeddings.append(rows.astype(np.float32))
-    return FlawedMasks(labels, embeddings, said)
+    return FlawedMasks(labels, embeddings, notes)
 
 
 def _outlined(mask, missing: Bool[np.ndarray, "k"], flaws: Flaws, random) -> Int[np.ndarray, "h w"]:
-    """Each thing eroded or grown by some pixels, small ones over large ones; what is missing is left out."""
+    """Each thing eroded or dilated by some pixels, small ones painted over large ones, missing ones left
+    out."""
     most, found = flaws.outline, np.where(missing[mask], -1, 0).astype(np.int64)
     sizes = np.bincount(mask.ravel(), minlength=len(missing))
     for k in np.argsort(-sizes):
@@ -116,7 +118,7 @@ def _outlined(mask, missing: Bool[np.ndarray, "k"], flaws: Flaws, random) -> Int
 
 
 def _neighbours(labels, random) -> tuple[int, int] | None:
-    """Two things that touch, or nearly; none where there are no such."""
+    """A random pair of things that touch or nearly touch; None if there is none."""
     kernel, pairs = np.ones((2 * _CLOSE + 1,) * 2, np.uint8), []
     for k in np.unique(labels[labels > 0]):
         near = np.unique(labels[cv2.dilate((labels == k).astype(np.uint8), kernel) > 0])
@@ -125,7 +127,7 @@ def _neighbours(labels, random) -> tuple[int, int] | None:
 
 
 def _smaller_piece(mask: Bool[np.ndarray, "h w"], random) -> Bool[np.ndarray, "h w"]:
-    """What lies beyond a line in a random direction, a quarter to a half of the mask."""
+    """The part of the mask beyond a line in a random direction, a quarter to a half of it."""
     rows, columns = np.nonzero(mask)
     angle = random.uniform(0, 2 * np.pi)
     along = np.cos(angle) * columns + np.sin(angle) * rows

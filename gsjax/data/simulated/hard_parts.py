@@ -1,4 +1,4 @@
-"""Parts that are hard to find: a wheel with gaps, a small motion, a thin rod, and a panel flush in a wall."""
+"""Parts that are hard to find: a wheel with gaps, a small motion, a thin rod, a panel flush in its frame."""
 
 from typing import NamedTuple
 
@@ -9,30 +9,30 @@ from gsjax.data.sequence import Sequence
 from gsjax.data.simulated.motion import minimum_jerk, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
-from gsjax.data.simulated.simulation import expect_counts, simulated_sequence
+from gsjax.data.simulated.simulation import check_counts, simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 from gsjax.geometry.joints import Joint
 
 RATE_HZ = 15.0
 AMOUNTS = {"wheel": 6.0, "small": 0.1, "thin": 0.02, "flush": 0.02}
-"""Of each case, unless told: how many spokes, how far it slides, how wide it is, how far it stands out."""
+"""Default amount of each case: number of spokes, and metres of slide, width and protrusion."""
 
 _WORLD, _PART, _BOX = range(3)  # bodies; labels are the same numbers
 
-# Half sizes and centres, metres; the floor is z = 0, a wall stands behind, cameras look from +x.
+# Half sizes and centres, metres; the floor is z = 0, the wall is at the back, cameras look from +x.
 _WALL_SIZE, _WALL_AT = (0.02, 0.55, 0.30), (-0.22, 0.0, 0.30)
-_BOX_SIZE, _BOX_FROM, _BOX_WAY = (0.05, 0.05, 0.06), (0.10, -0.34, 0.06), (0.12, 0.16, 0.0)
+_BOX_SIZE, _BOX_FROM, _BOX_PATH = (0.05, 0.05, 0.06), (0.10, -0.34, 0.06), (0.12, 0.16, 0.0)
 _TARGET = np.array([0.0, 0.0, 0.18])
-_DISTANCE, _ARC = 1.15, 130.0  # metres, and degrees of the arc on which cameras stand
+_DISTANCE, _ARC = 1.15, 130.0  # metres, and degrees of the cameras' arc
 _LIGHT = Light(position=(1.2, 0.7, 1.8), radius=0.03)
 _WALL_FRONT = _WALL_AT[0] + _WALL_SIZE[0]
 _TURN = np.deg2rad(80.0)
-_FRAMES = 15.0  # that all motion takes
+_FRAMES = 15.0  # duration of all motions
 
 
 class _Hard(NamedTuple):
-    """The part, at rest about the middle of its body, and its joint."""
+    """Solids of the part around the middle of its body at rest, that middle, and the joint."""
 
     solids: list[Primitive]
     middle: Float[np.ndarray, "3"]
@@ -49,41 +49,41 @@ def hard_parts(
     cameras: int = 8,
 ) -> Sequence:
     """A part that is hard to find, and a box that is not: RGB-D, labels, optical flow, exact poses, and the
-    joint of the part; 15 Hz. The failures of MotionSplicer (papers/001, figure 9), as hard as one likes. A
-    sequence of fewer frames is the beginning of the longer one; after frame 15 all is at rest.
+    joint of the part; 15 Hz. The failures of MotionSplicer, figure 9, as hard as requested. A sequence of
+    fewer frames is the beginning of the longer one; after frame 15 all is at rest.
 
-    Labels are 0 scene (a floor and a wall), 1 the part, 2 a box that slides by 0.2 m and turns. Cameras stand
-    on an arc before the wall.
+    Labels are 0 scene (a floor and a wall), 1 the part, 2 a box that slides by 0.2 m and turns. The cameras
+    are on an arc in front of the wall.
 
     Args:
-        case: "wheel", which turns by 80 degrees about its axle, and through whose gaps one sees the wall;
+        case: "wheel", which turns by 80 degrees about its axle, with the wall visible through its gaps;
             "small", a block that slides; "thin", a rod that swings about its foot; "flush", a panel that
             slides in a frame of the same wood.
-        amount: how many spokes; how far the block slides, how wide the rod is, or how far the panel stands
-            out of its frame, metres. With 0 as `AMOUNTS` has it.
-        seed: of patterns.
-        frames: how many.
+        amount: the number of spokes; or the slide of the block, the width of the rod, or the protrusion of
+            the panel from its frame, metres. 0 selects the default in `AMOUNTS`.
+        seed: seed of the patterns.
+        frames: number of frames.
         width: pixels.
         height: pixels.
-        cameras: how many.
+        cameras: number of cameras.
 
     Raises:
-        ValueError: there is no such case, or a number is below what makes sense.
+        ValueError: there is no such case, or a number is too small.
     """
     if case not in AMOUNTS:
         raise ValueError(f"case: expected one of {', '.join(AMOUNTS)}, found {case!r}")
     amount = amount or AMOUNTS[case]
     if not amount > 0 or (case == "wheel" and amount < 2):
-        wanted = "2 or more spokes" if case == "wheel" else "more than 0 metres"
-        raise ValueError(f"amount: expected {wanted}, found {amount}")
-    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
+        expected = "2 or more spokes" if case == "wheel" else "more than 0 metres"
+        raise ValueError(f"amount: expected {expected}, found {amount}")
+    check_counts(frames=frames, width=width, height=height, cameras=cameras)
     share = minimum_jerk(np.arange(frames) / _FRAMES)
     make = {"wheel": _wheel, "small": _small, "thin": _thin, "flush": _flush}[case]
     part = make(amount, share, seed)
     rest = np.array([[0.0, 0.0, 0.0], part.middle, _BOX_FROM])
     poses = np.broadcast_to(rigid(None, rest), (frames, 3, 4, 4)).copy()
     poses[:, _PART] = part.joint.motions() @ poses[:, _PART]
-    poses[:, _BOX, :3, 3] += share[:, None] * np.array(_BOX_WAY)
+    poses[:, _BOX, :3, 3] += share[:, None] * np.array(_BOX_PATH)
     poses[:, _BOX, :3, :3] = turn((0.0, 0.0, 1.0), 0.8 * share).as_matrix()
     angles = np.deg2rad(_ARC) * (np.linspace(-0.5, 0.5, cameras) if cameras > 1 else np.zeros(1))
     heights = np.deg2rad(np.where(np.arange(cameras) % 2, 32.0, 16.0))
@@ -116,7 +116,7 @@ def _room(seed: int) -> list[Primitive]:
 
 
 def _wheel(spokes: float, share: Float[np.ndarray, "t"], seed: int) -> _Hard:
-    """Upright, facing the cameras; its rim of short boards, on a post."""
+    """An upright wheel that faces the cameras, with a rim of short boards, on a post."""
     steel = Texture("noise", ((0.12, 0.30, 0.50), (0.36, 0.58, 0.80)), 0.03, seed=20 * seed + 4)
     middle, radius, board = np.array([-0.02, 0.08, 0.24]), 0.17, 0.012
     solids = [_at(_PART, (board, 0.03, 0.03), steel, np.zeros(3))]
@@ -140,7 +140,7 @@ def _small(far: float, share: Float[np.ndarray, "t"], seed: int) -> _Hard:
 
 
 def _thin(wide: float, share: Float[np.ndarray, "t"], seed: int) -> _Hard:
-    """A rod that swings about its foot, before the wall."""
+    """A rod that swings about its foot, in front of the wall."""
     green = Texture("stripes", ((0.16, 0.42, 0.24), (0.62, 0.80, 0.48)), 0.03, seed=20 * seed + 4)
     foot, half = np.array([0.0, 0.16, 0.02]), 0.16
     middle = foot + np.array([0.0, 0.0, half])
@@ -164,6 +164,6 @@ def _at(body: int, size: tuple[float, ...], texture: Texture, center) -> Primiti
 
 
 def _around_x(angle: float, size: tuple[float, ...], texture: Texture, out: float) -> Primitive:
-    """A board of the wheel, so far out at an angle about x."""
+    """A board of the wheel, at distance `out` and an angle about x."""
     turned = turn((1.0, 0.0, 0.0), angle)
     return Primitive("box", size, texture, _PART, rigid(turned, turned.apply([0.0, out, 0.0])))

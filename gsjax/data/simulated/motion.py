@@ -1,4 +1,4 @@
-"""Rigid transforms and smooth motions along keyframes; every function takes many frames at once."""
+"""Rigid transforms and smooth keyframe motions, vectorised over frames."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 def rigid(
     rotation: Rotation | None, translation: Float[np.ndarray, "*frames 3"] | Sequence[float]
 ) -> Float[np.ndarray, "*frames 4 4"]:
-    """Transforms that rotate, then translate; of one rotation or of many."""
+    """Transforms that rotate, then translate, from one rotation or a batch of them; None is no rotation."""
     translation = np.asarray(translation, np.float64)
     matrices = np.eye(3) if rotation is None else rotation.as_matrix()
     batch = np.broadcast_shapes(translation.shape[:-1], matrices.shape[:-2])
@@ -20,7 +20,7 @@ def rigid(
 
 
 def minimum_jerk(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """From 0 to 1 for x from 0 to 1, at rest at both ends; its steepest slope is 15/8."""
+    """Minimum-jerk ramp from 0 to 1 for x from 0 to 1, at rest at both ends; its steepest slope is 15/8."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x * x)
 
@@ -38,23 +38,24 @@ def along_keyframes(
 
 
 def coast(frames: Float[np.ndarray, "t"], start: float, duration: float) -> Float[np.ndarray, "t"]:
-    """From 0 to 1 as a push under friction goes: fastest at `start`, at rest after `duration` frames.
+    """Progress from 0 to 1 of a pushed object under friction: fastest at `start`, at rest after `duration`
+    frames.
 
-    The first frame covers at most 2 / duration of the way.
+    The first frame covers at most 2 / duration of the path.
     """
     x = np.clip((frames - start) / duration, 0.0, 1.0)
     return x * (2 - x)
 
 
 def turn(axis: Float[np.ndarray, "3"] | Sequence[float], angles: Float[np.ndarray, "*n"] | float) -> Rotation:
-    """Rotations about one unit axis, by radians."""
+    """Rotations about one unit axis, by angles in radians."""
     return Rotation.from_rotvec(np.asarray(angles)[..., None] * np.asarray(axis, np.float64))
 
 
 def between(
     start: Float[np.ndarray, "*frames 3"], end: Float[np.ndarray, "*frames 3"]
 ) -> Float[np.ndarray, "*frames 4 4"]:
-    """The frame in the middle of a stick: z points from start to end, x stays horizontal."""
+    """The frame at the midpoint of a segment: z points from start to end, x stays horizontal."""
     z = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
     x = np.cross(np.array([0.0, 0.0, 1.0]), z)
     length = np.linalg.norm(x, axis=-1, keepdims=True)

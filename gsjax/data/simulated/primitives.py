@@ -1,7 +1,7 @@
-"""Solids and a plane: where rays enter them, and their normals. All rays are columns, [3,N].
+"""Solids, a plane and a sheet: ray intersections and normals. Rays are columns, [3,N].
 
-Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; rays
-that miss it, or that start inside, give infinity.
+Every intersection solves for the smallest s > 0 at which origin + s * direction enters the solid; it is
+infinite for rays that miss it or start inside.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from gsjax.data.simulated.sheet import Sheet
 from gsjax.data.simulated.textures import Texture
 
 _TINY = 1e-300
-# Rays enter a bent box where they can go on by no more than this, metres. After so many steps one misses it.
+# A ray has entered a bent box when its safe step is below this, metres; without convergence it is a miss.
 _ON_SURFACE_M = 1e-10
 _MOST_STEPS = 200
 
@@ -26,10 +26,10 @@ class Primitive:
 
     Attributes:
         shape: "box", "sphere", "cylinder" (about z), "plane" (z = 0, seen from above), "bent box" or "sheet".
-        size: metres: three half edges; a radius; a radius and half a length; nothing; what `BentBox` has; the
-            bumps of a `Sheet`.
-        texture: its colours, in coordinates of the primitive at rest, so that they turn and bend with it.
-        body: index of the body that it moves with.
+        size: metres, by shape: three half edges; a radius; a radius and half a length; nothing; the fields of
+            `BentBox`; the bumps of a `Sheet`.
+        texture: its colours, in coordinates of the primitive at rest, so that they move and deform with it.
+        body: index of the body to which it is attached.
         pose: primitive to body, [4,4].
     """
 
@@ -41,7 +41,7 @@ class Primitive:
 
     @property
     def half_extents(self) -> Float[np.ndarray, "3"]:
-        """Half the edges of the box around it; infinite for a plane and a sheet."""
+        """Half edges of its bounding box; infinite for a plane and a sheet."""
         match self.shape:
             case "box":
                 return np.array(self.size)
@@ -59,12 +59,12 @@ class Primitive:
 def intersect(
     primitive: Primitive, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, "n"]:
-    """Where rays from one point, both in the primitive's frame, enter it: s, or infinity.
+    """Intersect rays from one point with a primitive, in its frame: s of the entry point, or infinity.
 
     Args:
-        primitive: what is to be met.
-        origin: of all rays, metres.
-        directions: of any length, of which s is a multiple.
+        primitive: the primitive.
+        origin: origin of all rays, metres.
+        directions: ray directions of any length; s is in units of it.
     """
     match primitive.shape:
         case "box":
@@ -77,8 +77,8 @@ def intersect(
             low, high = _slabs((0.0, 0.0, half), origin, directions, axes=(2,))
             near, far = np.maximum(near, low), np.minimum(far, high)
         case "plane":
-            falls = directions[2] < 0
-            near = far = np.where(falls, -origin[2] / np.where(falls, directions[2], 1.0), np.inf)
+            downward = directions[2] < 0
+            near = far = np.where(downward, -origin[2] / np.where(downward, directions[2], 1.0), np.inf)
         case "bent box":
             within = _slabs(primitive.half_extents, origin, directions, axes=(0, 1, 2))
             near = far = _march(BentBox(*primitive.size), origin, directions, *within)
@@ -111,19 +111,19 @@ def normals(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.
 
 
 def at_rest(primitive: Primitive, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
-    """Where points of the primitive, in its frame, are while it is not deformed."""
-    soft = _soft(primitive)
-    return points if soft is None else soft.undo(points)
+    """Map points of the primitive, in its frame, back to its undeformed state."""
+    deformation = _deformation(primitive)
+    return points if deformation is None else deformation.undo(points)
 
 
 def deformed(primitive: Primitive, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
-    """Where points of the primitive at rest are in its frame: the inverse of `at_rest`."""
-    soft = _soft(primitive)
-    return rest if soft is None else soft.deform(rest)
+    """Map points of the undeformed primitive to its deformed state, in its frame: inverse of `at_rest`."""
+    deformation = _deformation(primitive)
+    return rest if deformation is None else deformation.deform(rest)
 
 
-def _soft(primitive: Primitive) -> BentBox | Sheet | None:
-    """What maps a primitive that deforms; None for one that does not."""
+def _deformation(primitive: Primitive) -> BentBox | Sheet | None:
+    """The deformation of a primitive; None if it is rigid."""
     match primitive.shape:
         case "bent box":
             return BentBox(*primitive.size)
@@ -138,25 +138,25 @@ def _box_normals(half, points):
 
 
 def _march(box, origin, directions, near, far):
-    """Where rays enter a bent box between `near` and `far`; 0 for one that starts inside."""
+    """Entry points of rays into a bent box between `near` and `far`; 0 for a ray that starts inside."""
     speed = np.linalg.norm(directions, axis=0)
     unit = directions / speed
     s, entry = np.maximum(near, 0.0), np.full_like(speed, np.inf)
-    going = np.flatnonzero(s <= far)
+    active = np.flatnonzero(s <= far)
     for _ in range(_MOST_STEPS):
-        if not going.size:
+        if not active.size:
             break
-        rays = unit[:, going]
-        step = box.advance(origin[:, None] + rays * (s * speed)[going], rays)
-        there = step < _ON_SURFACE_M
-        s[going] += step / speed[going]
-        entry[going[there]] = s[going[there]]
-        going = going[~there & (s[going] <= far[going])]
+        rays = unit[:, active]
+        step = box.advance(origin[:, None] + rays * (s * speed)[active], rays)
+        arrived = step < _ON_SURFACE_M
+        s[active] += step / speed[active]
+        entry[active[arrived]] = s[active[arrived]]
+        active = active[~arrived & (s[active] <= far[active])]
     return entry
 
 
 def _slabs(half, origin, directions, axes):
-    """The stretch of each ray between pairs of planes at +-half."""
+    """The interval of each ray between pairs of planes at +-half."""
     near, far = -np.inf, np.inf
     for i in axes:
         inverse = 1.0 / np.where(np.abs(directions[i]) < _TINY, _TINY, directions[i])
@@ -166,7 +166,7 @@ def _slabs(half, origin, directions, axes):
 
 
 def _quadric(radius, origin, directions):
-    """The stretch of each ray within a sphere, or, with two coordinates, within an endless cylinder."""
+    """The interval of each ray within a sphere, or, with two coordinates, within an infinite cylinder."""
     a = np.maximum(np.einsum("ij,ij->j", directions, directions), _TINY)
     b = origin @ directions
     discriminant = b * b - a * (origin @ origin - radius * radius)

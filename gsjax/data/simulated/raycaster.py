@@ -10,22 +10,22 @@ from gsjax.data.simulated.primitives import Primitive, at_rest, deformed, inters
 from gsjax.data.simulated.textures import GAMMA, albedo
 
 _NEAR_M = 1e-3
-# A surface does not shade itself: shadow rays end this fraction before the point.
+# Shadow rays end this fraction before the point, so that a surface does not shadow itself.
 _SHADOW_MARGIN = 1e-6
-# Where in a pixel colour is sampled, and which point of the light each sample sees (in its radius).
+# Colour samples within a pixel, and the point of the lamp's disc that each one uses, in units of its radius.
 _SUBPIXELS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
 _LIGHT_POINTS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A small lamp and the light from all around.
+    """A small lamp and ambient light.
 
     Attributes:
         position: metres, world, [3].
-        radius: metres; softens shadows, by as many samples as a pixel has.
+        radius: metres; softens shadows, with one light sample per pixel sample.
         color: linear RGB of the lamp.
-        ambient: linear RGB from above; surfaces that face down get half.
+        ambient: linear RGB from above; surfaces that face down receive half.
     """
 
     position: tuple[float, float, float]
@@ -36,18 +36,18 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Solids on bodies that move rigidly, a light, and cameras. Bent boxes and sheets may deform besides.
+    """Solids on rigidly moving bodies, a light and cameras. Bent boxes and sheets may also deform.
 
     Attributes:
-        primitives: the solids; those of one body never move relative to each other.
+        primitives: the solids; those of one body do not move relative to each other.
         labels: the mask value of each body, [B].
         poses: body-to-world transforms, [T,B,4,4].
-        light: the lamp.
-        Ks: [T,C,3,3].
+        light: lamp and ambient light.
+        Ks: intrinsics in pixels, pixel centres at +0.5, [T,C,3,3].
         viewmats: world to camera, OpenCV axes, [T,C,4,4].
         width: pixels.
         height: pixels.
-        sizes: of primitives that deform, by index: the size of each frame, [T,n], in place of their own.
+        sizes: for primitives that deform, by index: their size in each frame, [T,n], instead of their own.
     """
 
     primitives: tuple[Primitive, ...]
@@ -61,7 +61,7 @@ class Scene:
     sizes: Mapping[int, Float[np.ndarray, "frames n"]] = field(default_factory=dict)
 
     def solids(self, t: int) -> list[tuple[Primitive, Float[np.ndarray, "4 4"]]]:
-        """The primitives as they are in frame t, each with its transform to the world."""
+        """The primitives in frame t, each with its transform to the world."""
         now = list(self.primitives)
         for i, size in self.sizes.items():
             now[i] = replace(now[i], size=tuple(size[t]))
@@ -70,13 +70,13 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What the rays of one camera met.
+    """The first hit of each ray of a camera.
 
     Attributes:
-        depth: metres along the optical axis, infinite where nothing was met.
-        primitive: index of the primitive, -1 where nothing was met.
-        origin: the camera, world, [3].
-        directions: world, scaled so that depth is their length, [3,H,W].
+        depth: metres along the optical axis, infinite for a miss, [H,W].
+        primitive: index of the primitive, -1 for a miss, [H,W].
+        origin: the camera centre, world, [3].
+        directions: ray directions in the world, scaled to unit depth, [3,H,W].
     """
 
     depth: Float[np.ndarray, "height width"]
@@ -85,18 +85,18 @@ class Hits:
     directions: Float[np.ndarray, "3 height width"]
 
     def points(self) -> Float[np.ndarray, "3 height width"]:
-        """World points; at the camera where nothing was met."""
+        """World points of the hits; the camera centre for a miss."""
         depth = np.where(np.isfinite(self.depth), self.depth, 0.0)
         return self.origin[:, None, None] + self.directions * depth
 
 
 def trace(scene: Scene, t: int, c: int, subpixel: tuple[float, float] = (0.5, 0.5)) -> Hits:
-    """What camera c sees in frame t, at the same place within every pixel (0.5: its centre).
+    """Trace one ray per pixel of camera c in frame t.
 
     Args:
-        scene: what there is.
+        scene: the scene.
         t, c: frame and camera.
-        subpixel: that place, (x, y), 0 to 1.
+        subpixel: position of the ray within its pixel, (x, y), 0 to 1; 0.5 is the centre.
     """
     K, viewmat = scene.Ks[t, c], scene.viewmats[t, c]
     x, y = np.meshgrid(np.arange(scene.width) + subpixel[0], np.arange(scene.height) + subpixel[1])
@@ -119,20 +119,20 @@ def trace(scene: Scene, t: int, c: int, subpixel: tuple[float, float] = (0.5, 0.
 
 
 def render_depth(hits: Hits) -> Float[np.ndarray, "height width"]:
-    """Depth in metres, float32, 0 where nothing was met."""
+    """Depth in metres, float32, 0 for a miss."""
     return np.where(np.isfinite(hits.depth), hits.depth, 0.0).astype(np.float32)
 
 
 def render_labels(scene: Scene, hits: Hits) -> Int[np.ndarray, "height width"]:
-    """Mask values, int32, 0 where nothing was met."""
+    """Mask values, int32, 0 for a miss."""
     return np.append(_primitive_labels(scene), 0)[hits.primitive].astype(np.int32)
 
 
 def render_color(scene: Scene, t: int, c: int) -> UInt8[np.ndarray, "height width 3"]:
-    """RGB: Lambert's law, shadows, four samples a pixel.
+    """RGB with Lambertian shading and shadows, four samples per pixel.
 
     Args:
-        scene: what there is.
+        scene: the scene.
         t, c: frame and camera.
     """
     total = np.zeros((3, scene.height, scene.width))
@@ -145,22 +145,23 @@ def render_color(scene: Scene, t: int, c: int) -> UInt8[np.ndarray, "height widt
 
 
 def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.ndarray, "height width 2"]:
-    """Pixels (x, y) that what is seen in frame t moves until frame u, whether or not it is seen there.
+    """Displacement (x, y) in pixels of each visible point from frame t to u, whether or not it is visible
+    in u.
 
-    NaN where nothing was met and where the point is behind the camera in frame u.
+    NaN for rays that hit nothing and for points behind the camera in frame u.
 
     Args:
-        scene: what there is.
+        scene: the scene.
         t, u: the frames.
         c: the camera.
-        hits: what its rays met in frame t.
+        hits: the hits of its rays in frame t.
     """
     index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
-    before, after = scene.solids(t), scene.solids(u)
+    solids_before, solids_after = scene.solids(t), scene.solids(u)
     for i in np.unique(index[index >= 0]):
         here = np.flatnonzero(index == i)
-        (was, from_pose), (becomes, to_pose) = before[i], after[i]
-        local = deformed(becomes, at_rest(was, _to_local(from_pose, points[:, here])))
+        (before, from_pose), (after, to_pose) = solids_before[i], solids_after[i]
+        local = deformed(after, at_rest(before, _to_local(from_pose, points[:, here])))
         points[:, here] = to_pose[:3, :3] @ local + to_pose[:3, 3:]
     to_pixels = scene.Ks[u, c] @ scene.viewmats[u, c][:3]
     homogeneous = (to_pixels[:, :3] @ points + to_pixels[:, 3:]).reshape(3, scene.height, scene.width)
@@ -171,7 +172,7 @@ def render_flow(scene: Scene, t: int, u: int, c: int, hits: Hits) -> Float[np.nd
 
 
 def _radiance(scene: Scene, t: int, hits: Hits, lamp: np.ndarray) -> Float[np.ndarray, "3 height width"]:
-    """Linear RGB that leaves the surfaces towards the camera."""
+    """Linear RGB radiance from the surfaces towards the camera."""
     flat_index, points = hits.primitive.ravel(), hits.points().reshape(3, -1)
     normal, reflectance = np.zeros_like(points), np.zeros_like(points)
     solids = scene.solids(t)
@@ -198,7 +199,7 @@ def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, poin
     unit = rays / lengths
     dark = np.zeros(len(lengths), bool)
     for primitive, pose in solids:
-        if primitive.shape in ("plane", "sheet"):  # nothing is below it
+        if primitive.shape in ("plane", "sheet"):  # there is nothing below to be shadowed
             continue
         # Only points in the cone of the solid's bounding sphere can lie in its shadow.
         center, radius = pose[:3, 3] - lamp, np.linalg.norm(primitive.half_extents)
@@ -214,7 +215,7 @@ def _shadowed(solids: list[tuple[Primitive, np.ndarray]], lamp: np.ndarray, poin
 def _window(
     primitive: Primitive, to_camera: np.ndarray, K: np.ndarray, width: int, height: int
 ) -> tuple[slice, slice] | None:
-    """Rows and columns that can see a primitive; None if there are none."""
+    """Rows and columns whose rays may hit a primitive; None if there are none."""
     half = primitive.half_extents
     everything = slice(0, height), slice(0, width)
     if not np.isfinite(half).all():
@@ -233,13 +234,13 @@ def _window(
 
 
 def _to_local(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """World points (columns, or one) in the frame of `pose`."""
+    """World points (columns, or a single one) in the frame of `pose`."""
     origin = pose[:3, 3] if points.ndim == 1 else pose[:3, 3:]
     return pose[:3, :3].T @ (points - origin)
 
 
 def _light_disc(light: Light) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions that span the lamp's disc, which faces the world's origin."""
+    """Two unit vectors that span the lamp's disc, which faces the world's origin."""
     toward = -np.array(light.position) / np.linalg.norm(light.position)
     side = np.cross(toward, [0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)

@@ -1,4 +1,4 @@
-"""An arm of two links on a pillar, with a two-finger gripper that points down its z axis."""
+"""A two-link arm on a pillar, with a two-finger gripper that points down its z axis."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from gsjax.data.simulated.textures import Texture
 
 LINK_M = 0.48
 SHOULDER = np.array([-0.50, 0.0, 0.33])
-_WRIST_HEIGHT = 0.20  # above the point that the fingers grasp
+_WRIST_HEIGHT = 0.20  # above the grasp point
 _FINGER = (0.011, 0.008, 0.045)
 BODIES = 6  # pillar, upper arm, forearm, hand, two fingers
 
@@ -19,7 +19,7 @@ _PAD = Texture("checker", ((0.15, 0.16, 0.18), (0.36, 0.36, 0.38)), 0.012, seed=
 
 
 def robot_primitives(first_body: int) -> list[Primitive]:
-    """The solids of the arm; its bodies are numbered from `first_body`."""
+    """The solids of the arm, with bodies numbered from `first_body`."""
     pillar, upper, fore, hand, left, right = range(first_body, first_body + BODIES)
     middle = SHOULDER[2] / 2
     return [
@@ -43,8 +43,9 @@ def robot_poses(
     """Poses of the arm's bodies in the world.
 
     Args:
-        grasp: the frame between the fingers; they close along its y, the hand is up its z.
-        opening: metres from the middle to each finger.
+        grasp: pose of the frame between the fingers; they close along its y axis, and the hand is up its z
+            axis.
+        opening: distance of each finger from the middle, metres.
     """
     wrist = grasp[:, :3, 3] + _WRIST_HEIGHT * grasp[:, :3, 2]
     shoulder = np.broadcast_to(SHOULDER, wrist.shape)
@@ -64,9 +65,10 @@ def robot_poses(
 
 
 def _elbow(shoulder: np.ndarray, wrist: np.ndarray) -> np.ndarray:
-    """The upper of the two places at which links of equal length meet, in the vertical plane through both.
+    """The upper of the two possible elbows of two links of equal length, in the vertical plane through
+    shoulder and wrist.
 
-    A wrist out of reach leaves a gap at the elbow rather than an error: this arm is scenery.
+    A wrist out of reach leaves a gap at the elbow rather than raising an error: the arm is only scenery.
     """
     reach = wrist - shoulder
     length = np.linalg.norm(reach, axis=-1, keepdims=True)

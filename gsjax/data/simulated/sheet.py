@@ -1,4 +1,4 @@
-"""An endless sheet that bumps lift and shift: its map from rest, the way back, and rays that meet it."""
+"""An infinite sheet deformed by smooth bumps: the map from rest, its inverse, and ray intersections."""
 
 from dataclasses import dataclass
 
@@ -7,24 +7,24 @@ from jaxtyping import Float
 
 _CLOSE_ENOUGH_M = 1e-10
 _MOST_STEPS = 30
-_NUMBERS = 6  # of a bump
+_NUMBERS = 6  # per bump
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """The plane z = 0, whose points are moved by smooth bumps, most at their centres.
+    """The plane z = 0 deformed by Gaussian bumps.
 
         X(p) = p + sum_b d_b exp(-((x - x_b)^2 + (y - y_b)^2) / (2 s_b^2)),      p = (x, y, z) at rest
 
-    What is above or below the plane moves with it. The map has an inverse where no bump shifts points by more
-    than its width or so; and a ray meets the surface once where that is nowhere as steep as the ray. Both are
-    for the scene to see to.
+    Points above and below the plane move with it. The map is invertible as long as no bump shifts points by
+    much more than its width, and a ray meets the surface only once if the surface is nowhere as steep as the
+    ray. The scene has to ensure both.
 
     Attributes:
-        bumps: x, y, the width s and the shift d of each, one after the other, metres.
+        bumps: x, y, width s and shift d of each bump, concatenated, metres.
 
     Raises:
-        ValueError: they are not six numbers a bump, or a width is not above 0.
+        ValueError: there are not six numbers per bump, or a width is not above 0.
     """
 
     bumps: tuple[float, ...]
@@ -35,7 +35,7 @@ class Sheet:
             raise ValueError(f"bumps must be x, y, a width above 0 and a shift each, got {found}")
 
     def deform(self, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
-        """Where points are that are at `rest` when there is no bump."""
+        """Map points at rest to the deformed sheet."""
         return self._moved(rest)[0]
 
     def undo(self, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
@@ -51,7 +51,7 @@ class Sheet:
         return rest
 
     def normals(self, rest: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
-        """Unit normals of the upper side, at points at rest."""
+        """Unit normals of the upper side at the deformed points of `rest`."""
         _, along_x, along_y = self._moved(rest)
         normal = np.cross(along_x, along_y, axis=0)
         return normal / np.linalg.norm(normal, axis=0)
@@ -60,10 +60,10 @@ class Sheet:
         self, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "3 n"]
     ) -> Float[np.ndarray, "n"]:
         """The s at which rays origin + s directions meet the sheet, by Newton's method on s and the point at
-        rest; infinity for rays that do not go down."""
+        rest; infinity for rays that do not point downwards."""
         entry = np.full(directions.shape[1], np.inf)
-        falls = np.flatnonzero(directions[2] < 0)
-        rays = directions[:, falls]
+        downward = np.flatnonzero(directions[2] < 0)
+        rays = directions[:, downward]
         s = -origin[2] / rays[2]
         rest = origin[:, None] + s * rays
         rest[2] = 0.0
@@ -76,7 +76,7 @@ class Sheet:
             s = s + step
             if np.abs(error).max(initial=0) < _CLOSE_ENOUGH_M:
                 break
-        entry[falls] = np.where(np.abs(error).max(0) < _CLOSE_ENOUGH_M, s, np.inf)
+        entry[downward] = np.where(np.abs(error).max(0) < _CLOSE_ENOUGH_M, s, np.inf)
         return entry
 
     def _moved(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ class Sheet:
 
 
 def _in_the_plane(along_x: np.ndarray, along_y: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """The steps in x and y at rest that make up for the first two coordinates of an error, [2,n]."""
+    """The steps in x and y at rest that cancel the first two coordinates of an error, [2,n]."""
     determinant = along_x[0] * along_y[1] - along_y[0] * along_x[1]
     steps = np.stack(
         [along_y[1] * error[0] - along_y[0] * error[1], along_x[0] * error[1] - along_x[1] * error[0]]

@@ -19,10 +19,10 @@ from gsjax.geometry.cameras import look_at
 from gsjax.geometry.joints import Joint
 
 CACHED_IMAGES = 16
-"""Rendered images, and traced views, that a simulated sequence keeps."""
+"""Number of rendered images, and of traced views, that a simulated sequence caches."""
 
 
-def expect_counts(**counts: int) -> None:
+def check_counts(**counts: int) -> None:
     """Raises ValueError for a count below 1."""
     for name, value in counts.items():
         if value < 1:
@@ -32,7 +32,8 @@ def expect_counts(**counts: int) -> None:
 def viewmats_around(
     target: Float[np.ndarray, "3"], distance: float, cameras: int, *, low: float, high: float = 42.0
 ) -> Float[np.ndarray, "c 4 4"]:
-    """Cameras in a circle around `target`, `distance` metres away, by turns `low` and `high` degrees up."""
+    """View matrices of cameras on a circle around `target`, at a distance of `distance` metres and, in
+    alternation, `low` and `high` degrees of elevation."""
     azimuths = 2 * np.pi * np.arange(cameras) / cameras
     heights = np.deg2rad(np.where(np.arange(cameras) % 2 == 0, low, high))
     flat = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1) * np.cos(heights)[:, None]
@@ -49,16 +50,16 @@ def simulated_sequence(
     joints: tuple[Joint | None, ...] = (),
     tracks: Float[np.ndarray, "frames points 3"] | None = None,
 ) -> Sequence:
-    """The sequence of a scene. Frames are rendered when asked for; the last few are kept.
+    """The sequence of a scene. Frames are rendered on demand; the last few are cached.
 
     Args:
-        name: what to call it.
-        scene: what is seen, by which cameras.
+        name: name of the sequence.
+        scene: solids, light and cameras.
         times: seconds, increasing.
-        objects: the body of each object whose pose is reported as truth.
+        objects: body index of each object whose poses are part of the truth, by name.
         robot: the mask value of the robot.
-        joints: of each object, as `Truth` has them.
-        tracks: of points of what deforms, as `Truth` has them.
+        joints: the joint of each object, see `Truth`.
+        tracks: trajectories of points on deformable surfaces, see `Truth`.
     """
     color = lru_cache(CACHED_IMAGES)(lambda t, c: render_color(scene, t, c))
     hits = lru_cache(CACHED_IMAGES)(lambda t, c: trace(scene, t, c))

@@ -1,4 +1,4 @@
-"""A table on which an arm carries a carton, a can is knocked, a ball rolls, and a block never moves."""
+"""A table on which an arm carries a carton, a can slides, a ball rolls, and a block never moves."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene, render_labels, trace
 from gsjax.data.simulated.robot import BODIES as ROBOT_BODIES
 from gsjax.data.simulated.robot import robot_poses, robot_primitives
-from gsjax.data.simulated.simulation import expect_counts, simulated_sequence
+from gsjax.data.simulated.simulation import check_counts, simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 
@@ -19,23 +19,23 @@ RATE_HZ = 30.0
 NAMES = ("carton", "can", "ball", "block")
 ROBOT_LABEL, FIRST_OBJECT_LABEL = 1, 2
 
-_FIRST_BODY = 1 + ROBOT_BODIES  # of the objects; body 0 is the world
+_FIRST_BODY = 1 + ROBOT_BODIES  # the first object's; body 0 is the world
 
 CARTON = (0.045, 0.028, 0.065)
 CAN = (0.034, 0.055)
 BALL = 0.036
 BLOCK = (0.034, 0.034, 0.030)
 _HEIGHTS = (CARTON[2], CAN[1], BALL, BLOCK[2])
-_CLEARANCES = (0.085, 0.045, 0.045, 0.055)  # the carton's with the fingers beside it
+_CLEARANCES = (0.085, 0.045, 0.045, 0.055)  # the carton's includes the fingers
 
-# Frames at which the carton is gripped, up, across, and down again.
+# Frames at which the carton is gripped, lifted, carried across, and put down.
 _CARRY = (4.0, 16.0, 37.0, 47.0)
 _LIFT_M = 0.16
 _LIGHT = Light(position=(0.55, -0.75, 1.35), radius=0.02)
 _UP = (0.0, 0.0, 1.0)
 _TARGET = np.array([-0.03, 0.0, 0.04])
 
-# The garage that hides the can: inner half sizes, and where it stands; open towards the robot.
+# The garage that hides the can: inner half sizes and position; open towards the robot.
 _GARAGE = (0.115, 0.060, 0.065)
 _GARAGE_WALL = 0.006
 _GARAGE_X = 0.10
@@ -45,7 +45,8 @@ _INTO_GARAGE_M = 0.22
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the seed decides: starts and displacements in the plane, turns, and when things begin to move."""
+    """Random parameters drawn from the seed: start and end positions in the plane, rotations, yaws at rest,
+    and the frames at which objects start to move."""
 
     starts: Float[np.ndarray, "objects 2"]
     ends: Float[np.ndarray, "objects 2"]
@@ -66,29 +67,29 @@ def tabletop(
     hide: bool = False,
     moving_cameras: bool = False,
 ) -> Sequence:
-    """The built-in scene: RGB-D, labels, optical flow, and exact poses, at 30 Hz.
+    """A robot arm and four objects on a table: RGB-D, labels, optical flow and exact poses, at 30 Hz.
 
     Labels are 0 scene, 1 robot, 2 carton (gripped, lifted, carried, put down), 3 can (slides and turns),
-    4 ball (rolls), 5 block (never moves). Objects move up to 30 mm and 15 degrees a frame. A sequence of
-    fewer frames is the beginning of the longer one; after frame 60 all is at rest.
+    4 ball (rolls), 5 block (never moves). Objects move up to 30 mm and 15 degrees per frame. A sequence of
+    fewer frames is a prefix of the longer one; after frame 60 everything is at rest.
 
     Args:
-        seed: where things stand and how they move.
-        frames: how many.
+        seed: seed of the positions, motions and patterns.
+        frames: number of frames.
         width: pixels.
         height: pixels.
-        cameras: how many, on an arc in front of the table.
+        cameras: number of cameras, on an arc in front of the table.
         still: nothing moves.
-        leave: the can slides on and out of all views.
+        leave: the can keeps sliding until it is out of all views.
         hide: the can slides into a garage, where no camera sees it around frame 20, and out again.
         moving_cameras: the cameras sway by 6 degrees around the table.
 
     Raises:
         ValueError: a count is below 1, or both `leave` and `hide` are set.
     """
-    expect_counts(frames=frames, width=width, height=height, cameras=cameras)
+    check_counts(frames=frames, width=width, height=height, cameras=cameras)
     if leave and hide:
-        raise ValueError("leave and hide are two fates of the one can; set at most one")
+        raise ValueError("leave and hide exclude each other: both move the can; set at most one")
     times = np.arange(frames) / RATE_HZ
     moments = np.zeros(frames) if still else np.arange(frames, dtype=np.float64)
     layout = _draw_layout(seed, leave, hide)
@@ -124,7 +125,8 @@ def _build_scene(
 
 
 def _draw_layout(seed: int, leave: bool, hide: bool) -> _Layout:
-    """Draws until no two objects meet, all stay on the table, and the standard cameras see all at first."""
+    """Draw layouts until no two objects collide, all stay on the table, and the standard cameras see all of
+    them in the first frame."""
     rng = np.random.default_rng(seed)
     moments = np.arange(61.0)
     first_views = _viewmats(3, np.zeros(1))
@@ -139,7 +141,7 @@ def _draw_layout(seed: int, leave: bool, hide: bool) -> _Layout:
 
 
 def _sees_all(preview: Scene, c: int) -> bool:
-    """Whether each object has 12 pixels of 80x60, which are 200 of 320x240."""
+    """Whether each object covers at least 12 of 80x60 pixels, which is about 200 of 320x240."""
     counts = np.bincount(render_labels(preview, trace(preview, 0, c)).ravel(), minlength=6)
     return bool((counts[FIRST_OBJECT_LABEL:] >= 12).all())
 
@@ -147,7 +149,7 @@ def _sees_all(preview: Scene, c: int) -> bool:
 def _propose_layout(rng: np.random.Generator, leave: bool, hide: bool) -> _Layout:
     count = len(NAMES)
     starts = rng.uniform([-0.22, -0.26], [0.24, 0.26], (count, 2))
-    # These distances keep the can below 30 mm a frame and the ball below 15 degrees.
+    # These distances keep the can below 30 mm per frame and the ball below 15 degrees.
     distances = np.array([rng.uniform(0.22, 0.30), rng.uniform(0.20, 0.29), rng.uniform(0.14, 0.18), 0.0])
     angles = rng.uniform(0, 2 * np.pi, count)
     ends = starts + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -172,7 +174,7 @@ def _is_clear(centers: Float[np.ndarray, "frames objects 3"], leave: bool, hide:
             distance = np.linalg.norm(centers[:, i, :2] - centers[:, j, :2], axis=-1)
             above = centers[:, j, 2] > CARTON[2] + 0.14  # only the carton rises, above all others
             apart &= bool(((distance > needed) | above).all())
-    if hide:  # nothing else, the carrying hand included, comes near the garage
+    if hide:  # nothing else, including the hand with the carton, comes near the garage
         garage = np.array([_GARAGE_X, centers[0, 1, 1]])
         others = centers[:, [0, 2, 3], :2] - garage
         apart &= bool((np.abs(others) > np.array(_GARAGE[:2]) + 0.09).any(-1).all())
@@ -182,7 +184,7 @@ def _is_clear(centers: Float[np.ndarray, "frames objects 3"], leave: bool, hide:
 def _object_poses(
     moments: Float[np.ndarray, "t"], layout: _Layout, leave: bool, hide: bool
 ) -> tuple[Float[np.ndarray, "t objects 4 4"], Float[np.ndarray, "t 4 4"], Float[np.ndarray, "t"]]:
-    """Poses of the objects, of the grasp, and how far each finger is from the middle."""
+    """Poses of the objects and of the grasp, and the distance of each finger from the middle."""
     carton, grasp, opening = _carry(moments, layout)
     travel = layout.ends - layout.starts
     can_share = _can_progress(moments, layout.begins[1], leave, hide)
@@ -202,7 +204,7 @@ def _object_poses(
 
 
 def _can_progress(moments: np.ndarray, begin: float, leave: bool, hide: bool) -> np.ndarray:
-    """The share of the can's way that it has gone."""
+    """Fraction of the can's path that it has covered."""
     if leave:
         return 0.026 * np.maximum(moments - 2.0, 0.0)
     if hide:
@@ -211,11 +213,12 @@ def _can_progress(moments: np.ndarray, begin: float, leave: bool, hide: bool) ->
 
 
 def _carry(moments: np.ndarray, layout: _Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The carton, the grasp near its top, and the fingers' opening; the hand goes up when it has let go."""
+    """Poses of the carton and of the grasp near its top, and the fingers' opening; the hand rises after the
+    release."""
     start, end = layout.starts[0], layout.ends[0]
     low, high = CARTON[2], CARTON[2] + _LIFT_M
-    way = [[*start, low], [*start, high], [*end, high], [*end, low]]
-    centers = along_keyframes(moments, _CARRY, way)
+    path = [[*start, low], [*start, high], [*end, high], [*end, low]]
+    centers = along_keyframes(moments, _CARRY, path)
     yaw = (
         layout.yaws[0]
         + along_keyframes(moments, _CARRY, [[0], [0], [layout.turns[0]], [layout.turns[0]]])[:, 0]
@@ -243,7 +246,7 @@ def _eye(azimuth: float, elevation: float) -> np.ndarray:
 
 
 def _surroundings(layout: _Layout, leave: bool, hide: bool) -> list[Primitive]:
-    """Floor, table, and what hides the can; all on body 0, the world. The table's top is z = 0."""
+    """Floor, table and, if the can hides, the garage; all on body 0, the world. The table's top is z = 0."""
     floor = Texture("checker", ((0.46, 0.47, 0.49), (0.54, 0.55, 0.56)), 0.35, seed=1)
     wood = Texture("stripes", ((0.60, 0.43, 0.28), (0.72, 0.55, 0.38)), 0.035, seed=2, grain=0.18)
     length = 1.4 if leave else 0.62  # from the edge behind the robot

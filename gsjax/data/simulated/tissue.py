@@ -1,4 +1,4 @@
-"""A sheet of tissue that breathes and is pulled by a tool, before a stereo endoscope that hardly moves."""
+"""A sheet of tissue that breathes and is pulled by a tool, seen by a stereo endoscope that hardly moves."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from gsjax.data.simulated.motion import along_keyframes, rigid, turn
 from gsjax.data.simulated.primitives import Primitive
 from gsjax.data.simulated.raycaster import Light, Scene
 from gsjax.data.simulated.sheet import Sheet
-from gsjax.data.simulated.simulation import expect_counts, simulated_sequence
+from gsjax.data.simulated.simulation import check_counts, simulated_sequence
 from gsjax.data.simulated.textures import Texture
 from gsjax.geometry.cameras import intrinsics, look_at
 
@@ -20,13 +20,13 @@ BASELINE_M = 0.0045
 _TISSUE, _TOOL = range(2)  # bodies; labels are the same numbers
 
 _BREATH_FRAMES, _SWAY_FRAMES = 30.0, 40.0
-# Frames at which the tool touches, has pulled most, holds until, has let go, and is away.
+# Frames at which the tool touches, has pulled farthest, stops holding, has released, and is away.
 _TOUCH, _PULLED, _HOLD, _RELEASE, _AWAY = 3.0, 14.0, 17.0, 27.0, 33.0
 _COMES_FROM_M, _GOES_TO_M = 0.010, 0.030
 
-# Metres: what the endoscope looks at, from where, and the grid of points that are tracked.
+# Metres: the endoscope's target and position, and the grid of tracked points.
 _TARGET, _EYE = np.array([0.002, 0.0, 0.004]), np.array([-0.006, -0.022, 0.105])
-_LAMP = np.array([0.006, 0.008, 0.0])  # from the lens
+_LAMP = np.array([0.006, 0.008, 0.0])  # relative to the lens
 _SWAY = 0.003
 _TRACKED, _TRACKS_M = 0.056, 0.004
 
@@ -38,31 +38,31 @@ _PRESSED_M = 0.0012
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the seed decides."""
+    """Random parameters drawn from the seed."""
 
-    relief: Float[np.ndarray, "2 6"]  # bumps of the sheet, as `Sheet` has them
+    relief: Float[np.ndarray, "2 6"]  # bumps of the sheet, see `Sheet`
     breath: Float[np.ndarray, "6"]
     pull: Float[np.ndarray, "6"]
-    shaft: Float[np.ndarray, "3"]  # where the shaft comes from
+    shaft: Float[np.ndarray, "3"]  # direction from which the shaft comes
 
 
 def tissue(
     seed: int = 0, frames: int = 40, width: int = 320, height: int = 256, *, still: bool = False
 ) -> Sequence:
-    """Tissue that breathes and is pulled by a tool: RGB-D of two eyes, masks, flow, exact tracks; 15 Hz.
+    """Tissue that breathes and is pulled by a tool: stereo RGB-D, masks, flow, exact tracks; 15 Hz.
 
     Labels are 0 tissue and 1 tool. Camera 0 is the left eye and camera 1 the right one, 4.5 mm beside it;
-    both sway by some millimetres, 0.1 m above the tissue. A breath lifts the tissue by 3 mm, every 2 s. The
-    tool touches it in frame 3, has pulled it by 14 to 18 mm in frame 14, lets it back from frame 17 to 27 and
-    leaves. A sequence of fewer frames is the beginning of the longer one.
+    both sway by some millimetres, 0.1 m above the tissue. Breathing lifts the tissue by 3 mm every 2 s. The
+    tool touches it in frame 3, has pulled it by 14 to 18 mm in frame 14, releases it between frames 17 and 27
+    and leaves. A sequence of fewer frames is a prefix of the longer one.
 
-    The truth has the pose of the tool. `tracks` follow 841 points of the tissue, 4 mm apart at rest, whether
-    or not the tool hides them. Light falls from beside the lens. Nothing shines: what a point looks like does
-    not depend on where it is seen from.
+    The truth has the poses of the tool. `tracks` follow 841 points of the tissue, 4 mm apart at rest, whether
+    or not the tool occludes them. The lamp is beside the lens. All surfaces are Lambertian: the appearance of
+    a point does not depend on the viewpoint.
 
     Args:
-        seed: the relief, where and how far the tool pulls, where it comes from, and the patterns.
-        frames: how many.
+        seed: seed of the relief, the pull, the direction of the tool, and the patterns.
+        frames: number of frames.
         width: pixels.
         height: pixels.
         still: nothing moves.
@@ -70,7 +70,7 @@ def tissue(
     Raises:
         ValueError: a count is below 1.
     """
-    expect_counts(frames=frames, width=width, height=height)
+    check_counts(frames=frames, width=width, height=height)
     moments = np.zeros(frames) if still else np.arange(frames, dtype=np.float64)
     motion = _draw_motion(seed)
     bumps = _bumps(motion, moments)
@@ -115,7 +115,7 @@ def _draw_motion(seed: int) -> _Motion:
 
 
 def _bumps(motion: _Motion, moments: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 24"]:
-    """The sheet of each frame."""
+    """The bumps of the sheet in each frame."""
     breath = 0.5 - 0.5 * np.cos(2 * np.pi * moments / _BREATH_FRAMES)
     pulled = along_keyframes(moments, (_TOUCH, _PULLED, _HOLD, _RELEASE), [[0.0], [1.0], [1.0], [0.0]])
     bumps = np.broadcast_to(
@@ -129,7 +129,8 @@ def _bumps(motion: _Motion, moments: Float[np.ndarray, "t"]) -> Float[np.ndarray
 def _tool_poses(
     motion: _Motion, moments: Float[np.ndarray, "t"], bumps: Float[np.ndarray, "t 24"]
 ) -> Float[np.ndarray, "t 4 4"]:
-    """The tip holds the tissue where that is pulled; before and after it is away along the shaft."""
+    """Poses of the tool: the tip follows the pulled tissue; before and after that it is retracted along the
+    shaft."""
     grasped = np.array([[*motion.pull[:2], 0.0]]).T
     held = np.stack([Sheet(tuple(now)).deform(grasped)[:, 0] for now in bumps])
     away = along_keyframes(
@@ -144,7 +145,7 @@ def _tool_poses(
 
 
 def _viewmats(moments: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 2 4 4"]:
-    """Of the left and the right eye, which look the same way."""
+    """View matrices of the left and the right eye, which have the same orientation."""
     phase = 2 * np.pi * moments / _SWAY_FRAMES
     sway = np.stack([np.sin(phase), np.cos(phase) - 1, 0.5 * np.sin(2 * phase)], axis=1)
     left = np.array([look_at(_EYE + _SWAY * offset, _TARGET, np.array([0.0, 1.0, 0.0])) for offset in sway])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gsjax.data.ordered import open_in_time
+from gsjax.data.ordered import open_as_sequence
 from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation
 from gsjax.engine.deform.pictures import probabilities_of
 from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
@@ -18,7 +18,7 @@ from gsjax.engine.files import reopen
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.selected import EXTRACTED, keep_part
 from gsjax.methods.deform.query import most_likely
-from gsjax.viz.viewer import Asking, Found, Motion, Shots, Viewable
+from gsjax.viz.viewer import Answer, Asking, Motion, Shots, Viewable
 
 _AGAIN = "reconstruct it again with this version of gsjax"
 
@@ -73,21 +73,21 @@ def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None
         assert features is not None
         return features
 
-    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Found:
+    def answer(words: str, wanted: Wanted, features: Float[jax.Array, "n c"]) -> Answer:
         jax.block_until_ready(wanted.scores(features))  # what compiles is no answer's time
         begun = perf_counter()
         scores = np.asarray(wanted.scores(features))
         seconds = perf_counter() - begun
-        return Found(words, scores, *wanted.threshold(scores), seconds)
+        return Answer(words, scores, *wanted.threshold(scores), seconds)
 
     one_by_one, encoder = threading.Lock(), cache(lambda: meaning.source.encoder(weights))
 
-    def ask(text: str, frame: int) -> Found:
+    def ask(text: str, frame: int) -> Answer:
         with one_by_one:  # several pages may ask before the encoder is loaded
             wanted = wanted_text(meaning, text, encoder=encoder)
         return answer(text, wanted, features_in(frame))
 
-    def like(row: int, frame: int) -> Found:
+    def like(row: int, frame: int) -> Answer:
         features = features_in(frame)
         wanted = wanted_like(meaning, np.asarray(features[row], np.float64))
         return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
@@ -103,7 +103,7 @@ def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
     """The cameras of all frames, with what they saw if that is still there."""
     load = None
     try:
-        sequence = reopen(path / "config.yml", _AGAIN, opened=open_in_time)[0].judged
+        sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
         if found != (wanted := (len(stored.times), *stored.size)):
             raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")

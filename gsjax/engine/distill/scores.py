@@ -25,7 +25,7 @@ from gsjax.methods.distill import (
 from gsjax.methods.distill.teacher import most_rows, of_view
 from gsjax.metrics.segmentation import MaskOverlap
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.frozen import FrozenView, filled_up, paint_shown, rows_within, strip_of
+from gsjax.rasterize.frozen import FrozenView, padded_view, paint_shown, rows_within, strip_of
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.feature_grid import Located
 from gsjax.scene.gaussians import Gaussians
@@ -157,7 +157,7 @@ def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: 
         needed = (plan.capacity, rung(len(view.rows)), rung(len(view.ids)))
         before = largest.get((plan.width, plan.height), needed)
         capacity, seen, pairs = largest[plan.width, plan.height] = tuple(map(max, needed, before))
-        view = jax.tree.map(jnp.asarray, filled_up(view, seen, pairs))
+        view = jax.tree.map(jnp.asarray, padded_view(view, seen, pairs))
         yield view, replace(plan, capacity=capacity)
 
 

@@ -14,7 +14,7 @@ from gsjax.engine.distill.query import Question, select
 from gsjax.engine.distill.saved import FieldRun
 from gsjax.engine.selected import EXTRACTED, keep_part
 from gsjax.methods.distill import FeatureField, features_of, gaussian_cosines, threshold_for
-from gsjax.viz.viewer import Asking, Found
+from gsjax.viz.viewer import Answer, Asking
 
 
 def asking_of(run: FieldRun) -> Asking:
@@ -29,18 +29,18 @@ def asking_of(run: FieldRun) -> Asking:
         vector = jnp.matmul(field.lift, field.encoding[row], precision="highest")
         return gaussian_cosines(field, None, vector[None])[:, 0]
 
-    def ask(text: str, frame: int) -> Found:
+    def ask(text: str, frame: int) -> Answer:
         with one_by_one:  # several pages may ask before the encoder is loaded
             found = select(run, Question(text=text))
-        return Found(text, found.scores, found.threshold.value, found.threshold.rule, found.seconds)
+        return Answer(text, found.scores, found.threshold.value, found.threshold.rule, found.seconds)
 
-    def like(row: int, frame: int) -> Found:
+    def like(row: int, frame: int) -> Answer:
         jax.block_until_ready(likeness(jnp.asarray(row)))  # what compiles is no answer's time
         begun = perf_counter()
         scores = np.asarray(likeness(jnp.asarray(row)))
         threshold = threshold_for(scores, False)
         seconds = perf_counter() - begun
-        return Found(f"like Gaussian {row}", scores, threshold.value, threshold.rule, seconds)
+        return Answer(f"like Gaussian {row}", scores, threshold.value, threshold.rule, seconds)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
         return keep_part(run.path / EXTRACTED, name, run.gaussians, selected, run.labels)

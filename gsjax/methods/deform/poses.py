@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gsjax.geometry.cameras import perturbed
 from gsjax.methods.deform.start import Look
-from gsjax.methods.twisted import twisted
 
 
 def refined_viewmats(
@@ -34,7 +34,7 @@ def refined_viewmats(
     rows = np.asarray(twists, np.float64)[order]
     at = np.stack([np.interp(times, known[order], column) for column in rows.T], axis=1)
     dtype = jnp.result_type(float)
-    apply = jax.jit(jax.vmap(lambda viewmat, twist: twisted(viewmat, twist, radius)))
+    apply = jax.jit(jax.vmap(lambda viewmat, twist: perturbed(viewmat, twist, radius)))
     found = apply(jnp.asarray(viewmats[:, :1], dtype), jnp.asarray(at, dtype))
     first = np.asarray(found, np.float64)
     return (viewmats @ np.linalg.inv(viewmats[:, :1])) @ first

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import Camera, perturbed
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.losses.regularization import plane_variation, second_differences
 from gsjax.methods.deform.config import DeformConfig
 from gsjax.methods.deform.graph import FrameGraph, graph_loss
-from gsjax.methods.twisted import twisted
 from gsjax.optim.step import Step, gradient_step, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.deformation import DeformationField, Nodes, deform_by_nodes, deform_rows, features_at
@@ -164,7 +163,7 @@ def _seen_from(scene: DeformingScene, batch: Batch, radius: float) -> Camera:
     if scene.twists is None or batch.look is None:
         return batch.camera
     twist = jnp.where(batch.look >= 0, scene.twists[batch.look], 0.0)
-    return eqx.tree_at(lambda c: c.viewmat, batch.camera, twisted(batch.camera.viewmat, twist, radius))
+    return eqx.tree_at(lambda c: c.viewmat, batch.camera, perturbed(batch.camera.viewmat, twist, radius))
 
 
 def feature_loss(

@@ -215,7 +215,8 @@ def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
     some: each kind is a program of its own.
     """
     frame = frames[view]
-    image, mask = frame.images[0], None if _counts_all(frame) else frame.masks[0]
+    image = frame.images[0]
+    mask = None if frame.masks is None or _counts_all(frame) else frame.masks[0]
     depth = None if frame.depths is None else frame.depths[0]
     if mask is None and not all(map(_counts_all, frames)):
         mask = np.ones(image.shape[:2], bool)

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from gsjax.geometry.cameras import perturbed
 from gsjax.geometry.spherical_harmonics import num_sh_bases
 from gsjax.methods.fit.config import FitConfig
-from gsjax.methods.twisted import twisted
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.gaussians import Gaussians
 
@@ -75,7 +75,7 @@ def refined(
         view: which photograph.
         radius: of the scene: what shifts are counted in.
     """
-    return twisted(viewmats, (twists - twists.mean(0))[view], radius)
+    return perturbed(viewmats, (twists - twists.mean(0))[view], radius)
 
 
 def with_degree(model: Model, degree: int) -> Model:

@@ -15,8 +15,8 @@ from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.losses.photometric import photometric_loss, weighted_mean
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, exposed, refined
-from gsjax.optim.densification import EMPTY_LOGIT, exploration, forgotten, is_alive, relocate
-from gsjax.optim.splitting import Pull, divide, wanted, watch_pull, with_low_opacities
+from gsjax.optim.densification import EMPTY_LOGIT, exploration, is_alive, relocate, reset_rows
+from gsjax.optim.splitting import Pull, divide, reset_opacities, strongly_pulled, watch_pull
 from gsjax.optim.step import Step, all_finite, gradient_step, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -165,7 +165,7 @@ def grow(
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
     slots = jnp.clip(jnp.ceil(used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
-    state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
+    state = _map_nodes(Gaussians, lambda known: reset_rows(known, touched), state)
     seen = jnp.where(all_looked, 0.0, jnp.where(touched, 1.0, pull.seen))  # who is new cannot have been seen
     state = _map_nodes(Pull, lambda pull: Pull(pull.total, seen), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
@@ -179,7 +179,7 @@ def slots_wanted(model: Model, state: Any, config: FitConfig) -> Int[Array, ""]:
         state: of the optimizer, with what it knows of pulls.
         config: with the threshold of pulls.
     """
-    asks = wanted(model.gaussians, _pull_of(state), config.split.pull)
+    asks = strongly_pulled(model.gaussians, _pull_of(state), config.split.pull)
     return is_alive(model.gaussians).sum() + asks.sum()
 
 
@@ -216,11 +216,11 @@ def split(
         large=options.large * radius,
         too_large=jnp.where(pruning, options.too_large * radius, jnp.inf),
     )
-    moved = keep_if(jnp.asarray(reset), with_low_opacities(moved), moved)
+    moved = keep_if(jnp.asarray(reset), reset_opacities(moved), moved)
     every = jnp.full_like(touched, True)
-    state = _map_nodes(Gaussians, lambda known: forgotten(known, touched), state)
+    state = _map_nodes(Gaussians, lambda known: reset_rows(known, touched), state)
     state = _map_nodes(Gaussians, lambda known: _forget_opacities(known, every & reset), state)
-    state = _map_nodes(Pull, lambda known: forgotten(known, every), state)
+    state = _map_nodes(Pull, lambda known: reset_rows(known, every), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
 
 
@@ -242,7 +242,7 @@ def _map_nodes(kind: type, function: Callable, tree: Any) -> Any:
 
 def _forget_opacities(known: Gaussians, rows: Bool[Array, "n"]) -> Gaussians:
     return eqx.tree_at(
-        lambda g: g.logit_opacities, known, forgotten(known.logit_opacities, rows), is_leaf=_is_masked
+        lambda g: g.logit_opacities, known, reset_rows(known.logit_opacities, rows), is_leaf=_is_masked
     )
 
 

@@ -1,4 +1,4 @@
-"""Questions on the page: what a text means, as heat on the Gaussians, and what is done with those found."""
+"""Queries on the page: scores of a text or a click as heat on the Gaussians, and saving what was found."""
 
 import math
 import threading
@@ -11,31 +11,31 @@ from jaxtyping import Bool, Float, Int
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.colors import heat
-from gsjax.viz.viewer import words
+from gsjax.viz.viewer import markup
+from gsjax.viz.viewer.debounce import Debouncer
 from gsjax.viz.viewer.drawing import recolored
-from gsjax.viz.viewer.newest import Newest
-from gsjax.viz.viewer.viewable import Asking, Found, Showing, Viewable, redone
+from gsjax.viz.viewer.viewable import Answer, Asking, Showing, Viewable, redone
 
-_TYPED_S = 0.7  # without a key pressed
-_SETTLE_S, _PATIENCE_S = 0.05, 0.3  # of the threshold, while it slides
-_SHADE = 0.35  # of the brightness of what is not meant
+_TYPED_S = 0.7  # since the last key press
+_SETTLE_S, _PATIENCE_S = 0.05, 0.3  # delays while the threshold slides
+_SHADE = 0.35  # brightness of Gaussians below the threshold
 _RED, _GREEN = "#ff6b6b", "#51cf66"
 _HEAT, _ONLY, _WITHOUT, _SCENE = get_args(Showing)
 _PICK_FIRST = "pick something first: click on it in the view"
-_ASK_FIRST = "ask something first"
+_ASK_FIRST = "enter a query first"
 
 
 class AskFolder:
-    """The part of a page that asks a field, as soon as nobody types.
+    """The part of a page that queries a field, as soon as typing stops.
 
     Args:
-        gui: viser's, of one browser.
-        scene: that is asked about.
-        asking: who answers.
-        show: called with what is to be shown in place of the scene, or None: the scene itself.
-        picked: which Gaussian of what is shown was clicked on last, or None.
-        frame: that is looked at.
-        in_colour: has Gaussians shown in their colours, which heat is one of.
+        gui: viser's GUI handle of one browser.
+        scene: the scene that is queried.
+        asking: answers the queries.
+        show: called with the scene to show instead, or with None for the scene itself.
+        picked: returns the Gaussian of the displayed scene that was clicked last, or None.
+        frame: returns the current frame.
+        in_colour: switches the view to the Gaussians' own colours, which heat overrides.
     """
 
     def __init__(
@@ -50,68 +50,68 @@ class AskFolder:
     ):
         self._scene, self._asking, self._show, self._picked = scene, asking, show, picked
         self._frame, self._in_colour = frame, in_colour
-        self._lock, self._asked = threading.Lock(), 0  # questions so far
-        self._found: Found | None = None
-        self._rows: Int[np.ndarray, "shown"] | None = None  # of the scene, that are shown; None: all
+        self._lock, self._num_queries = threading.Lock(), 0  # queries so far
+        self._found: Answer | None = None
+        self._rows: Int[np.ndarray, "shown"] | None = None  # rows of the scene that are shown; None: all
         with gui.add_folder("Ask"):
             self._text = gui.add_text("What", "", hint=asking.hint)
             like = gui.add_button(
-                "Ask for what is picked", color="gray", hint="Click on it in the view first"
+                "Find similar to the pick", color="gray", hint="Click on something in the view first"
             )
-            self._told = gui.add_html(words.lines([asking.hint]))
+            self._status = gui.add_html(markup.as_lines([asking.hint]))
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5)
             self._showing = gui.add_dropdown("Shows", get_args(Showing))
             self._count = gui.add_html("")
-            keep = gui.add_button("Save it (PLY)", color="gray", hint="What was found; none is written over")
+            keep = gui.add_button("Save it (PLY)", color="gray", hint="The selection; nothing is overwritten")
             rest = gui.add_button("Save the rest (PLY)", color="gray", hint="The scene without it")
-            self._kept = gui.add_html("")
-        self._worker = Newest(self._bring, _SETTLE_S, _PATIENCE_S)
-        self._listener = Newest(self._ask, _TYPED_S, math.inf)
-        self._text.on_update(lambda _: self._listener.ask())
-        like.on_click(lambda _: self._like())
-        self._threshold.on_update(lambda _: self._worker.ask())
-        self._showing.on_update(lambda _: self._worker.ask())
-        keep.on_click(lambda _: self._keep("object"))
-        rest.on_click(lambda _: self._keep("rest"))
+            self._save_status = gui.add_html("")
+        self._display_worker = Debouncer(self._update_view, _SETTLE_S, _PATIENCE_S)
+        self._query_worker = Debouncer(self._ask, _TYPED_S, math.inf)
+        self._text.on_update(lambda _: self._query_worker.request())
+        like.on_click(lambda _: self._ask_similar())
+        self._threshold.on_update(lambda _: self._display_worker.request())
+        self._showing.on_update(lambda _: self._display_worker.request())
+        keep.on_click(lambda _: self._save_part("object"))
+        rest.on_click(lambda _: self._save_part("rest"))
 
     def close(self) -> None:
-        """Show nothing any more."""
-        self._listener.close()
-        self._worker.close()
+        """Stop the threads."""
+        self._query_worker.close()
+        self._display_worker.close()
 
     def _ask(self) -> None:
         text = self._text.value.strip()
         self._answer((lambda: self._asking.ask(text, self._frame())) if text else None, self._asking.hint)
 
-    def _like(self) -> None:
+    def _ask_similar(self) -> None:
         shown = self._picked()
         row = shown if shown is None or self._rows is None else int(self._rows[shown])
         like = None if row is None else (lambda: self._asking.like(row, self._frame()))
         self._answer(like, _PICK_FIRST)
 
-    def _answer(self, ask: Callable[[], Found] | None, otherwise: str) -> None:
-        """Ask, and show the heat of the answer, unless another question came meanwhile; runs in a thread of
-        its own or of viser's."""
+    def _answer(self, ask: Callable[[], Answer] | None, otherwise: str) -> None:
+        """Ask and show the heat of the answer, unless a newer query arrived meanwhile; runs in its own thread
+        or in one of viser's."""
         if ask is None:
-            self._told.content = words.lines([otherwise], _RED)
+            self._status.content = markup.as_lines([otherwise], _RED)
             return
         with self._lock:
-            self._asked += 1
-            number = self._asked
-            self._told.content = words.lines(["asking ..."])
+            self._num_queries += 1
+            number = self._num_queries
+            self._status.content = markup.as_lines(["asking ..."])
         try:
             found = ask()
-        except Exception as error:  # nobody else would hear of it
+        except Exception as error:  # would otherwise go unnoticed
             with self._lock:
-                if number == self._asked:
-                    self._told.content = words.lines([f"{error}"], _RED)
+                if number == self._num_queries:
+                    self._status.content = markup.as_lines([f"{error}"], _RED)
             return
         with self._lock:
-            if number == self._asked:
-                self._take(found)
+            if number == self._num_queries:
+                self._accept(found)
 
-    def _take(self, found: Found) -> None:
-        """An answer takes the place of the one before."""
+    def _accept(self, found: Answer) -> None:
+        """Replace the previous answer."""
         low, high = (
             float(np.floor(100 * found.scores.min()) / 100),
             float(np.ceil(100 * found.scores.max()) / 100),
@@ -119,26 +119,26 @@ class AskFolder:
         self._threshold.min, self._threshold.max = low, max(high, low + 0.01)
         self._found = found
         self._threshold.value = float(np.clip(found.threshold, low, max(high, low + 0.01)))
-        self._told.content = words.lines(
+        self._status.content = markup.as_lines(
             [f"{found.what}, in {1e3 * found.seconds:.0f} ms ({found.rule})"], _GREEN
         )
         if self._showing.value == _SCENE:
             self._showing.value = _HEAT
         if self._showing.value == _HEAT:
             self._in_colour()
-        self._worker.ask()
+        self._display_worker.request()
 
-    def _selected(self, found: Found) -> Bool[np.ndarray, "n"]:
+    def _selected(self, found: Answer) -> Bool[np.ndarray, "n"]:
         return found.scores > self._threshold.value
 
-    def _bring(self) -> None:
-        """Show what is wanted now."""
+    def _update_view(self) -> None:
+        """Show the answer as the controls request it."""
         found, showing = self._found, self._showing.value
         if found is None:
             return
         try:
             selected = self._selected(found)
-            self._count.content = words.lines([f"{selected.sum():,} of {len(selected):,} Gaussians"])
+            self._count.content = markup.as_lines([f"{selected.sum():,} of {len(selected):,} Gaussians"])
             if showing == _SCENE:
                 self._rows = None
                 self._show(None)
@@ -149,37 +149,37 @@ class AskFolder:
             else:
                 kept = selected if showing == _ONLY else ~selected
                 if not kept.any():
-                    self._count.content = words.lines(["nothing is left to be shown"], _RED)
+                    self._count.content = markup.as_lines(["nothing is left to show"], _RED)
                     return
                 self._rows = np.flatnonzero(kept)
                 self._show(redone(self._scene, lambda gaussians: gaussians, kept))
-        except Exception as error:  # in a thread of its own nobody else would hear of it
-            self._count.content = words.lines([f"{error}"], _RED)
+        except Exception as error:  # runs in its own thread, where an exception would go unnoticed
+            self._count.content = markup.as_lines([f"{error}"], _RED)
 
-    def _keep(self, which: str) -> None:
-        """Save a part of the scene; runs in a thread of viser's."""
+    def _save_part(self, which: str) -> None:
+        """Save a part of the scene; runs in one of viser's threads."""
         if self._found is None:
-            self._kept.content = words.lines([_ASK_FIRST], _RED)
+            self._save_status.content = markup.as_lines([_ASK_FIRST], _RED)
             return
         try:
             selected = self._selected(self._found)
             selected = selected if which == "object" else ~selected
             if not selected.any():
-                raise ValueError("nothing is left to be saved")
+                raise ValueError("nothing is left to save")
             path = self._asking.save(selected, f"{self._found.what} {which}", self._frame())
-            self._kept.content = words.lines([f"kept as {path}"], _GREEN)
-        except Exception as error:  # nobody else would hear of it
-            self._kept.content = words.lines([f"{error}"], _RED)
+            self._save_status.content = markup.as_lines([f"saved as {path}"], _GREEN)
+        except Exception as error:  # would otherwise go unnoticed
+            self._save_status.content = markup.as_lines([f"{error}"], _RED)
 
 
-def heat_of(gaussians: Gaussians, found: Found, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-    """A colour for each Gaussian by its score, RGB 0 to 1: bright above the threshold; below it dark, over a
-    grey shade of what is there.
+def heat_of(gaussians: Gaussians, found: Answer, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+    """A colour for each Gaussian by its score, RGB 0 to 1: bright above the threshold; below it dark, over
+    dimmed grey scene colours.
 
     Args:
         gaussians: the scene.
-        found: their scores.
-        selected: which are above the threshold.
+        found: the answer, with the scores.
+        selected: which Gaussians are above the threshold.
     """
     low, high = float(found.scores.min()), float(found.scores.max())
     shares = (found.scores - low) / max(high - low, 1e-9)

@@ -1,4 +1,4 @@
-"""Cameras of a browser and of photographs: how the one becomes the other, and which way is up."""
+"""Cameras of a browser and of photographs: conversions between them, and the up direction."""
 
 from typing import NamedTuple
 
@@ -13,20 +13,20 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.viz.viewer.pick import pick
 from gsjax.viz.viewer.viewable import Shots, Viewable
 
-_STEP = 8  # heights of pictures are multiples of it, so that windows of about one shape compile one program
-_ALIKE = 0.02  # cameras whose right-hand axes vary less than this about one do not say what is up
-_SNAP = np.cos(np.radians(12.0))  # an axis of the world that is nearer than that to "up" is meant
+_STEP = 8  # picture heights are multiples of this, so that similar window shapes share one program
+_ALIKE = 0.02  # cameras whose right-hand axes vary less than this do not determine the up direction
+_SNAP = np.cos(np.radians(12.0))  # "up" snaps to a world axis that is nearer than this
 _FAR = 1e3
-_SPACING, _FRUSTUM = 0.2, (0.02, 0.1)  # of the distance to the next camera; of the scene's radius
+_SPACING, _FRUSTUM = 0.2, (0.02, 0.1)  # shares of the distance to the nearest camera, of the scene's radius
 
 
 class Pose(NamedTuple):
-    """Where a browser's camera is.
+    """Pose and field of view of a browser's camera.
 
     Attributes:
-        position: in the world.
-        target: what it looks at, and turns about.
-        up: which way is up in its picture.
+        position: position in the world.
+        target: point that it looks at and orbits.
+        up: up direction of its picture.
         fov: vertical field of view, radians.
     """
 
@@ -39,13 +39,13 @@ class Pose(NamedTuple):
 def browser_camera(
     wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"], fov: float, width: int, height: int
 ) -> Camera:
-    """One camera [1] for our rasterizer, from a browser's.
+    """A browser's camera as one camera [1] for our rasterizer.
 
     Args:
         wxyz: orientation, camera to world in OpenCV axes.
-        position: in the world.
+        position: position in the world.
         fov: vertical field of view, radians.
-        width, height: of the picture, pixels.
+        width, height: size of the picture, pixels.
     """
     rotation = Rotation.from_quat(np.asarray(wxyz, float), scalar_first=True).as_matrix().T
     viewmat = np.eye(4)
@@ -55,7 +55,7 @@ def browser_camera(
 
 
 def picture_size(width: int, window: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of a picture in about the proportions of a window (width, height)."""
+    """Width and height of a picture with about the aspect ratio of a window (width, height)."""
     wide, high = window
     height = width if min(window) < 1 else width * high / wide
     return width, int(np.clip(round(height / _STEP), 1, 3 * width // _STEP)) * _STEP
@@ -67,13 +67,13 @@ def vertical_fov(K: Float[np.ndarray, "3 3"], height: int) -> float:
 
 
 def pose_of(shots: Shots, frame: int, shot: int, distance: float) -> Pose:
-    """The camera of a photograph, looking at what is so far away.
+    """The camera of a photograph, with its target at a given distance.
 
     Args:
         shots: all photographs.
-        frame: when.
-        shot: which of that frame.
-        distance: to what it looks at, in the scene's unit.
+        frame: frame of the scene.
+        shot: index of the photograph in that frame.
+        distance: distance to the target, in the scene's unit.
     """
     row = shots.at(frame)
     to_world = np.linalg.inv(shots.viewmats[row, shot])
@@ -83,16 +83,16 @@ def pose_of(shots: Shots, frame: int, shot: int, distance: float) -> Pose:
 
 
 def up_direction(viewmats: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "3"]:
-    """Which way is up for those who held the cameras: at right angles to what was to their right.
+    """The up direction of whoever held the cameras: perpendicular to the cameras' right-hand axes.
 
-    Where all looked the same way, up is the mean of what was up in the pictures. An axis of the world that is
-    about the same is taken instead.
+    If all cameras face the same way, it is the mean of their own up directions. It snaps to a nearby world
+    axis.
     """
     rights, ups = viewmats[:, 0, :3], -viewmats[:, 1, :3]
     mean = ups.mean(0)
     values, axes = np.linalg.eigh(rights.T @ rights / len(rights))
     up = axes[:, 0] * np.sign(axes[:, 0] @ mean) if values[1] > _ALIKE else mean
-    if np.linalg.norm(up) < 1e-6:  # level neither way: the cameras contradict each other
+    if np.linalg.norm(up) < 1e-6:  # the cameras contradict each other
         return np.array([0.0, 0.0, 1.0])
     up = up / np.linalg.norm(up)
     nearest = np.abs(up).argmax()
@@ -100,7 +100,7 @@ def up_direction(viewmats: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "3"]
 
 
 def scene_up(scene: Viewable) -> Float[np.ndarray, "3"]:
-    """Which way is up: as the scene says, as its photographs were held, else +z."""
+    """The up direction: the scene's own, else that of its photographs, else +z."""
     if scene.up is not None:
         up = np.asarray(scene.up, float)
         return up / np.linalg.norm(up)
@@ -110,7 +110,7 @@ def scene_up(scene: Viewable) -> Float[np.ndarray, "3"]:
 
 
 def extent(gaussians: Gaussians) -> tuple[Float[np.ndarray, "3"], float]:
-    """Middle and radius of where most of what is opaque lies; a few that flew off do not count."""
+    """Centre and radius of the bulk of the opaque Gaussians, robust to a few outliers."""
     means = np.asarray(gaussians.means, np.float64)
     solid = means[np.asarray(gaussians.logit_opacities) > 0]
     means = solid if len(solid) > 10 else means
@@ -120,7 +120,7 @@ def extent(gaussians: Gaussians) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def distance_along(gaussians: Gaussians, viewmat: Float[np.ndarray, "4 4"]) -> float:
-    """How far away is what a camera sees in the middle of its picture; else the middle of the scene."""
+    """Distance to what a camera sees in the middle of its picture, else to the centre of the scene."""
     to_world = np.linalg.inv(viewmat)
     seen = pick(gaussians, to_world[:3, 3], to_world[:3, 2])
     if seen is not None:
@@ -130,7 +130,7 @@ def distance_along(gaussians: Gaussians, viewmat: Float[np.ndarray, "4 4"]) -> f
 
 
 def frustum_size(scene: Viewable) -> float:
-    """How large to draw where photographs were taken: so that neighbours leave each other room."""
+    """Size at which to draw the frusta of photographs so that neighbours do not overlap."""
     _, radius = extent(scene.gaussians)
     if scene.shots is None or len(scene.shots.names) < 2:
         return _FRUSTUM[1] * radius
@@ -141,7 +141,7 @@ def frustum_size(scene: Viewable) -> float:
 
 
 def first_pose(scene: Viewable) -> Pose:
-    """Where to look from at first: where the first photograph was taken, else from the side and above."""
+    """The initial camera: that of the first photograph, else from the side and above."""
     up = scene_up(scene)
     gaussians = scene.at(0)
     if scene.shots is not None and len(scene.shots.names):
@@ -156,6 +156,6 @@ def first_pose(scene: Viewable) -> Pose:
 
 
 def far_plane(gaussians: Gaussians, pose: Pose) -> float:
-    """What a browser should draw as far as."""
+    """Far clipping distance for the browser."""
     middle, radius = extent(gaussians)
     return max(_FAR, 20 * (radius + float(np.linalg.norm(pose.position - middle))))

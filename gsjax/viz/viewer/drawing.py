@@ -1,4 +1,4 @@
-"""Our rasterizer's picture of a scene from any camera: compiled once a size, however the camera moves."""
+"""Our rasterizer's picture of a scene from any camera: compiled once per size, however the camera moves."""
 
 import threading
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from gsjax.viz.colors import colorize_depth, to_uint8
 
 Shown = Literal["colour", "depth", "alpha", "label", "features"]
 
-_ROOM = 1.25  # times as many Gaussians as the first scene that has more than those before it
-_INVISIBLE = -40.0  # a logit
-_HEADROOM = 1.5  # what a plan holds more than its first camera needs: the next ones need about as much
+_ROOM = 1.25  # slots per Gaussian of a scene that outgrows the previous ones
+_INVISIBLE = -40.0  # an opacity logit
+_HEADROOM = 1.5  # of a plan over what its first camera needs: later cameras need about as much
 _OPAQUE = 0.5  # pixels with less alpha have no depth
 
 
@@ -29,8 +29,8 @@ class Drawn(NamedTuple):
 
     Attributes:
         colors: RGB over the background, 0 to 1.
-        depths: expected depth, 0 where less than half of a pixel is covered.
-        alphas: 0 to 1.
+        depths: expected depth; 0 where alpha is below one half.
+        alphas: opacity of each pixel, 0 to 1.
     """
 
     colors: Float[np.ndarray, "height width 3"]
@@ -39,13 +39,13 @@ class Drawn(NamedTuple):
 
 
 class Drawer:
-    """Draws scenes of one kind; any thread may call it. One that has fewer Gaussians than one before it is
-    filled up with what cannot be seen, for a number of Gaussians costs seconds to compile.
+    """Draws scenes of one kind; thread-safe. A scene with fewer Gaussians than an earlier one is padded with
+    invisible ones, because each new number of Gaussians takes seconds to compile.
 
     Args:
         background: RGB, 0 to 1.
-        antialiased: whether opacities are scaled by what the dilation spread out.
-        compiler_options: of the program that draws.
+        antialiased: whether to compensate opacities for the dilation of small splats.
+        compiler_options: XLA options of the program that draws.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Drawer:
         self._program: Callable = jax.jit(_draw, compiler_options=compiler_options or {})
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Drawn:
-        """The picture of one camera [1]. A plan that is too small grows, and is kept.
+        """The picture of one camera [1]. A plan that is too small grows, and the larger one is kept.
 
         Raises:
             ValueError: no plan can hold what the camera sees.
@@ -69,9 +69,9 @@ class Drawer:
         kind, count = (camera.width, camera.height, gaussians.sh_degree), gaussians.num
         with self._lock:
             plans = self._plans.setdefault(kind, {})
-            anew = int(_ROOM * count) if plans else count
-            room = min((known for known in plans if known >= count), default=anew)
-            gaussians, plan = _filled_up(gaussians, room), plans.get(room)
+            grown = int(_ROOM * count) if plans else count
+            slots = min((known for known in plans if known >= count), default=grown)
+            gaussians, plan = _padded(gaussians, slots), plans.get(slots)
             if plan is None:
                 options = {"headroom": _HEADROOM, "rasterize_mode": self._mode}
                 plan = plan_render(gaussians, camera, **options)
@@ -80,16 +80,16 @@ class Drawer:
                     self._program(gaussians, camera, self._background, plan)
                 )
                 if not overflow:
-                    plans[room] = plan
+                    plans[slots] = plan
                     return Drawn(*images)
                 plan = plan.grown(int(needed), _HEADROOM)
 
 
-def _filled_up(gaussians: Gaussians, room: int) -> Gaussians:
-    """So many Gaussians, the last of which cannot be seen. On the host, where nothing is compiled for it."""
-    if room == gaussians.num:
+def _padded(gaussians: Gaussians, slots: int) -> Gaussians:
+    """The Gaussians padded to `slots` with invisible ones. On the host, so that nothing is compiled."""
+    if slots == gaussians.num:
         return gaussians
-    rows = np.minimum(np.arange(room), gaussians.num - 1)
+    rows = np.minimum(np.arange(slots), gaussians.num - 1)
     more = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
     more.logit_opacities[gaussians.num :] = _INVISIBLE
     return jax.tree.map(jnp.asarray, more)
@@ -103,7 +103,7 @@ def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any
 
 
 def recolored(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
-    """The same Gaussians in other colours (RGB, 0 to 1), the same from all sides."""
+    """The same Gaussians in other, view-independent colours (RGB, 0 to 1)."""
     sh0 = rgb_to_sh0(jnp.asarray(colors, gaussians.sh0.dtype))[:, None, :]
     return eqx.tree_at(lambda g: (g.sh0, g.shN), gaussians, (sh0, None), is_leaf=lambda leaf: leaf is None)
 
@@ -111,7 +111,7 @@ def recolored(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussia
 def picture_of(
     drawn: Drawn, shown: Shown, depths: tuple[float, float] | None
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """What a panel shows of it; depth between the ends of a scale, or between the picture's own."""
+    """The requested channel as a picture; depth is scaled to `depths`, or to its own range if None."""
     if shown == "depth":
         return colorize_depth(drawn.depths, *(depths or (None, None)))
     if shown == "alpha":

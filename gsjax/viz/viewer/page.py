@@ -1,4 +1,4 @@
-"""The page of one browser: what stands on it, and what happens when it is touched."""
+"""The page of one browser: its controls, and what happens when they are used."""
 
 import threading
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from gsjax.viz.viewer import words
+from gsjax.viz.viewer import markup
 from gsjax.viz.viewer.ask_folder import AskFolder
 from gsjax.viz.viewer.cameras import (
     Pose,
@@ -21,39 +21,39 @@ from gsjax.viz.viewer.cameras import (
     picture_size,
     pose_of,
 )
+from gsjax.viz.viewer.debounce import Debouncer
 from gsjax.viz.viewer.drawing import Drawer, Shown, picture_of, recolored
 from gsjax.viz.viewer.edit_folder import EditFolder
-from gsjax.viz.viewer.newest import Newest
 from gsjax.viz.viewer.pick import Picked, pick
 from gsjax.viz.viewer.player import Player, frame_pause
 from gsjax.viz.viewer.shot_nodes import ShotNodes, shrunk
-from gsjax.viz.viewer.splat_nodes import Look, Present, SplatNodes
+from gsjax.viz.viewer.splat_nodes import Appearance, Displayed, SplatNodes
 from gsjax.viz.viewer.splats import Palette, depth_range
 from gsjax.viz.viewer.viewable import Shots, Viewable
 
 Save = Callable[[str, np.ndarray], Path]
-"""Keeps a picture [H,W,3] under a name of its kind; returns where."""
+"""Saves a picture [H,W,3] under a name made from its kind; returns the path."""
 
 WIDTHS = ("160", "240", "320", "480", "640", "960", "1280")
 _WIDTH = "320"
-_PHOTOGRAPH = 640  # pixels, the longer side of one that is shown beside the render
-_SETTLE_S, _PATIENCE_S = 0.12, 0.6  # of the render, while the camera moves
+_PHOTOGRAPH = 640  # longer side in pixels of a photograph shown beside the render
+_SETTLE_S, _PATIENCE_S = 0.12, 0.6  # delays of the render while the camera moves
 _TIMEOUT_S = 30.0  # for the browser's own picture
-_NUMBERED = "A PNG with the next number; none is written over"
+_NUMBERED = "A PNG with the next free number; nothing is overwritten"
 _MARK = (255, 70, 160)
 
 
 @dataclass(frozen=True)
 class Shared:
-    """What all pages of a viewer have in common.
+    """State shared by all pages of a viewer.
 
     Attributes:
-        scene: what is shown.
-        drawer: our rasterizer, with what it has compiled.
-        max_gaussians: that a browser gets.
-        save: keeps screenshots; None offers them for download only.
-        closing: set when nobody can look any more, and films that are being kept are to end.
-        filming: held while one is: one at a time, whoever looks.
+        scene: the scene that is shown.
+        drawer: our rasterizer, with its compiled programs.
+        max_gaussians: the most Gaussians sent to a browser.
+        save: saves screenshots; with None they are only offered for download.
+        closing: set when the viewer closes, which ends any film that is being saved.
+        filming: held while a film is being saved: one at a time across all browsers.
     """
 
     scene: Viewable
@@ -65,17 +65,17 @@ class Shared:
 
 
 class Page:
-    """One browser. Callbacks note what is wanted; two threads bring splats and render up to it.
+    """One browser. Callbacks record what is requested; two threads update the splats and the render.
 
     Args:
-        client: viser's handle of the browser, connected.
-        shared: what it shows.
+        client: viser's handle of the connected browser.
+        shared: state shared by all pages.
     """
 
     def __init__(self, client: Any, shared: Shared):
         self._client, self._shared, scene = client, shared, shared.scene
         self._frame, self._picture = 0, None
-        self._now = Present(scene, Palette(scene), 0, scene.at(0))
+        self._now = Displayed(scene, Palette(scene), 0, scene.at(0))
         self._picked: Picked | None = None
         self._shot: int | None = None
         self._photographed: tuple[Shots, int, int] | None = None
@@ -83,20 +83,20 @@ class Page:
         self._player = Player(self._step, lambda: frame_pause(self._now.scene.times), self._label_play)
         self._lock = threading.Lock()
         self._splats = SplatNodes(client.scene, scene, shared.max_gaussians)
-        # What stands on the page can be touched before all of it is there.
-        self._sender = Newest(self._send_splats, 0.0, 0.0, hold=True)
-        self._renderer = Newest(self._render, _SETTLE_S, _PATIENCE_S, hold=True)
+        # The controls can be used before the whole page is built.
+        self._sender = Debouncer(self._send_splats, 0.0, 0.0, hold=True)
+        self._renderer = Debouncer(self._render, _SETTLE_S, _PATIENCE_S, hold=True)
         self._shots = None if scene.shots is None else self._frusta(scene.shots)
         self._build()
         self._send_splats()
-        self._sender.begin()
-        self._renderer.begin()
+        self._sender.start()
+        self._renderer.start()
         client.camera.on_update(lambda _: self._moved())
         client.scene.on_click()(self._clicked)
-        self._renderer.ask()
+        self._renderer.request()
 
     def close(self) -> None:
-        """Stop what runs for this page."""
+        """Stop the threads of this page."""
         self._player.close()
         self._sender.close()
         self._renderer.close()
@@ -107,16 +107,16 @@ class Page:
         if self._shots is not None:
             self._shots.close()
 
-    # What stands on the page.
+    # The controls on the page.
 
     def _build(self) -> None:
         gui, scene = self._client.gui, self._shared.scene
-        gui.add_markdown(words.heading(scene, min(scene.gaussians.num, self._shared.max_gaussians)))
+        gui.add_markdown(markup.heading(scene, min(scene.gaussians.num, self._shared.max_gaussians)))
         if scene.num_frames > 1:
             with gui.add_folder("Time"):
                 last = scene.num_frames - 1
                 self._slider = gui.add_slider("Frame", min=0, max=last, step=1, initial_value=0)
-                self._moment = gui.add_markdown(words.moment(scene, 0))
+                self._moment = gui.add_markdown(markup.frame_label(scene, 0))
                 self._play = gui.add_button("Play", color="gray")
                 self._slider.on_update(lambda _: self._to_frame(int(self._slider.value)))
                 self._play.on_click(lambda _: self._player.toggle())
@@ -131,29 +131,29 @@ class Page:
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)
-            back = gui.add_button("Back to the start", color="gray", hint="The camera as it was at first")
+            back = gui.add_button("Reset the camera", color="gray", hint="Back to the initial view")
             self._coloring.on_update(lambda _: self._moved())
             back.on_click(lambda _: self._go(self._start))
         if self._shots is not None:
             self._build_shots(self._shots)
         with gui.add_folder("Picked"):
-            self._told = gui.add_markdown(words.HOW_TO_PICK)
+            self._picked_info = gui.add_markdown(markup.HOW_TO_PICK)
         with gui.add_folder("Screenshot"):
             ours = gui.add_button("Save the render", color="gray", hint=_NUMBERED)
             theirs = gui.add_button("Save the view", color="gray", hint="As the browser draws it")
-            ours.on_click(lambda _: self._keep("render", self._picture))
-            theirs.on_click(lambda _: self._keep("view", self._browser_picture()))
+            ours.on_click(lambda _: self._save_screenshot("render", self._picture))
+            theirs.on_click(lambda _: self._save_screenshot("view", self._browser_picture()))
         panel = gui.add_panel()
         with panel.add_tab("Render by gsjax"):
             self._image = gui.add_image(np.full((208, 320, 3), 40, np.uint8), format="png")
-            self._status = gui.add_markdown("compiling ...")
+            self._status = gui.add_markdown("Compiling ...")
             extra = tuple(name for name in scene.colorings if name in ("label", "features"))
             shows: tuple[Shown, ...] = ("colour", "depth", "alpha", *extra)
             self._shown = gui.add_dropdown("Shows", shows)
             self._width = gui.add_dropdown("Width", WIDTHS, initial_value=_WIDTH, hint="In pixels")
             self._photograph = gui.add_image(np.zeros((1, 1, 3), np.uint8), visible=False)
-            self._shown.on_update(lambda _: self._renderer.ask())
-            self._width.on_update(lambda _: self._renderer.ask())
+            self._shown.on_update(lambda _: self._renderer.request())
+            self._width.on_update(lambda _: self._renderer.request())
         panel.dock_left()
         panel.set_width(350)
 
@@ -169,27 +169,27 @@ class Page:
         self._names = unique(shots.names)
 
         def go(shot: int) -> None:
-            self._visited.value = self._names[shot]  # which goes there
+            self._visited.value = self._names[shot]  # its callback moves the camera
 
         return ShotNodes(self._client.scene, shots, frustum_size(self._shared.scene), go)
 
-    # What happens when it is touched.
+    # Callbacks of the controls.
 
     def _moved(self) -> None:
-        """The camera, or what is wanted of it, changed."""
-        self._renderer.ask()
-        self._sender.ask()
+        """The camera or the settings of the view changed."""
+        self._renderer.request()
+        self._sender.request()
 
     def _show(self, scene: Viewable | None) -> None:
-        """Show something else in the scene's place, a film or a part of it; or None: the scene again."""
+        """Show another scene, such as a film or a part of the scene; None restores the original scene."""
         scene = self._shared.scene if scene is None else scene
-        first, last = scene.at(0), scene.num_frames - 1  # what has to be compiled is, before it is shown
+        first, last = scene.at(0), scene.num_frames - 1  # compiles what is needed before anything is shown
         with self._lock:
             self._frame = min(self._frame, last)
-            self._now = Present(scene, Palette(scene), 0, first)
+            self._now = Displayed(scene, Palette(scene), 0, first)
         if self._shared.scene.num_frames > 1:
             self._slider.value = min(int(self._slider.value), last)
-            self._slider.max = max(last, 1)  # sliders have some length
+            self._slider.max = max(last, 1)  # a slider cannot have length zero
             self._to_frame(self._frame)
         else:
             self._unpick()
@@ -199,17 +199,17 @@ class Page:
         with self._lock:
             scene = self._now.scene
             self._frame = frame = min(frame, scene.num_frames - 1)
-        self._moment.content = words.moment(scene, frame)
+        self._moment.content = markup.frame_label(scene, frame)
         if self._shots is not None and scene.shots is not None:
             self._shots.move(scene.shots, frame)
         self._unpick()
         self._moved()
 
     def _unpick(self) -> None:
-        """What was picked may have moved away from under the mark, or be gone."""
+        """Clear the pick: the Gaussian may have moved away from its mark, or no longer exist."""
         if self._picked is not None:
             self._mark(None)
-            self._told.content = words.HOW_TO_PICK
+            self._picked_info.content = markup.HOW_TO_PICK
 
     def _picked_row(self) -> int | None:
         return None if self._picked is None else self._picked.index
@@ -218,23 +218,23 @@ class Page:
         self._coloring.value = "colour"
 
     def _step(self) -> None:
-        """To the next frame; after the last, to the first."""
+        """Go to the next frame, or from the last to the first."""
         self._slider.value = (int(self._slider.value) + 1) % self._now.scene.num_frames
 
     def _label_play(self, plays: bool) -> None:
         self._play.label = "Stop" if plays else "Play"
 
     def _visit_named(self, name: str) -> None:
-        now = self._present()
+        now = self._current()
         if now.scene.shots is not None and name in self._names:
             self._visit(now, now.scene.shots, self._names.index(name))
 
-    def _visit(self, now: Present, shots: Shots, shot: int) -> None:
-        """Look from where a photograph was taken; what draws shows it beside."""
+    def _visit(self, now: Displayed, shots: Shots, shot: int) -> None:
+        """Move the camera to where a photograph was taken; `_render` then shows the photograph beside."""
         self._shot = shot
         distance = distance_along(now.gaussians, shots.viewmats[shots.at(now.frame), shot])
         self._go(pose_of(shots, now.frame, shot, distance))
-        self._renderer.ask()
+        self._renderer.request()
 
     def _go(self, pose: Pose) -> None:
         camera = self._client.camera
@@ -245,19 +245,19 @@ class Page:
             camera.fov = pose.fov
 
     def _clicked(self, event: Any) -> None:
-        now = self._present()
+        now = self._current()
         picked = pick(now.gaussians, np.array(event.ray_origin), np.array(event.ray_direction))
         self._mark(picked)
-        self._told.content = words.described(now.scene, picked, now.frame)
+        self._picked_info.content = markup.describe_pick(now.scene, picked, now.frame)
 
     def _mark(self, picked: Picked | None) -> None:
-        """Show the shape of a picked Gaussian, or of none."""
+        """Show the shape of the picked Gaussian; None removes the mark."""
         for part in ("shape", "name"):
             self._client.scene.remove_by_name(f"/picked/{part}")
         self._picked = picked
         if picked is None:
             return
-        (scene, _, _, gaussians), row = self._present(), picked.index
+        (scene, _, _, gaussians), row = self._current(), picked.index
         center = np.asarray(gaussians.means, np.float64)[row]
         quat = np.asarray(gaussians.quats, np.float64)[row]
         self._client.scene.add_icosphere(
@@ -273,18 +273,18 @@ class Page:
         text = f"{row}" if name is None else f"{name}, {row}"
         self._client.scene.add_label("/picked/name", text, position=center, anchor="bottom-left")
 
-    # What two threads do.
+    # Work of the two threads.
 
-    def _present(self) -> Present:
-        """What is to be shown now."""
+    def _current(self) -> Displayed:
+        """What should be displayed now."""
         with self._lock:
             if self._now.frame != self._frame:
                 gaussians = self._now.scene.at(self._frame)
                 self._now = self._now._replace(frame=self._frame, gaussians=gaussians)
             return self._now
 
-    def _view(self, now: Present, width: int) -> tuple[Any, tuple[float, float] | None]:
-        """The browser's camera in a picture so wide, and the scale of depth in it."""
+    def _view(self, now: Displayed, width: int) -> tuple[Any, tuple[float, float] | None]:
+        """The browser's camera for a picture of this width, and the range of depths it sees."""
         camera = self._client.camera
         width, height = picture_size(width, (camera.image_width, camera.image_height))
         seen = browser_camera(camera.wxyz, camera.position, camera.fov, width, height)
@@ -294,23 +294,23 @@ class Page:
     def _send_splats(self) -> None:
         try:
             self._recolor()
-        except Exception as error:  # in a thread of its own nobody else would hear of it
-            self._say("The splats cannot be shown", str(error), color="red")
+        except Exception as error:  # runs in its own thread, where an exception would go unnoticed
+            self._notify("The splats cannot be shown", str(error), color="red")
 
     def _recolor(self) -> None:
-        now, coloring = self._present(), self._coloring.value
-        look = Look(coloring)
+        now, coloring = self._current(), self._coloring.value
+        look = Appearance(coloring)
         if coloring == "depth":
             seen, depths = self._view(now, int(_WIDTH))
-            look = Look(coloring, np.asarray(seen.viewmat[0], np.float64), depths)
+            look = Appearance(coloring, np.asarray(seen.viewmat[0], np.float64), depths)
         self._splats.show(now, look)
         labels = [] if now.scene.labels is None else np.unique(now.scene.labels).tolist()
-        self._legend.content = words.legend(now.scene, coloring, look.depths, labels)
+        self._legend.content = markup.legend(now.scene, coloring, look.depths, labels)
         self._legend.visible = bool(self._legend.content)
 
     def _render(self) -> None:
         try:
-            now, shown = self._present(), self._shown.value
+            now, shown = self._current(), self._shown.value
             camera, depths = self._view(now, int(self._width.value))
             gaussians = now.gaussians
             if shown in ("label", "features"):
@@ -320,18 +320,18 @@ class Page:
             drawn = self._shared.drawer(gaussians, camera)
             picture = picture_of(drawn, shown, depths)
             self._image.image = picture
-            told = f"{camera.width} x {camera.height} pixels, all {gaussians.num:,} Gaussians"
+            info = f"{camera.width} x {camera.height} pixels, all {gaussians.num:,} Gaussians"
             if shown == "depth" and depths is not None:
-                near, far = (words.length(value, now.scene.unit) for value in depths)
-                told += f"; bright: {near} away, dark: {far}"
-            self._status.content = told
-            self._picture = picture  # once all is said of it
+                near, far = (markup.format_length(value, now.scene.unit) for value in depths)
+                info += f"; bright: {near} away, dark: {far}"
+            self._status.content = info
+            self._picture = picture  # only after its status is set
             self._show_photograph(now)
-        except Exception as error:  # in a thread of its own nobody else would hear of it
+        except Exception as error:  # runs in its own thread, where an exception would go unnoticed
             self._status.content = f"This cannot be drawn: {error}"
 
-    def _show_photograph(self, now: Present) -> None:
-        """The photograph that was last gone to, of the present frame."""
+    def _show_photograph(self, now: Displayed) -> None:
+        """Show the photograph that was visited last, in the current frame."""
         shots, shot = now.scene.shots, self._shot
         if shots is None or shots.load_image is None or shot is None:
             return
@@ -343,9 +343,9 @@ class Page:
             picture = shots.load_image(row, shot)
         except (ValueError, OSError) as error:
             self._photograph.visible = False
-            self._say("The photograph cannot be shown", str(error), color="red")
+            self._notify("The photograph cannot be shown", str(error), color="red")
             return
-        when = f", {words.moment(now.scene, row)}" if len(shots.viewmats) > 1 else ""
+        when = f", {markup.frame_label(now.scene, row)}" if len(shots.viewmats) > 1 else ""
         self._photograph.label = f"photograph {self._names[shot]}{when}"
         self._photograph.image = shrunk(picture, _PHOTOGRAPH)
         self._photograph.visible = True
@@ -362,28 +362,28 @@ class Page:
             return None
         return over(picture, self._shared.scene.background)
 
-    def _keep(self, kind: str, picture: np.ndarray | None) -> None:
+    def _save_screenshot(self, kind: str, picture: np.ndarray | None) -> None:
         if picture is None:
-            self._say("There is no picture yet", "Wait until it is drawn.", color="red")
+            self._notify("There is no picture yet", "Wait until it is drawn.", color="red")
             return
         name = f"{kind}.png"
         if self._shared.save is not None:
             try:
                 path = self._shared.save(kind, picture)
             except OSError as error:
-                self._say("The screenshot could not be kept", str(error), color="red")
+                self._notify("The screenshot could not be saved", str(error), color="red")
             else:
                 name = path.name
-                self._say("Screenshot kept", str(path))
+                self._notify("Screenshot saved", str(path))
         encoded, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
         self._client.send_file_download(name, data.tobytes() if encoded else b"")
 
-    def _say(self, title: str, body: str, color: str | None = None) -> None:
+    def _notify(self, title: str, body: str, color: str | None = None) -> None:
         self._client.add_notification(title, body, color=color, auto_close_seconds=8.0)
 
 
 def unique(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The same names, numbered where two are alike."""
+    """The same names, numbered if any two are equal."""
     if len(set(names)) == len(names):
         return names
     return tuple(f"{number}: {name}" for number, name in enumerate(names))
@@ -392,7 +392,7 @@ def unique(names: tuple[str, ...]) -> tuple[str, ...]:
 def over(
     picture: UInt8[np.ndarray, "h w channels"], background: tuple[float, float, float]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture that may be transparent over a background (RGB, 0 to 1)."""
+    """A possibly transparent picture over a background (RGB, 0 to 1)."""
     if picture.shape[2] == 3:
         return picture
     alpha = picture[..., 3:] / 255.0

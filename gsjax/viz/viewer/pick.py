@@ -1,4 +1,4 @@
-"""Which Gaussian a ray meets."""
+"""The Gaussian that a ray hits."""
 
 from typing import NamedTuple
 
@@ -13,14 +13,14 @@ _FAINTEST, _FULL = 1 / 255, 0.99  # the rasterizer's alpha_min and alpha_max
 
 
 class Picked(NamedTuple):
-    """What a ray meets.
+    """The Gaussian that a ray hits.
 
     Attributes:
-        index: row of the Gaussian that gives most of the colour.
-        depth: how far along the ray it is densest.
-        point: where that is.
-        share: of the colour, 0 to 1.
-        alpha: how much of the ray all Gaussians together stop, 0 to 1.
+        index: row of the Gaussian that contributes most of the colour.
+        depth: distance along the ray to its point of highest density.
+        point: that point.
+        share: its weight in the colour, 0 to 1.
+        alpha: opacity of all Gaussians together along the ray, 0 to 1.
     """
 
     index: int
@@ -38,18 +38,18 @@ def pick(
     least: float = 0.5,
     near: float = 0.01,
 ) -> Picked | None:
-    """The Gaussian that gives most of the colour along a ray; None where the ray goes through.
+    """The Gaussian that contributes most of the colour along a ray; None if the ray passes through.
 
-    Along a ray o + t d a Gaussian is densest at its least Mahalanobis distance q, where
-    alpha = opacity exp(-q^2 / 2). Composited in the order of these t, its share is alpha times what those
-    before it let through, as in a picture.
+    Along a ray o + t d a Gaussian is densest at its smallest Mahalanobis distance q, where
+    alpha = opacity exp(-q^2 / 2). Gaussians are composited in the order of these t, as in a picture: the
+    share of one is its alpha times the transmittance of those before it.
 
     Args:
-        gaussians: N of them.
-        origin: where the ray begins, in the world.
-        direction: of any length but 0.
-        least: a ray of which less is stopped meets nothing.
-        near: Gaussians nearer than this are not met.
+        gaussians: N Gaussians.
+        origin: origin of the ray, in the world.
+        direction: direction of the ray, of any length but 0.
+        least: a ray whose total alpha is lower hits nothing.
+        near: Gaussians nearer than this are ignored.
 
     Raises:
         ValueError: `direction` has no length.
@@ -57,7 +57,7 @@ def pick(
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     length = np.linalg.norm(direction)
     if not length > 0:
-        raise ValueError(f"direction: got {direction}, want one of some length")
+        raise ValueError(f"direction: expected a non-zero vector, found {direction}")
     direction = direction / length
     # In the axes of each Gaussian, in units of its standard deviations.
     axes = np.asarray(quats_to_matrices(jnp.asarray(gaussians.quats)), np.float64)

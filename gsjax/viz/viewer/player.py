@@ -1,4 +1,4 @@
-"""What goes on by itself until it is stopped."""
+"""Playback: a step repeated in a thread until it is stopped."""
 
 import threading
 from collections.abc import Callable
@@ -9,22 +9,24 @@ _MOST_HZ = 12.0  # frames a second
 
 
 class Player:
-    """Steps again and again, in a thread of its own.
+    """Repeats a step in its own thread.
 
     Args:
-        step: what to do.
-        pause: seconds before each step, asked anew each time.
-        told: called with whether it plays, as soon as that changes.
+        step: the step.
+        pause: returns the seconds to wait before the next step.
+        on_change: called with True when playback starts and False when it stops.
     """
 
-    def __init__(self, step: Callable[[], None], pause: Callable[[], float], told: Callable[[bool], None]):
-        self._step, self._pause, self._told = step, pause, told
+    def __init__(
+        self, step: Callable[[], None], pause: Callable[[], float], on_change: Callable[[bool], None]
+    ):
+        self._step, self._pause, self._on_change = step, pause, on_change
         self._lock = threading.Lock()
-        self._stop: threading.Event | None = None  # of the run that plays: a later run has another
+        self._stop: threading.Event | None = None  # stops the current thread; each thread has its own
         self._closed = False
 
     def toggle(self) -> None:
-        """Play, or stop if it plays."""
+        """Start playback, or stop it if it is running."""
         with self._lock:
             if self._closed:
                 return
@@ -36,10 +38,10 @@ class Player:
             else:
                 self._stop.set()
                 self._stop = None
-            self._told(self._stop is not None)
+            self._on_change(self._stop is not None)
 
     def close(self) -> None:
-        """Stop, and play no more."""
+        """Stop for good."""
         with self._lock:
             self._closed = True
             if self._stop is not None:
@@ -51,6 +53,6 @@ class Player:
 
 
 def frame_pause(times: np.ndarray | None) -> float:
-    """Seconds between frames when playing: as they were taken, but not faster than a browser follows."""
+    """Seconds between frames in playback: as recorded, but no faster than a browser can follow."""
     step = 0.0 if times is None or len(times) < 2 else float(np.median(np.diff(times)))
     return float(np.clip(step, 1 / _MOST_HZ, 1.0))

@@ -1,4 +1,4 @@
-"""A web server that shows a scene: one page for each browser that comes."""
+"""A web server that shows a scene, with a page for each browser that connects."""
 
 import contextlib
 import io
@@ -16,16 +16,16 @@ from gsjax.viz.viewer.page import Page, Save, Shared
 from gsjax.viz.viewer.viewable import Viewable
 
 PORT = 8080
-_TRIED = 50  # ports after the first, where it may be another
+_TRIED = 50  # ports that are tried if none is given
 _BRAND = (88, 120, 255)
 
 
 class Viewer:
-    """A scene that browsers can look at; from `open_viewer`. As a context it closes itself.
+    """A running viewer, from `open_viewer`; as a context manager it closes itself.
 
     Attributes:
-        url: where.
-        port: of it.
+        url: address of the page.
+        port: port of the server.
     """
 
     def __init__(self, server: Any, shared: Shared, host: str):
@@ -35,16 +35,16 @@ class Viewer:
         self.port: int = server.get_port()
         shown = f"[{host}]" if ":" in host else host
         self.url: str = f"http://{shown}:{self.port}"
-        server.on_client_connect(self._come)
-        server.on_client_disconnect(self._gone)
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
 
     def wait(self) -> None:
-        """Until it is closed, or Ctrl-C."""
-        while not self._closed.wait(0.5):  # with a limit: without one, Ctrl-C would not be heard everywhere
+        """Block until the viewer is closed or interrupted with Ctrl-C."""
+        while not self._closed.wait(0.5):  # without a timeout, some platforms would not deliver Ctrl-C
             pass
 
     def close(self) -> None:
-        """Let all browsers go, free the port, and end a film that is being kept after its present frame."""
+        """Disconnect all browsers, free the port, and end any film being saved after its current frame."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -53,19 +53,19 @@ class Viewer:
             self._pages.clear()
         for page in pages:
             page.close()
-        with _hushed():
+        with _silenced():
             self._server.stop()
         with self._shared.filming:
             pass
 
-    def _come(self, client: Any) -> None:
+    def _on_connect(self, client: Any) -> None:
         page = Page(client, self._shared)
         with self._lock:
             self._pages[client.client_id] = page
-        if client.client_id not in self._server.get_clients():  # it left while its page was made
-            self._gone(client)
+        if client.client_id not in self._server.get_clients():  # it left while its page was built
+            self._on_disconnect(client)
 
-    def _gone(self, client: Any) -> None:
+    def _on_disconnect(self, client: Any) -> None:
         with self._lock:
             page = self._pages.pop(client.client_id, None)
         if page is not None:
@@ -90,13 +90,15 @@ def open_viewer(
     """Show a scene in web browsers, until the viewer is closed.
 
     Args:
-        scene: what to show.
-        host: address to listen on. Only this machine can look unless it is another than the default.
-        port: 8080, or the next one that is free, unless given.
-        max_gaussians: a browser gets so many, the most opaque ones; our render has all.
-        save: (kind, picture [H,W,3] uint8) -> path: keeps a screenshot; they are only offered for download
-            unless given.
-        compiler_options: of the program that draws; `gsjax.optim.compiler.host_options()` makes it faster.
+        scene: the scene to show.
+        host: address to listen on. With the default, only this machine can connect.
+        port: port to listen on (default: 8080, or the next free one).
+        max_gaussians: a browser receives at most this many Gaussians, the most opaque ones; our render draws
+            all of them.
+        save: (kind, picture [H,W,3] uint8) -> path: saves a screenshot (default: screenshots are only offered
+            for download).
+        compiler_options: XLA options of the program that draws; `gsjax.optim.compiler.host_options()` makes
+            it faster.
 
     Raises:
         MissingExtra: viser is not installed.
@@ -107,9 +109,9 @@ def open_viewer(
     if max_gaussians < 1:
         raise ValueError(f"max_gaussians: expected 1 or more, found {max_gaussians}")
     port = free_port(host, port)
-    with _hushed():
+    with _silenced():
         server = viser.ViserServer(host=host, port=port, label=scene.title, verbose=False)
-    # Any page could ask viser to open a tunnel through which the whole internet can look.
+    # Otherwise any page could make viser open a public tunnel to the internet.
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=_BRAND)
     server.gui.main_panel.dock_right()
@@ -125,7 +127,7 @@ def open_viewer(
 
 
 def load_viser() -> ModuleType:
-    """viser, which is optional.
+    """The module viser, which is optional.
 
     Raises:
         MissingExtra: it is not installed.
@@ -134,7 +136,7 @@ def load_viser() -> ModuleType:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only programs of this machine reach an address."""
+    """Whether an address can be reached from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -142,11 +144,11 @@ def is_loopback(host: str) -> bool:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """A port that can be listened on: that one, or without one the first free one from 8080 on.
+    """A port that can be listened on: the given one, or (None) the first free one from 8080 on.
 
     Raises:
-        ValueError: there is no port of that number.
-        OSError: it is in use; or nothing can listen on that address.
+        ValueError: the number is not a valid port.
+        OSError: the port is in use, or the address is not available.
     """
     if port is not None and not 0 <= port < 2**16:
         raise ValueError(f"port: expected 0 (any that is free) to {2**16 - 1}, found {port}")
@@ -154,11 +156,11 @@ def free_port(host: str, port: int | None) -> int:
     try:
         family, _, _, _, _ = socket.getaddrinfo(host, asked[0], type=socket.SOCK_STREAM)[0]
     except socket.gaierror as error:
-        raise OSError(f"host: {host!r} is no address of this machine") from error
+        raise OSError(f"host: {host!r} is not an address of this machine") from error
     refused = OSError()
     for number in asked:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
-            # As servers do, or a port that was in use a minute ago would count as taken.
+            # As servers do; otherwise a port that was in use a minute ago would count as taken.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((host, number))
@@ -173,7 +175,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 @contextlib.contextmanager
-def _hushed() -> Iterator[None]:
-    """viser prints a panel of its own when it starts and when it stops."""
+def _silenced() -> Iterator[None]:
+    """Suppress the panel that viser prints when it starts and stops."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield

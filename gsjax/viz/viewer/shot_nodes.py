@@ -13,18 +13,18 @@ from gsjax.viz.viewer.cameras import vertical_fov
 from gsjax.viz.viewer.viewable import Shots
 
 _COLOR = (120, 150, 255)
-_THUMB = 96  # pixels, the longer side
-_PICTURED = 300  # photographs that are shown in their frustums at most: each is read from the disk
+_THUMB = 96  # longer side in pixels
+_PICTURED = 300  # at most this many photographs are shown in their frustums: each is read from disk
 
 
 class ShotNodes:
-    """Frustums of one browser. They are made when they are first wanted.
+    """Frustums of one browser, created when they are first shown.
 
     Args:
-        api: viser's scene of that browser.
+        api: viser's scene handle of that browser.
         shots: the photographs.
-        size: of a frustum, in the scene's unit.
-        go: called with the number of the photograph whose frustum is clicked.
+        size: size of a frustum, in the scene's unit.
+        go: called with the index of the photograph whose frustum is clicked.
     """
 
     def __init__(self, api: Any, shots: Shots, size: float, go: Callable[[int], None]):
@@ -33,7 +33,7 @@ class ShotNodes:
         self._closed = False
 
     def show(self, visible: bool, frame: int) -> None:
-        """Show or hide them, where they stand in that frame."""
+        """Show the frustums of a frame, or hide them."""
         if visible and not self._nodes:
             self._nodes = [self._frustum(v, frame) for v in range(len(self._shots.names))]
             if self._shots.load_image is not None and len(self._shots.viewmats) == 1:
@@ -42,14 +42,14 @@ class ShotNodes:
             node.visible = visible
 
     def move(self, shots: Shots, frame: int) -> None:
-        """Put them where they stand in a frame; `shots` are the same, perhaps at other times."""
+        """Move the frustums to their poses in a frame; `shots` has the same cameras, maybe at other times."""
         self._shots = shots
         if len(self._shots.viewmats) > 1:
             for v, node in enumerate(self._nodes):
                 node.wxyz, node.position = self._pose(v, frame)
 
     def close(self) -> None:
-        """Read no more pictures."""
+        """Stop reading pictures."""
         self._closed = True
 
     def _pose(self, v: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +81,7 @@ class ShotNodes:
             try:
                 node.image = shrunk(load(0, v), _THUMB)
             except (ValueError, OSError):
-                continue  # one that cannot be read has an empty frustum; going there says why
+                continue  # an unreadable one has an empty frustum; visiting it reports why
 
 
 def shrunk(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "rows cols 3"]:

@@ -1,4 +1,4 @@
-"""The Gaussians in a browser's scene: those that stand still, and those that are sent anew for each frame."""
+"""The Gaussians in a browser's scene: those that stand still, and those that are sent again every frame."""
 
 from typing import Any, NamedTuple
 
@@ -10,21 +10,21 @@ from gsjax.viz.viewer.splats import Palette, browser_scale, splats
 from gsjax.viz.viewer.viewable import Coloring, Viewable, most_opaque, rows_of
 
 
-class Look(NamedTuple):
+class Appearance(NamedTuple):
     """How Gaussians are coloured.
 
     Attributes:
-        coloring: by what.
-        viewmat: of the camera that depth is seen from, or None before there is one.
-        depths: the ends of the scale of depth, or None.
+        coloring: one of the scene's colorings.
+        viewmat: world to camera, for depth; None before there is a camera.
+        depths: the ends of the depth scale, or None.
     """
 
     coloring: Coloring
     viewmat: Float[np.ndarray, "4 4"] | None = None
     depths: tuple[float, float] | None = None
 
-    def same_as(self, other: "Look | None") -> bool:
-        """Whether Gaussians that do not move have the same colours; only depth asks for the camera."""
+    def same_as(self, other: "Appearance | None") -> bool:
+        """Whether Gaussians that do not move keep their colours; only depth depends on the camera."""
         if other is None or self.coloring != other.coloring:
             return False
         return self.coloring != "depth" or (
@@ -32,14 +32,14 @@ class Look(NamedTuple):
         )
 
 
-class Present(NamedTuple):
-    """What is shown at the moment.
+class Displayed(NamedTuple):
+    """What a page currently displays.
 
     Attributes:
-        scene: one of those that a page shows, one after the other.
-        palette: its colours.
-        frame: of it.
-        gaussians: all of the scene, in that frame.
+        scene: the original scene, or an edited or filtered one.
+        palette: the colours of the scene.
+        frame: index of the frame.
+        gaussians: all Gaussians of the scene in that frame.
     """
 
     scene: Viewable
@@ -49,12 +49,12 @@ class Present(NamedTuple):
 
 
 class SplatNodes:
-    """Splats of one browser; for one thread.
+    """Splats of one browser; not thread-safe.
 
     Args:
-        api: viser's scene of that browser.
-        scene: what is shown at first.
-        max_gaussians: the most opaque ones that are sent.
+        api: viser's scene handle of that browser.
+        scene: the scene shown at first.
+        max_gaussians: only the most opaque Gaussians are sent, at most this many.
     """
 
     def __init__(self, api: Any, scene: Viewable, max_gaussians: int):
@@ -63,12 +63,12 @@ class SplatNodes:
         self._nodes: dict[str, Any] = {}
         self._begin(scene)
 
-    def show(self, now: Present, look: Look) -> None:
+    def show(self, now: Displayed, look: Appearance) -> None:
         """Send what differs from what the browser has.
 
         Args:
-            now: what is shown; another scene than before takes its place.
-            look: how it is coloured.
+            now: what to display; a new scene replaces the previous one.
+            look: how to colour it.
         """
         if now.scene is not self._scene:
             self._begin(now.scene)
@@ -89,13 +89,13 @@ class SplatNodes:
             "moving": rows[rows < scene.num_moving],
             "still": rows[rows >= scene.num_moving],
         }
-        self._sent: dict[str, tuple[int, Look]] = {}
+        self._sent: dict[str, tuple[int, Appearance]] = {}
 
     def _remove(self, name: str) -> None:
         if name in self._nodes:
             self._nodes.pop(name).remove()
 
-    def _has(self, name: str, frame: int, look: Look) -> bool:
+    def _has(self, name: str, frame: int, look: Appearance) -> bool:
         if name not in self._sent:
             return False
         then, colored = self._sent[name]

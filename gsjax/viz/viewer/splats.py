@@ -18,11 +18,11 @@ from gsjax.viz.colors import (
 )
 from gsjax.viz.viewer.viewable import Coloring, Viewable
 
-_MIDDLE = 0.25  # the median standard deviation is sent as this long: in the middle of what float16 resolves
+_MIDDLE = 0.25  # the median standard deviation is scaled to this length: mid-range for float16
 
 
 class Splats(NamedTuple):
-    """What viser's `add_gaussian_splats` takes, lengths times `1 / scale`."""
+    """Arguments of viser's `add_gaussian_splats`, with lengths divided by `scale`."""
 
     centers: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
@@ -30,16 +30,16 @@ class Splats(NamedTuple):
 
 
 def browser_scale(gaussians: Gaussians) -> float:
-    """The length that is sent as 1.
+    """The length that is sent to the browser as 1.
 
-    Browsers get covariances in float16, in which a standard deviation below a quarter of a millimetre is
-    nothing, and one of a centimetre has three digits.
+    Browsers receive covariances in float16, in which a standard deviation below a quarter of a millimetre
+    underflows, and one of a centimetre has three digits.
     """
     return float(np.exp(np.median(np.asarray(gaussians.log_scales, np.float64))) / _MIDDLE)
 
 
 def splats(gaussians: Gaussians, scale: float) -> Splats:
-    """Centres, covariances R S^2 R^T and opacities in lengths of `scale`."""
+    """Centres, covariances R S^2 R^T and opacities, with `scale` as the unit of length."""
     axes = np.asarray(quats_to_matrices(jnp.asarray(gaussians.quats)), np.float32)
     spread = axes * (np.asarray(gaussians.scales) / scale)[:, None, :]
     largest = np.finfo(np.float16).max
@@ -49,7 +49,7 @@ def splats(gaussians: Gaussians, scale: float) -> Splats:
 
 
 class Palette:
-    """What each Gaussian's colour is, by each of the ways to colour a scene."""
+    """The colours of a scene's Gaussians in each of its colorings."""
 
     def __init__(self, scene: Viewable):
         self._scene = scene
@@ -63,14 +63,14 @@ class Palette:
         viewmat: Float[np.ndarray, "4 4"] | None,
         depths: tuple[float, float] | None,
     ) -> Float[np.ndarray, "kept 3"]:
-        """RGB, 0 to 1, of some Gaussians.
+        """RGB, 0 to 1, of the selected Gaussians.
 
         Args:
-            coloring: one of the scene's.
-            means: where all Gaussians are now.
-            rows: which of them.
-            viewmat: of the camera that depth is seen from; None shows all at one depth.
-            depths: what is nearest and what is farthest.
+            coloring: one of the scene's colorings.
+            means: current centres of all Gaussians.
+            rows: the selected Gaussians.
+            viewmat: world to camera, for depth; None gives all Gaussians one depth.
+            depths: nearest and farthest depth of the colour scale.
         """
         scene = self._scene
         if coloring == "label":
@@ -91,7 +91,7 @@ class Palette:
 def camera_depths(
     means: Float[np.ndarray, "n 3"], viewmat: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n"]:
-    """Depths along the axis of a camera."""
+    """Depths along the optical axis of a camera."""
     return np.asarray(means, np.float64) @ viewmat[2, :3] + viewmat[2, 3]
 
 
@@ -101,16 +101,16 @@ def depth_range(
     fov: float,
     aspect: float,
 ) -> tuple[float, float] | None:
-    """Near and far ends of a scale of depth: the 2nd and 98th percentile of the centres that a camera sees.
+    """Near and far end of a depth scale: the 2nd and 98th percentile of the centres that a camera sees.
 
     Args:
-        means: centres.
+        means: centres of the Gaussians.
         viewmat: world to camera.
         fov: vertical field of view, radians.
         aspect: width over height.
 
     Returns:
-        None where it sees none.
+        (near, far), or None if the camera sees no centre.
     """
     local = np.asarray(means, np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
     up = np.tan(fov / 2) * local[:, 2]

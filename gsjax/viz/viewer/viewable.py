@@ -1,4 +1,4 @@
-"""What a viewer shows: Gaussians, where they go, their names, who photographed them, and how to edit them."""
+"""What a viewer shows: Gaussians, their motion, names and photographs, and how to edit or query them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,21 +13,21 @@ from jaxtyping import Bool, Float, Int
 from gsjax.scene.gaussians import Gaussians, take, valid_rows
 from gsjax.scene.selection import only
 
-# Shapes of fields stand in the docstrings: constructors check them, and say more than an annotation could.
+# The shapes of fields are in the docstrings: constructors check them with clearer messages than annotations.
 
 Coloring = Literal["colour", "depth", "label", "features"]
 
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """Cameras that took photographs of a scene. T is 1 where they stand still.
+    """Cameras that took photographs of a scene. T is 1 if they do not move.
 
     Attributes:
-        names: of each camera, V of them.
+        names: names of the V cameras.
         viewmats: world to camera, OpenCV axes, [T,V,4,4].
         Ks: intrinsics in pixels, [T,V,3,3].
         sizes: width and height in pixels, [V,2].
-        load_image: (t, v) -> RGB, [H,W,3] uint8; None where there are no pictures to show.
+        load_image: (t, v) -> RGB, [H,W,3] uint8; None if there are no pictures to show.
 
     Raises:
         ValueError: shapes disagree.
@@ -55,8 +55,8 @@ class Motion:
     """How a scene changes from frame to frame; `moved` makes it from arrays.
 
     Attributes:
-        num_frames: how many there are.
-        num_moving: so many Gaussians, from the first on, may differ between frames, but for their colours.
+        num_frames: number of frames.
+        num_moving: the first `num_moving` Gaussians may differ between frames, except in colour.
         at: frame -> all Gaussians.
     """
 
@@ -66,19 +66,21 @@ class Motion:
 
 
 def moved(gaussians: Gaussians, means: Float[np.ndarray, "..."], quats: Float[np.ndarray, "..."]) -> Motion:
-    """The first M Gaussians go elsewhere in each frame, and the others stand still.
+    """A motion of the first M Gaussians, while the others stand still.
 
     Args:
-        gaussians: N of them.
+        gaussians: N Gaussians.
         means: centres of the first M, [T,M,3].
-        quats: their orientations, [T,M,4].
+        quats: orientations of the first M, [T,M,4].
 
     Raises:
         ValueError: shapes disagree.
     """
     frames, moving = means.shape[:2]
     if frames == 0 or moving > gaussians.num:
-        raise ValueError(f"means: got shape {means.shape}, want [T,M,3], T from 1 on, M to {gaussians.num}")
+        raise ValueError(
+            f"means: expected shape [T,M,3], T at least 1 and M at most {gaussians.num}, found {means.shape}"
+        )
     _check("means", means, (frames, moving, 3))
     _check("quats", quats, (frames, moving, 4))
 
@@ -92,17 +94,17 @@ def moved(gaussians: Gaussians, means: Float[np.ndarray, "..."], quats: Float[np
 
 @dataclass(frozen=True, eq=False)
 class Editing:
-    """How a scene can be edited. An edit is a line of text; they are done one after the other.
+    """How a scene can be edited. An edit is a line of text; edits are applied in order.
 
     Attributes:
-        operations: by name, lines that say what each does and what it wants.
-        parts: what lines call the things that can be edited, by what to call them on the page.
-        cameras: names of those that can film; the first does unless told otherwise.
-        begin: (operation, part) -> a line to begin with.
-        preview: lines -> what they make of the scene. A ValueError or an OSError of it says what cannot be
-            done, as do those of `save`.
-        save: (lines, name, camera, goes_on) -> where the film is kept that they make; none is written over.
-            `goes_on(done, asked)` is asked after each frame, and ends the film where it is False.
+        operations: name to help text: a line on what the operation does, then one line per key.
+        parts: name on the page to name in edits, for each part that can be edited.
+        cameras: names of the cameras that can film; the first is the default.
+        begin: (operation, part) -> a template line.
+        preview: lines -> the edited scene. It raises a ValueError or an OSError to report an edit that cannot
+            be done, as does `save`.
+        save: (lines, name, camera, goes_on) -> the path of the saved film; nothing is overwritten.
+            `goes_on(done, total)` is called after each frame, and the film ends when it returns False.
     """
 
     operations: Mapping[str, Sequence[str]]
@@ -113,15 +115,15 @@ class Editing:
     save: Callable[[Sequence[str], str, str, Callable[[int, int], bool]], Path]
 
 
-class Found(NamedTuple):
-    """The answer to a question.
+class Answer(NamedTuple):
+    """The answer to a query.
 
     Attributes:
-        what: was asked for, in a few words.
-        scores: of each Gaussian, [N].
-        threshold: from which on they are meant.
-        rule: by which that is so.
-        seconds: that it took.
+        what: a short description of the query.
+        scores: score of each Gaussian, [N].
+        threshold: Gaussians with a higher score are selected.
+        rule: how the threshold was chosen.
+        seconds: time taken.
     """
 
     what: str
@@ -132,45 +134,45 @@ class Found(NamedTuple):
 
 
 Showing = Literal["heat of the scores", "only what was found", "all but that", "the scene"]
-"""What is shown of an answer."""
+"""How an answer is shown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Asking:
-    """How a scene can be asked. A ValueError of it says what cannot be answered.
+    """How a scene can be queried. The functions raise a ValueError to report a query that cannot be answered.
 
     Attributes:
         hint: what can be asked for.
-        ask: (text, frame) -> the answer. Only what means something else in each frame looks at the frame.
-        like: (row of a Gaussian, frame) -> the answer to "what is like it".
-        save: (which Gaussians [N], a name, frame) -> where they are kept as a PLY file, as they are in that
-            frame; none is written over.
+        ask: (text, frame) -> the answer. The frame matters only for features that change over time.
+        like: (row of a Gaussian, frame) -> the answer to "what is similar to it".
+        save: (selected Gaussians [N], name, frame) -> the path of a PLY file with the Gaussians as they are
+            in that frame; nothing is overwritten.
     """
 
     hint: str
-    ask: Callable[[str, int], Found]
-    like: Callable[[int, int], Found]
+    ask: Callable[[str, int], Answer]
+    like: Callable[[int, int], Answer]
     save: Callable[[Bool[np.ndarray, "n"], str, int], Path]
 
 
 @dataclass(frozen=True, eq=False)
 class Viewable:
-    """A scene to look at. What it does not have is None, and the page does not offer it.
+    """A scene to look at. Fields that do not apply are None, and the page does not offer them.
 
     Attributes:
-        title: what to call it.
-        gaussians: the scene, of the first frame where there is time; rows that cannot be drawn are an error.
-        labels: of each Gaussian, [N] integers; 0 is the background.
-        names: of the labels.
-        motion: where they go, in T frames.
-        times: seconds of each frame, [T].
+        title: title of the page.
+        gaussians: the scene, in its first frame if it moves; rows that cannot be drawn are an error.
+        labels: label of each Gaussian, [N] integers; 0 is the background.
+        names: label to name.
+        motion: the motion over T frames.
+        times: time of each frame in seconds, [T].
         shots: the photographs.
-        up: which way is up, [3]; taken from the photographs, else +z, unless given.
+        up: the up direction, [3] (default: from the photographs, or +z without any).
         background: RGB behind the scene, 0 to 1.
-        antialiased: whether it was fitted with `rasterize_mode="antialiased"`.
-        unit: of lengths, as in "m"; empty where only their proportions are known.
-        editing: how it can be edited.
-        asking: how it can be asked, where it cannot be edited.
+        antialiased: whether the scene was fitted with `rasterize_mode="antialiased"`.
+        unit: unit of lengths, such as "m"; empty if the scale is unknown.
+        editing: how the scene can be edited.
+        asking: how the scene can be queried, if it cannot be edited.
 
     Raises:
         ValueError: shapes disagree, there is no Gaussian, or one holds a number that is not finite.
@@ -206,17 +208,17 @@ class Viewable:
 
     @property
     def num_frames(self) -> int:
-        """How many frames there are; 1 where nothing moves."""
+        """Number of frames; 1 if nothing moves."""
         return 1 if self.motion is None else self.motion.num_frames
 
     @property
     def num_moving(self) -> int:
-        """How many Gaussians, from the first on, may differ from frame to frame."""
+        """Number of leading Gaussians that may differ from frame to frame."""
         return 0 if self.motion is None or self.num_frames == 1 else self.motion.num_moving
 
     @property
     def colorings(self) -> tuple[Coloring, ...]:
-        """What Gaussians can be coloured by."""
+        """The available colorings."""
         known: list[Coloring] = ["colour", "depth"]
         if self.labels is not None and (self.labels != self.labels[0]).any():
             known.append("label")
@@ -230,7 +232,7 @@ class Viewable:
         return eqx.tree_at(lambda g: g.features, gaussians, None, is_leaf=lambda leaf: leaf is None)
 
     def name_of(self, index: int) -> str | None:
-        """What the thing is called that a Gaussian belongs to; None without labels."""
+        """Name of the object that a Gaussian belongs to; None without labels."""
         if self.labels is None:
             return None
         label = int(self.labels[index])
@@ -240,12 +242,12 @@ class Viewable:
 def redone(
     scene: Viewable, change: Callable[[Gaussians], Gaussians], kept: Bool[np.ndarray, "n"] | None = None
 ) -> Viewable:
-    """A scene with something done to its Gaussians in each frame.
+    """A scene with its Gaussians changed in the same way in every frame.
 
     Args:
-        scene: to be changed.
-        change: what is done; it does not change how many there are.
-        kept: which are left of them afterwards; all unless given.
+        scene: the scene to change.
+        change: the change; it must not change the number of Gaussians.
+        kept: the Gaussians to keep afterwards (default: all).
     """
 
     def done(gaussians: Gaussians) -> Gaussians:
@@ -263,11 +265,11 @@ def redone(
 
 
 class Preview(NamedTuple):
-    """What edits make of a scene.
+    """The result of editing a scene.
 
     Attributes:
-        scene: to look at.
-        doubts: what may look wrong in it, a sentence each.
+        scene: the edited scene.
+        doubts: warnings about what may look wrong, one sentence each.
     """
 
     scene: Viewable
@@ -275,7 +277,7 @@ class Preview(NamedTuple):
 
 
 def most_opaque(gaussians: Gaussians, count: int) -> Int[np.ndarray, "kept"]:
-    """Rows of the `count` most opaque Gaussians, in their order; all where there are no more."""
+    """Rows of the `count` most opaque Gaussians, in ascending order; all rows if there are no more."""
     if gaussians.num <= count:
         return np.arange(gaussians.num)
     order = np.argsort(-np.asarray(gaussians.logit_opacities), kind="stable")
@@ -283,10 +285,10 @@ def most_opaque(gaussians: Gaussians, count: int) -> Int[np.ndarray, "kept"]:
 
 
 def rows_of(gaussians: Gaussians, rows: Int[np.ndarray, "kept"]) -> Gaussians:
-    """Some of the Gaussians; the same object where that is all of them."""
+    """The selected Gaussians; the same object if all are selected."""
     return gaussians if len(rows) == gaussians.num else take(gaussians, rows)
 
 
 def _check(name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:
     if np.shape(array) != wanted:
-        raise ValueError(f"{name}: got shape {np.shape(array)}, want {wanted}")
+        raise ValueError(f"{name}: expected shape {wanted}, found {np.shape(array)}")

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from gsjax.data import DataError, DataWarning, open_photographs, open_sequence
-from gsjax.data.ordered import in_order
 from gsjax.engine.deform.depth import with_depth
 from gsjax.engine.messages import Notes
 from gsjax.io.video import VideoWriter
@@ -103,15 +102,15 @@ def test_photographs_that_were_placed_are_frames(gsjax, photographs, tmp_path):
     code, said = gsjax("deform", table, "--out", tmp_path / "run", "--frames", "0:3", "--depth", "data")
     assert code == 2
     assert "--depth data: table has none" in said
-    sequence = in_order(open_photographs(table))
+    sequence = sequence_of(open_photographs(table))
     assert (sequence.num_frames, sequence.camera_ids) == (9, (0,))
     np.testing.assert_array_equal(sequence.image(1, 0), open_photographs(table).image(7))
     some = open_photographs(table)
     np.testing.assert_array_equal(sequence.viewmats[1, 0], some.viewmats[7])
     sizes = some.sizes.copy()
     sizes[3] += 2
-    with pytest.raises(DataError, match="frames of 48x36 as the first, found 50x38 in"):
-        in_order(replace(some, sizes=sizes))
+    with pytest.raises(DataError, match="frames of 48x36 like the first, found 50x38 in"):
+        sequence_of(replace(some, sizes=sizes))
 
 
 def test_what_is_not_there_is_named(gsjax, clip, tmp_path):

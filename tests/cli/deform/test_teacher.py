@@ -142,7 +142,7 @@ def test_options_that_contradict_each_other(options, words, tmp_path, capsys):
 
 
 def test_files_that_do_not_fit(files, tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected features of the picture 000000"):
+    with pytest.raises(FileNotFoundError, match="expected features of the image 000000"):
         data_of(tmp_path, tmp_path)
     for t in range(10):
         np.save(tmp_path / f"{t:06d}.npy", feature_map(t, (13, 16) if t else (26, 32)))

@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.fit
+import gsjax.engine.fit.results
+import gsjax.engine.fit.run
 import gsjax.engine.photographs
 from gsjax.cli import main
 from gsjax.data.video import describe_video
-from gsjax.engine.fit.loop import Budget
-from gsjax.engine.fit.results import Curve
-from gsjax.engine.fit.worth import parts_of_time
+from gsjax.engine.drive import Tick
+from gsjax.engine.fit.ablation import ablate_time
+from gsjax.engine.fit.schedule import Budget, Looks
+from gsjax.engine.progress import Progress
 from gsjax.io.ply import read_ply
-from gsjax.methods.fit import PRESETS
+from gsjax.methods.fit import PRESETS, Fit
+from gsjax.optim.method import Run
 
 QUICK = ("--fit.steps", "24", "--fit.cap", "150", "--fit.start.count", "120", "--fit.sh-every", "12")
 QUICK += ("--judge-every", "8", "--test-every", "4", "--fit.growth.begin", "4", "--fit.growth.every", "4")
@@ -78,16 +81,16 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     config = yaml.safe_load((run / "config.yml").read_text())
     assert Path(config["dataset"]).is_absolute()
 
-    shown = Curve.took
+    add = Progress.add
 
-    def stopped(self, seconds, compile_seconds):
-        shown(self, seconds, compile_seconds)
+    def stopped(self, tick):
+        add(self, tick)
         if calls.append(1) or len(calls) == 14:  # after the degree has changed
             raise KeyboardInterrupt
 
     calls: list[int] = []
     with monkeypatch.context() as context:
-        context.setattr(Curve, "took", stopped)
+        context.setattr(Progress, "add", stopped)
         code, said = gsjax_fit(*QUICK, name="stopped")
     assert code == 130
     assert "partial run" in said
@@ -179,17 +182,23 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["judge", "parts", "write_orbit"])
+@pytest.mark.parametrize(
+    ("module", "what", "lacks"),
+    [
+        (gsjax.engine.fit.results, "write_panel", "scoring"),
+        (gsjax.engine.fit.run, "ablate", "looking at"),
+        (gsjax.engine.fit.run, "write_orbit", "drawing a video"),
+    ],
+)
 def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
-    gsjax_fit, tmp_path, monkeypatch, what
+    gsjax_fit, tmp_path, monkeypatch, module, what, lacks
 ):
     def stopped(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(gsjax.cli.fit, what, stopped)
+    monkeypatch.setattr(module, what, stopped)
     code, said = gsjax_fit(*QUICK, "--fit.steps", "8")
     assert code == 0, said
-    lacks = {"parts": "looking at", "write_orbit": "drawing a video", "judge": "scoring"}[what]
     assert f"warning: {lacks}" in said
     assert "was left out: Ctrl-C" in " ".join(said.split())
     assert (tmp_path / "run" / "report.html").exists()
@@ -199,22 +208,22 @@ def test_ctrl_c_after_the_last_step_leaves_out_what_a_run_can_go_without(
 def test_what_a_part_of_the_time_bought_is_the_last_look_before_it():
     looks = [(1.0, 10.0), (2.0, 12.0), (4.5, 14.0), (6.0, 15.0), (9.0, None), (10.0, 16.0)]
     rows = [{"seconds": s, "test_psnr": p, "alive": int(100 * s), "step": 1} for s, p in looks]
-    after = {row["part"]: (row["gaussians"], row["psnr"]) for row in parts_of_time(Curve(rows))}
+    after = {row["part"]: (row["gaussians"], row["psnr"]) for row in ablate_time(rows)}
     assert list(after) == ["after half of the time", "after a quarter", "after an eighth"]
     assert list(after.values()) == [(450, 14.0), (200, 12.0), (100, 10.0)]
-    assert parts_of_time(Curve(rows[4:])) == []
+    assert ablate_time(rows[4:]) == []
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before(gsjax_fit, tmp_path, monkeypatch):
-    shown, calls, often = Curve.took, [], ("--save-every", "1e-9")
+    add, calls, often = Progress.add, [], ("--save-every", "1e-9")
 
-    def stopped(self, seconds, compile_seconds):
-        shown(self, seconds, compile_seconds)
+    def stopped(self, tick):
+        add(self, tick)
         if calls.append(1) or len(calls) == 6:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as context:
-        context.setattr(Curve, "took", stopped)
+        context.setattr(Progress, "add", stopped)
         assert gsjax_fit(*QUICK, *often)[0] == 130
     *_, before, newest = sorted((tmp_path / "run" / "resume").iterdir())
     newest.write_bytes(newest.read_bytes()[:1000])
@@ -233,7 +242,9 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
 
 def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypatch):
     """On the way a few are looked at, which may be easy ones."""
-    monkeypatch.setattr(Curve, "has_met", lambda self, goal: True)
+    monkeypatch.setattr(
+        Looks, "__call__", lambda self, now: {"test_psnr": 99.0} if now.step % 8 == 0 else None
+    )
     code, said = gsjax_fit(*QUICK, "--until-psnr", "90")
     assert code == 0, said
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 24
@@ -273,20 +284,21 @@ def test_a_photograph_that_is_cut_off_is_named(photographs, gsjax_fit, tmp_path)
 
 
 def test_the_share_that_is_done_is_of_steps_or_of_minutes_and_never_jumps():
-    curve = Curve()
-    budget, shares = Budget(7_000, 1.0, curve), []
+    progress = Progress()
+    budget, shares = Budget(7_000, 1.0, progress), []
     for step in range(7_000):
         shares.append(budget(step))
         if shares[-1] >= 1:
             break
-        curve.took(0.01 if shares[-1] < 0.25 else 0.05, 5.0 if step == 0 else 0.0)  # small photographs first
+        seconds = 0.01 if shares[-1] < 0.25 else 0.05  # small photographs first
+        progress.add(Tick(Fit(), None, Run(None, None), {}, seconds, 5.0 if step == 0 else 0.0))
     assert shares[0] == 0.0
     assert shares[1] == pytest.approx(5.01 / 60)
     assert max(np.diff(shares[1:])) < 0.001
     assert step == pytest.approx(1000 + 900, abs=5)  # 10 s of 0.01, 45 of 0.05, 5 of compiling
-    resumed = Budget(7_000, 1.0, Curve.of(curve.metadata()))
+    resumed = Budget(7_000, 1.0, Progress(**progress.metadata()))
     assert resumed(step) == shares[-1]
-    assert Budget(10_000, None, curve)(5_000) == 0.5
+    assert Budget(10_000, None, progress)(5_000) == 0.5
 
 
 def test_photographs_that_do_not_fit_into_memory_are_refused_before_anything_is_cleared(

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.cli.fit
+import gsjax.engine.fit.run
 from gsjax.cli import main
+from gsjax.engine.drive import drive
 from gsjax.engine.records import read_record
 
 
@@ -21,7 +22,7 @@ def fitted(photographs, tmp_path_factory):
     run = tmp_path_factory.mktemp("fitted") / "run"
     options = ("--fit.cap", "120", "--fit.start.count", "100", "--test-every", "4")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gsjax.cli.fit, "follow", lambda problem, state, *_, **how: (state, None))
+        patch.setattr(gsjax.engine.fit.run, "_fitted", lambda options, *given: drive(*given[:3]))
         assert main(["fit", str(photographs), "--out", str(run), *options]) == 0
     return run
 
@@ -120,15 +121,17 @@ def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, r
 
 def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
     from gsjax.cli.evaluate import scores
-    from gsjax.engine.fit.results import Seen
-    from gsjax.methods.fit import View
+    from gsjax.engine.fit.results import Compared
+    from gsjax.geometry.cameras import Camera
+    from gsjax.scene.frame import Frame
 
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (170, 180, 3))
     photograph = np.round(255 * truth).astype(np.uint8)
-    view = View(photograph, None, np.full((170, 180), 2.0, np.float32), np.eye(4), np.eye(3))
+    camera = Camera(np.eye(4)[None], np.eye(3)[None], 180, 170)
+    view = Frame(photograph[None], np.full((1, 170, 180), 2.0, np.float32), camera)
     drawn = np.clip(truth + rng.normal(0, 0.1, truth.shape), 0, 1)
-    seen = Seen(view, drawn, truth, np.full((170, 180), 2.02, np.float32), np.ones((170, 180), bool))
+    seen = Compared(view, drawn, truth, np.full((170, 180), 2.02, np.float32), np.ones((170, 180), bool))
     found = scores(seen, None)
     assert 0.5 < found["ssim"] < found["ms_ssim"] < 1
     assert found["depth_mm"] == pytest.approx(20, abs=1e-3)

@@ -1,5 +1,6 @@
 """What each part of a fitted scene is worth: how well it is seen with fewer Gaussians, colours or minutes."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -7,59 +8,58 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.engine.fit.results import Curve, Plans, judge
-from gsjax.methods.fit import Problem, View
+from gsjax.engine.fit.results import Judge
+from gsjax.engine.fit.schedule import looks
 from gsjax.optim.densification import EMPTY_LOGIT
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 _SHARES = {"half of the Gaussians": 2, "a quarter": 4, "an eighth": 8, "a sixteenth": 16}
 _MINUTES = {"after half of the time": 1 / 2, "after a quarter": 1 / 4, "after an eighth": 1 / 8}
 
 
-def parts(
-    problem: Problem,
+def ablate(
     gaussians: Gaussians,
     light: Float[np.ndarray, "n"],
-    views: list[tuple[str, View]],
-    curve: Curve,
-    plans: Plans,
+    frames: Sequence[tuple[str, Frame]],
+    rows: Sequence[Mapping[str, Any]],
+    judge: Judge,
 ) -> list[dict[str, Any]]:
     """What is left (`part`) of the scene, of how many `gaussians` and which `sh_degree` (None: was not
     written down), and the mean `psnr` of the views then. Nothing is fitted again: a fit for less does better.
 
     Args:
-        problem: what was fitted.
         gaussians: the scene.
         light: of `light_of`; who sends least is left out first.
-        views: held-out ones, those that the curve was judged by.
-        curve: how the fit went on.
-        plans: as `judge` has it.
+        frames: held-out ones, those that the curve was judged by.
+        rows: how the fit went on.
+        judge: of views.
     """
 
     def row(part: str, scene: Gaussians, count: int, degree: int) -> dict[str, Any]:
-        psnr = judge(problem, scene, views, plans=plans).mean()["psnr"]
+        psnr = judge(scene, frames).mean()["psnr"]
         return {"part": part, "gaussians": count, "sh_degree": degree, "psnr": psnr}
 
     count, degree = gaussians.num, gaussians.sh_degree
-    rows = [row("all", gaussians, count, degree)]
+    found = [row("all", gaussians, count, degree)]
     order = np.argsort(-light, kind="stable")
     for name, divisor in _SHARES.items():
         kept = -(-count // divisor)
-        rows.append(row(name, _emptied(gaussians, order[kept:]), kept, degree))
+        found.append(row(name, _emptied(gaussians, order[kept:]), kept, degree))
     for less in reversed(range(degree)):
-        rows.append(row(f"colours of degree {less}", _plainer(gaussians, less), count, less))
-    return rows + parts_of_time(curve)
+        found.append(row(f"colours of degree {less}", _plainer(gaussians, less), count, less))
+    return found + ablate_time(rows)
 
 
-def parts_of_time(curve: Curve) -> list[dict[str, Any]]:
+def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The same after a part of the time: at the last look before it, where there was one."""
-    rows = []
+    found = []
     for name, share in _MINUTES.items():
-        before = [r for r in curve.looks() if r["seconds"] <= share * curve.rows[-1]["seconds"]]
+        before = [r for r in looks(rows) if r["seconds"] <= share * rows[-1]["seconds"]]
         if before:
             alive, psnr = before[-1]["alive"], before[-1]["test_psnr"]
-            rows.append({"part": name, "gaussians": alive, "sh_degree": None, "psnr": psnr})
-    return rows
+            found.append({"part": name, "gaussians": alive, "sh_degree": None, "psnr": psnr})
+    return found
 
 
 def _emptied(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:

@@ -1,4 +1,4 @@
-"""How tests look at simulated scenes: points before cameras, pictures between pixels, and how fast."""
+"""Helpers for tests of simulated scenes: projection, interpolation, and rendering time."""
 
 import time
 
@@ -6,20 +6,21 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 
-def looked_at(sequence, t, c, points):
-    """Pixels (x, y) and depths of world points [V,3] before camera c."""
+def project_points(sequence, t, c, points):
+    """Pixels (x, y) and depths of world points [V,3] in camera c."""
     view, K = sequence.viewmats[t, c], sequence.Ks[t, c]
     local = points @ view[:3, :3].T + view[:3, 3]
     pixels = local @ K.T
     return pixels[:, :2] / pixels[:, 2:], local[:, 2]
 
 
-def between_pixels(image, pixels):
+def interpolate(image, pixels):
+    """Values of an image at pixels (x, y), bilinearly interpolated."""
     return map_coordinates(image.astype(np.float64), (pixels - 0.5).T[::-1], order=1, mode="nearest")
 
 
 def depths_from_another_frame(sequence, t, u):
-    """Depths that camera 0 measured in frame u, and those that points it measured in frame t have there."""
+    """Depths measured by camera 0 in frame u, and those expected there for the points measured in frame t."""
     depth, K = sequence.depth(t, 0), sequence.Ks[t, 0]
     y, x = np.nonzero(depth)
     local = np.linalg.inv(K) @ np.stack([x + 0.5, y + 0.5, np.ones(len(x))]) * depth[y, x]
@@ -30,10 +31,10 @@ def depths_from_another_frame(sequence, t, u):
     return sequence.depth(u, 0)[y[inside], x[inside]], there[2][inside]
 
 
-def seconds_a_frame(sequence, looks) -> float:
-    """The least time of a processor that image, depth and mask take together, over `looks`, pairs (t, c)."""
+def seconds_per_frame(sequence, views) -> float:
+    """The shortest CPU time of image, depth and mask together, over `views`, pairs (t, c)."""
     durations = []
-    for t, c in looks:
+    for t, c in views:
         start = time.thread_time()
         sequence.image(t, c), sequence.depth(t, c), sequence.mask(t, c)
         durations.append(time.thread_time() - start)

@@ -1,0 +1,267 @@
+"""A run of `gsjax fit`: photographs in, a folder with a scene, its scores and a report out."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from gsjax.engine.drive import Drive, drive
+from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.fit.ablation import ablate
+from gsjax.engine.fit.orbit import write_orbit
+from gsjax.engine.fit.results import Judge, Scores, print_results, write_results
+from gsjax.engine.fit.schedule import Budget, Looks, looks, schedule_of
+from gsjax.engine.fit.start import start_from
+from gsjax.engine.fit.tensorboard import TensorBoard
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import Notes, reason, stage
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
+from gsjax.engine.photographs import choose_photographs, read_frames, say_if_large, split
+from gsjax.engine.progress import Progress, load_run, watch
+from gsjax.engine.recording import located
+from gsjax.io.atomic import write_npz
+from gsjax.io.ply import write_ply
+from gsjax.methods.fit import Fit, FitConfig, Model, Problem, as_found, light_of, needed
+from gsjax.optim.method import Run
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians, take
+
+JUDGED_AT_MOST = 4
+"""Held-out views that are looked at while the fit goes on."""
+_MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")  # on what is fitted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(OfDataset):
+    """What `gsjax fit` is told."""
+
+    preset: Literal["default", "quick", "classic", "depth", "published"] = "default"
+    """How the scene is fitted unless given: quick (a first look), classic (cloning and splitting, as in
+    3DGS), depth (for RGB-D), published (those of 3DGS-MCMC, for a GPU or a night)."""
+    until_psnr: float | None = None
+    """Stop when held-out photographs are seen with so many dB."""
+    judge_every: int = 500
+    """Steps between looks at held-out photographs; under --minutes there are ten besides."""
+    save_every: float = 30.0
+    """Seconds of fitting that a run may lose when it is killed."""
+    tensorboard: bool = False
+    """Write the curve for TensorBoard too, into RUN/tensorboard."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """How the scene is fitted."""
+
+
+def run(options: Options) -> int:
+    """Fit a scene and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
+    """
+    options = checked(options)
+    expect_positive(options, "until_psnr", "judge_every", "save_every")
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        photographs = choose_photographs(
+            options.dataset,
+            options.read,
+            scale=options.scale,
+            frames=options.frames,
+            cameras=options.cameras,
+            eval_cameras=options.eval_cameras,
+        )
+        chosen, held_out = split(photographs, options.test_every)
+        if options.until_psnr is not None and not len(held_out):
+            raise ValueError("--until-psnr: nothing is held out to judge by; see --test-every")
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset))
+        if options.resume:
+            folder.check_config(settings, but=_MAY_CHANGE)
+        say_if_large(photographs)
+        frames = read_frames(photographs, console)
+        fitted = [frames[i] for i in chosen]
+        config, cloud = start_from(photographs, fitted, options.fit, console)
+        method = Fit(config)
+        problem, run = method.start(fitted, cloud, photographs.background)
+        folder.write_config(settings)  # from here on an earlier run is gone
+        progress = Progress()
+        if options.resume:
+            run, progress = load_run(folder.resume, run, progress)
+            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+        board = TensorBoard(folder.path, progress.rows) if options.tensorboard else None
+        judged = [(photographs.names[i], frames[i]) for i in held_out]
+        judge = Judge(config, problem.background)
+        ticks = _fitted(options, method, problem, run, progress, judged, judge, folder, console, board)
+        stopped, run = progress.stopped, ticks.run
+        if isinstance(stopped, KeyboardInterrupt):
+            console.print("stopping: what there is is written; Ctrl-C again leaves out the scores")
+        seconds = {"fit": progress.seconds, "compile": progress.compile_seconds}
+        gaussians, finished, worth = ticks.result, stopped is None, []
+        _note_oddities(options, progress, gaussians, finished, notes)
+        found_frames = as_found(problem, run.params)
+        write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
+        aside = Aside(seconds, console, notes)
+        light, scores = None, Scores([])
+        if finished:  # who pressed Ctrl-C does not wait for this
+            with aside("pruning", "leaving out what no photograph needs"):
+                gaussians, light = without_needless(found_frames, config, gaussians, notes)
+        write_ply(folder.scene, gaussians)
+        with aside("scores", "scoring held-out photographs"):
+            shown = judged or [(photographs.names[i], frames[i]) for i in chosen[:1]]
+            scores = judge(gaussians, shown, folder)
+        if finished and judged and light is not None and gaussians.num:
+            with aside("parts", "looking at what each part of the scene is worth"):
+                worth = ablate(gaussians, light, some_of(judged), progress.rows, judge)
+        if finished:
+            with aside("video", "drawing a video of the scene"):
+                write_orbit(folder, found_frames, problem.extent.focus, gaussians, judge)
+        found = {
+            "kind": "fit",
+            "dataset": photographs.name,
+            **ended(stopped),
+            "steps": run.step,
+            "skipped": progress.skipped,
+            "num_gaussians": gaussians.num,
+            "sh_degree": gaussians.sh_degree,
+            "photographs": {
+                "fitted": len(chosen),
+                "held_out": len(held_out),
+                "looked_at": len(some_of(judged)),
+            },
+            "size": photographs.sizes.max(0),
+            "start": problem.start,
+            "seconds": seconds | {"total": perf_counter() - begun},
+            "machine": describe_machine(),
+            "test": scores.mean() if judged and scores.rows else None,
+            "views": scores.rows,
+            "parts": worth,
+            "curve": progress.rows,
+            "notes": notes.all,
+        }
+        if board is not None:
+            board.close({f"held_out/{row['view']}": folder.path / row["picture"] for row in scores.rows})
+        finish(folder, found, write_results)
+    print_results(folder, found)
+    return exit_code(stopped)
+
+
+def some_of(judged: Sequence[tuple[str, Frame]]) -> Sequence[tuple[str, Frame]]:
+    """The held-out views that are looked at while the fit goes on; all of them are at its end."""
+    return judged[:: max(1, len(judged) // JUDGED_AT_MOST)][:JUDGED_AT_MOST]
+
+
+def _fitted(
+    options: Options,
+    method: Fit,
+    problem: Problem,
+    run: Run,
+    progress: Progress,
+    judged: Sequence[tuple[str, Frame]],
+    judge: Judge,
+    folder: RunFolder,
+    console: Console,
+    board: TensorBoard | None,
+) -> Drive:
+    """The fit after the steps, the minutes or the wanted PSNR are reached, or what stopped it."""
+    budget, goal = Budget(method.config.steps, options.minutes, progress), options.until_psnr
+    schedule = schedule_of(method.config, progress)
+
+    def is_met(run: Run) -> bool:
+        """Whether what is wanted is reached: by some views, and then by all of them."""
+        if goal is None or not any(row["test_psnr"] >= goal for row in looks(progress.rows)[-1:]):
+            return False
+        found = judge(run.params.gaussians, judged).mean()["psnr"]
+        return found is not None and found >= goal
+
+    met = is_met(run)
+    ticks = drive(method, problem, run, progress=(lambda step: 1.0) if met else budget)
+    watch(
+        ticks,
+        progress,
+        schedule,
+        folder,
+        console,
+        minutes=options.minutes,
+        save_every=options.save_every,
+        look=Looks(judge, some_of(judged), options.judge_every, budget).begin(run.step),
+        enough=lambda now, row: row["test_psnr"] is not None and is_met(now.run),
+        listeners=() if board is None else (board.add,),
+    )
+    return ticks
+
+
+class Aside:
+    """What is done with a fit after its last step, and what it can do without: Ctrl-C and errors end it, and
+    the run still has its report."""
+
+    def __init__(self, seconds: dict[str, float], console: Console, notes: Notes):
+        self._seconds, self._console, self._notes = seconds, console, notes
+
+    @contextmanager
+    def __call__(self, name: str, words: str) -> Iterator[None]:
+        """Say what goes on, and how long it took."""
+        begun = perf_counter()
+        try:
+            with stage(self._console, words):
+                yield
+        except (KeyboardInterrupt, OSError, ValueError) as error:
+            self._notes.warn(f"{words} was left out: {reason(error)}")
+        self._seconds[name] = perf_counter() - begun
+
+
+def _note_oddities(
+    options: Options, progress: Progress, gaussians: Gaussians, finished: bool, notes: Notes
+) -> None:
+    if progress.skipped:
+        notes.add(f"{progress.skipped} steps met numbers that are not finite and changed nothing.")
+    compiling, given = progress.compile_seconds, 60 * (options.minutes or np.inf)
+    if compiling > given / 3:
+        kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir
+        later = "; programs are kept, and the next fit at this size finds most of them" if kept else ""
+        notes.warn(f"compiling took {compiling:.0f} s, of {given:.0f} given{later}")
+    if finished and gaussians.sh_degree < options.fit.sh_degree:
+        notes.add(
+            f"Colours are of degree {gaussians.sh_degree}: a degree is added every "
+            f"{options.fit.sh_every:,} steps (--fit.sh-every)."
+        )
+
+
+def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], model: Model) -> None:
+    """Writes cameras.npz, where cameras or exposures were learned: names [V], viewmats [V,4,4] (world to
+    camera, OpenCV axes), exposures [V,3,4] (the affine maps of colours)."""
+    if model.twists is None and model.exposures is None:
+        return
+    found = {
+        "names": np.array(names),
+        "viewmats": np.concatenate([frame.cameras.viewmat for frame in frames]),
+    }
+    if model.exposures is not None:
+        exposures = np.asarray(model.exposures)
+        found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)
+    write_npz(folder.path / "cameras.npz", found)
+
+
+def without_needless(
+    frames: list[Frame], config: FitConfig, gaussians: Gaussians, notes: Notes
+) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
+    """Those that some photograph needs, and the light that each sends.
+
+    Args:
+        frames: the photographs that were fitted.
+        config: how; its `prune` is the share of light below which one is not needed.
+        gaussians: the scene.
+        notes: told how many were left out.
+    """
+    if not gaussians.num:
+        return gaussians, np.zeros(0)
+    light = light_of(gaussians, frames, "antialiased" if config.antialiased else "classic")
+    kept = needed(light, config.prune) if config.prune else np.ones(len(light), bool)
+    if not kept.all():
+        some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
+        notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
+    return take(gaussians, kept), light[kept]

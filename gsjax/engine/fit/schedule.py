@@ -1,0 +1,98 @@
+"""How far a fit is, what its rows hold, and when held-out photographs are looked at."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsjax.engine.drive import Tick
+from gsjax.engine.fit.results import Judge
+from gsjax.engine.progress import Progress, Schedule
+from gsjax.methods.fit import FitConfig
+from gsjax.methods.fit.method import shrink_at
+
+_LOGGED_EVERY = 100  # steps
+_LOOKS = 10  # under --minutes, beside those that were asked for
+
+
+@dataclass(frozen=True)
+class Budget:
+    """step -> the share of a fit that is done before it: of its steps, or of its minutes, whichever is more.
+
+    Attributes:
+        steps: that were asked for.
+        minutes: of steps, compiling included; None for no limit.
+        progress: how much time was used.
+    """
+
+    steps: int
+    minutes: float | None
+    progress: Progress
+
+    def __call__(self, step: int) -> float:
+        used = 0.0 if self.minutes is None else self.progress.used_seconds / 60 / self.minutes
+        return max(step / self.steps, used)
+
+
+def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
+    """Rows of a fit: loss and psnr (of the photograph of that step), the number of Gaussians (alive), by how
+    many times smaller the photograph was (shrink), and test_psnr of held-out photographs, or None."""
+
+    def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
+        last = infos[-1] if infos else {}
+        shown = {name: _finite(last.get(name)) for name in ("loss", "psnr")}
+        alive = int(now.info["alive"])
+        return shown | {"alive": alive, "shrink": shrink_at(config, now.progress), "test_psnr": None}
+
+    def words(row: Mapping[str, Any]) -> str:
+        tested = looks(progress.rows)
+        test = f", {tested[-1]['test_psnr']:.1f} dB" if tested else ""
+        pace = f", {progress.pace:.0f}/s" if progress.pace else ""
+        loss = "–" if row["loss"] is None else f"{row['loss']:.2f}"
+        return f"loss {loss}{test}, {row['alive']:,} Gaussians{pace}"
+
+    return Schedule("fitting", config.steps, row, words, _LOGGED_EVERY)
+
+
+def _finite(value: Any) -> float | None:
+    """JSON has no infinity: a picture that is hit to the bit has no PSNR."""
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def looks(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows of steps after which held-out photographs were looked at."""
+    return [row for row in rows if row["test_psnr"] is not None]
+
+
+@dataclass
+class Looks:
+    """When held-out photographs are looked at while a fit goes on, and what is seen.
+
+    Attributes:
+        judge: of photographs.
+        some: held-out ones that are looked at on the way.
+        every: steps between looks.
+        budget: of the fit; under minutes there are ten looks besides.
+    """
+
+    judge: Judge
+    some: Sequence[Any]
+    every: int
+    budget: Budget
+    _tenths: int = field(default=0, init=False)
+
+    def begin(self, step: int) -> "Looks":
+        """Tenths of the time that were over before this step get no look."""
+        self._tenths = int(_LOOKS * self.budget(step))
+        return self
+
+    def __call__(self, now: Tick) -> dict[str, Any] | None:
+        """What the row of a step has of it; None where this is none of those."""
+        share = self.budget(now.step)
+        due = now.step % self.every == 0 or share >= 1
+        if self.budget.minutes is not None and int(_LOOKS * share) > self._tenths:
+            due, self._tenths = True, int(_LOOKS * share)
+        if not due:
+            return None
+        return {"test_psnr": self.judge(now.run.params.gaussians, self.some).mean()["psnr"]}
