@@ -37,7 +37,7 @@ CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the b
 
 @dataclass(frozen=True)
 class SourceAndOut:
-    """What is followed, and where that is kept."""
+    """The source to follow, and the folder of the run."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
@@ -47,14 +47,14 @@ class SourceAndOut:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common, Overwriting, FirstMasks, Selection, SourceAndOut):
-    """What `gsjax live` is told."""
+    """Options of `gsjax live`."""
 
     minutes: float = 1.0
     """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
     hz: float = 30.0
     """Frames a second: of the replay, and what the budget comes from."""
     budget_ms: float | None = None
-    """What an update may take; the time between two frames unless given."""
+    """Time that an update may take, milliseconds; default: the time between two frames."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
 
@@ -197,9 +197,9 @@ class Log:
             self.memory_mb.append(resident_mb())
 
     def _carried(self, twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """Where the groups' first middles are now, and how they are turned.
+        """Where the groups' first centres are now, and how they are turned.
 
-        The tracker's own middles shift with what joins a group; these go where its motion carries them.
+        The tracker's own centres shift with what joins a group; these go where its motion carries them.
         """
         before, turns = centers - twists[:, :3], Rotation.from_rotvec(twists[:, 3:])
         old = before if self._centers is None else self._centers
@@ -270,7 +270,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
     Args:
         options: budget, patience and how long.
         source: where frames come from.
-        log: is told of every update.
+        log: keeps every update.
         console: shows how far it is.
     """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms

@@ -46,7 +46,7 @@ class Tracking:
         plans: how many plans there were; more than one means that it had to plan again.
         visible: [K] of each update, which objects some camera saw.
         lost: [K] of each update, which objects were not where they were believed to be.
-        turn_known: [K] of each update, which objects' turns since the first frame pictures told.
+        turn_known: [K] of each update, whether the turn of each object since the first frame is known.
         skipped: updates that changed nothing, because a number in them was not finite.
         everywhere: of each update, how many groups it looked for everywhere.
         resumed: how many frames an earlier run had tracked; 0 without one.

@@ -16,7 +16,7 @@ class StartConfig:
     object_pixels: float = 1.5
     """Width of the voxels that keep one point of an object each, in pixels of the camera that saw it."""
     background_pixels: float = 4.0
-    """The same for the background, which is only looked at."""
+    """The same for the background, which is only rendered."""
     max_extent: float = 0.35
     """Objects longer than this are seldom rigid (a robot arm): they are followed in parts, metres."""
     part_size: float = 0.15
@@ -69,15 +69,15 @@ class AlignConfig:
     centers: int = 256
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 1.0
-    """What a centre counts beside a pixel. It keeps from drifting; a pixel looks more like the new frame."""
+    """Weight of a centre beside a pixel. Centres prevent drift; pixels look more like the new frame."""
     pixels: int = 192
-    """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
+    """Pixels of the last frame that stand for a group in each camera, and as many of its keyframe."""
     keyframe_turn: float = 0.4
     """The keyframe counts less as a group turns, and beyond this turn the last frame replaces it, radians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
     shading: float = 0.3
-    """What brightness counts beside chroma: 1 as much, 0 nothing. What turns is lit differently."""
+    """Weight of brightness beside chroma, 0 to 1. What turns is lit differently."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
@@ -145,11 +145,11 @@ class GrowConfig:
     slots: int = 4096
     """Gaussians that may join over the whole recording; 0 leaves growing out."""
     candidates: int = 256
-    """Pixels that are looked at in a frame."""
+    """Pixels that are examined in a frame."""
     reach: int = 6
     """How far from an object's outline they may be, pixels."""
     min_gap: float = 0.008
-    """What is measured this much nearer than the model is not explained by it, metres."""
+    """Depth measured this much nearer than the model is not explained by it, metres."""
     distance: float = 0.012
     """How near a pixel must be to a Gaussian to continue its object, metres ..."""
     color: float = 0.15
@@ -174,9 +174,9 @@ class TrackConfig:
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
     cameras: tuple[int, ...] = ()
-    """The frame's cameras that are followed with, counted from 0; all unless given."""
+    """Cameras of the frame to track with, counted from 0; default: all."""
     shrink: int = 1
-    """Pictures are averaged over so many pixels each way before anything else."""
+    """Pictures are averaged over blocks of this many pixels each way before anything else."""
     redraw: Literal["all", "moving"] = "moving"
     """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
     coarseness: int = 1
@@ -216,5 +216,5 @@ FAST = replace(
 )
 PRESETS = {"accurate": TrackConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
 """`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on one core,
-and looks for two objects everywhere in an update. `paper` has all of the paper's stages, template matching
+and searches everywhere for two objects in an update. `paper` has all of the paper's stages, template matching
 and photometric refinement too, which cost much and gain little: see docs/results-tracking.md."""

@@ -7,12 +7,12 @@ it shows in, weighted by how much it shows there:
 
     f = (W^T m) / (W^T 1)
 
-*Distillation* looks for those features whose render comes closest to the maps:
+*Distillation* finds the features whose render comes closest to the maps:
 
     min_f  |W f - a m|^2 + damping |f - f_projected|^2
 
 in which a = W 1 is the rendered alpha: what is half transparent shows half a feature. It is a linear least
-squares problem, so conjugate gradients solve it without a rate that somebody would have to choose; W^T 1 is
+squares problem, so conjugate gradients solve it without a learning rate; W^T 1 is
 the preconditioner, for it bounds what a row of W^T W can add up to. Both give a constant map back as it is.
 """
 
@@ -41,7 +41,7 @@ _CHANNELS = 16  # rendered at a time: hundreds, as foundation models have, compi
 
 
 class FeatureBatch(NamedTuple):
-    """What distillation is given.
+    """The batch of the distillation.
 
     Attributes:
         gaussians: the scene, frozen.

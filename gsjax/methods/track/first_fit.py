@@ -33,7 +33,7 @@ def start_scene(
         frame: what the cameras see at first, with depth.
         mask: labels [H, W] of one camera's image; 0 is background.
         mask_camera: which camera of the frame the mask belongs to, counted from 0.
-        config: how it starts; the default settings unless given.
+        config: how it starts; default: the default settings.
 
     Raises:
         ValueError: there is no depth, or the mask does not fit the images.
@@ -107,7 +107,7 @@ _STEP = gradient_step(fit_loss, per_field_adam(RATES))
 
 @cache
 def _advance() -> Callable:
-    """The jitted step; made late, because its options ask which machine this is."""
+    """The jitted step; made late, because its options depend on the machine."""
     return jax.jit(
         lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
         compiler_options=host_options(),

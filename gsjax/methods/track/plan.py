@@ -43,7 +43,7 @@ class TrackPlan:
 
 
 class Needed(NamedTuple):
-    """What a step needed of each capacity."""
+    """How much of each capacity a step needed."""
 
     full: Int[Array, ""]
     near: Int[Array, ""]

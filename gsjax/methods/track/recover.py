@@ -1,8 +1,8 @@
-"""Where a lost group may be: of many guesses, what the cameras show most of, aligned.
+"""Recovery of a lost group: many places are guessed and aligned, and the one where most of it shows is kept.
 
 Residuals cannot choose, for they take what hides a group, or lies outside the pictures, for a disagreement.
-So `confidence` does, with the Gaussians of the first frame that would face each camera. What it comes up with
-is a guess, from which the next frame goes on, until so much of the group shows there that it is found: in two
+So `confidence` does, with the Gaussians of the first frame that would face each camera. The result is a
+guess, from which the next frame goes on, until enough of the group shows there for it to be found: in two
 frames, for of many guesses one may agree by chance.
 """
 
@@ -33,17 +33,15 @@ def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -
 
 
 class Relocation(NamedTuple):
-    """Where a lost group may be instead."""
+    """Another place where a lost group may be."""
 
     twists: Float[Array, "*k 6"]  # from where it is believed to be
     sure: Confidence
-    before: (
-        Confidence  # of where it was said to be in the last frame, aligned: found by chance, it is not there
-    )
+    before: Confidence  # of the last frame's guess, aligned: what agreed by chance does not again
 
 
 class SearchContext(NamedTuple):
-    """What a lost group is looked for in."""
+    """The images that a lost group is looked for in, and what hides it there."""
 
     sight: Sight
     background: Float[Array, "c h w"] | None  # its depth, metres, where it is known; else 0
@@ -60,13 +58,13 @@ def recover(
     config: AlignConfig,
     gap: float,
 ) -> Relocation:
-    """Where one lost group shows most.
+    """The place where most of one lost group shows.
 
     Args:
         key: of the random places.
         reference: of the group.
         center: what it turns about.
-        guess: what this said in the last frame, from where the group is believed to be now.
+        guess: the result of the last frame, from where the group is believed to be now.
         around: what it is looked for in.
         gap: see `confidence`.
     """
@@ -107,7 +105,7 @@ def recover(
 
 
 def evidence(sure: Confidence) -> Float[Array, "*k"]:
-    """What speaks for a group's being somewhere: much of it shows, and what shows of it agrees."""
+    """Evidence that a group is in a place: much of it shows there, and what shows agrees."""
     return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
 
 
@@ -126,7 +124,7 @@ def with_unexplained(
     Args:
         gap: what is measured this much nearer than the background is not explained by it, metres ...
         thickness: ... and this much nearer than a group, metres.
-        coarseness: `shown` has every so-manieth pixel.
+        coarseness: n, where `shown` has every n-th pixel.
     """
     if sight.depths is None:
         return shown
@@ -146,13 +144,13 @@ def guesses(
     guess: Float[Array, "6"],
     config: AlignConfig,
 ) -> Float[Array, "h 6"]:
-    """Where a lost group may be: half of them at strange pixels and a quarter near by, turned at random, and
-    a quarter near the guess.
+    """Places where a lost group may be: half of them at unexplained pixels and a quarter near by, turned at
+    random, and a quarter near the guess.
 
     Args:
         key: of the random places.
         shifts: what is tried near by.
-        reference: of the group. Those of about a strange pixel's colour are brought to it.
+        reference: of the group. Those of about an unexplained pixel's colour are brought to it.
         center: what the group turns about.
         unexplained_pixels: pixels that no group explains, as each camera sees them.
         guess: see `recover`.

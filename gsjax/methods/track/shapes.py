@@ -50,7 +50,7 @@ class Shape(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is."""
+        """Its name."""
         ...
 
     @property
@@ -221,7 +221,7 @@ def _scores(shape: Shape, poses: np.ndarray, frame: Frame) -> np.ndarray:
 
 
 def _observed_colors(scene: TrackedScene, frame: Frame):
-    """Of each Gaussian in each camera: its pixel's colour, whether that exists, whether an object is near."""
+    """Each Gaussian's colour in each camera, whether it has one, and whether an object is near."""
     rendered = render_labels(scene, first_pose(scene), frame, plan_render(scene.gaussians, frame.cameras))
     assert rendered.features is not None
     objects = 1 - rendered.features[..., 0] / jnp.maximum(rendered.alphas, 1e-3)
@@ -241,7 +241,7 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
 def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
     """Each Gaussian takes the median over cameras of the colours it is seen in.
 
-    The background listens to no pixel that an object may cover, and where none is left to its nearest
+    The background uses no pixel that an object may cover, and where none is left to its nearest
     neighbour; an object's Gaussian to none that looks unlike its group, for something stands in front.
     """
     colors, inside, covered = (np.asarray(a) for a in _observed_colors(scene, frame))
@@ -300,5 +300,5 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
 
 @cache
 def _refine_rigidly() -> Callable:
-    """The jitted refinement; made late, because its options ask which machine this is."""
+    """The jitted refinement; made late, because its options depend on the machine."""
     return jax.jit(refine, static_argnums=2, compiler_options=host_options())

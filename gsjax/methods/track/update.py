@@ -181,6 +181,6 @@ def _looked_for(batch: TrackBatch, num_objects: int, config: TrackConfig) -> Arr
 
 
 def _can_be_read(frame: Frame, broken: Array) -> Bool[Array, ""]:
-    """Whether the frame says anything, and from where."""
+    """Whether the frame has a pixel that is finite, and cameras that are."""
     count = frame.images.size // 3
     return (broken < count) & all_finite((frame.cameras.viewmat, frame.cameras.K))

@@ -59,7 +59,7 @@ def look_back(now: Moment, config: TrackConfig) -> Past:
 
 
 def starting_points(now: Moment, past: Past, config: TrackConfig, reduction: int) -> Starts:
-    """Second stage: standing still, going on as before, and what template matching says.
+    """Second stage: standing still, going on as before, and where template matching finds it.
 
     Args:
         now: see `Moment`.
@@ -118,7 +118,7 @@ def align_and_search(
         return recover(jax.random.fold_in(key, group), *own, around, config.align, gap)
 
     how = (config.align, state.watch, past.visible, everywhere)
-    # Without depth, what hides a group cannot be told from what is not it.
+    # Without depth, an occluder cannot be distinguished from anything else that is not the group.
     beyond = () if now.sight.depths is None else (astray, recovered)
     sought = search(starts.twists, points, now.centers, now.sight, *how, *beyond)
     return Hunt(sought, points, named, astray, others, near)
@@ -133,7 +133,7 @@ def in_search_round(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]
 def refine_motion(
     now: Moment, past: Past, starts: Starts, hunt: Hunt, config: TrackConfig, extra_losses: ExtraLosses
 ) -> Refined:
-    """Fourth stage, where `config.refine.iterations` asks for it: D_k and delta_i against rendered images,
+    """Fourth stage, where `config.refine.iterations` is above 0: D_k and delta_i against rendered images,
     kept for the groups that agree better with it. What too few pixels show stands still.
 
     Args:
@@ -169,7 +169,7 @@ def refine_motion(
 def _look_again(
     now: Moment, past: Past, asked: Bool[Array, ""], config: TrackConfig
 ) -> tuple[Shown, Int[Array, ""]]:
-    """What the last scene shows to the cameras of now, if that is asked, and what capacity that took."""
+    """What the last scene shows to the cameras of this frame, if that is asked, and what capacity it took."""
     backdrop, before = past.backdrop, (past.shown, jnp.int32(0))
     if backdrop is None or now.frame.depths is None:
         return before
@@ -179,7 +179,7 @@ def _look_again(
 
 
 def _match(template: Template | None, now: Moment, config: TrackConfig, reduction: int):
-    """Where template matching says that each group has gone, whether it found it, and its scores [C, K]."""
+    """Each group's shift by template matching, whether it was found, and scores [C, K]."""
     num_objects, num_cameras = now.scene.num_objects, len(now.frame.images)
     if not config.matching:
         nowhere, unfound = jnp.zeros((num_objects, 3)), jnp.zeros(num_objects, bool)

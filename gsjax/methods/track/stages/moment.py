@@ -91,7 +91,7 @@ class Starts(NamedTuple):
 
 
 class Hunt(NamedTuple):
-    """What the alignment and the search came to.
+    """The result of alignment and search.
 
     Attributes:
         sought: the best twist of each group, and where it may be instead.
