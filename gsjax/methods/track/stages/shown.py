@@ -37,7 +37,14 @@ def show(
 
 
 def pixels_shown(shown: Shown, sight: Sight, num_objects: int, config: TrackConfig) -> tuple[Points, Points]:
-    """Pixels that show each group, and those that none explains."""
+    """Pixels that show each group, and those that none explains.
+
+    Args:
+        shown: what the scene shows.
+        sight: what the cameras see.
+        num_objects: K, static.
+        config: the tracker's.
+    """
     gaps = (config.grow.min_gap, config.align.max_thickness)
     labelled = with_unexplained(shown, sight, num_objects, *gaps, config.coarseness)
     how = (num_objects + 1, config.align, config.coarseness)
