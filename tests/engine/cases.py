@@ -83,9 +83,9 @@ def track_step_case():
 def features_case():
     first, _, scene = little_table()
     gaussians, plan = scene.gaussians, plan_render(scene.gaussians, first.cameras)
-    known = jnp.ones(first.images.shape[:3])
+    valid = jnp.ones(first.images.shape[:3])
     prior = jax.random.normal(jax.random.key(0), (gaussians.num, 3))
-    known = known, prior, jnp.ones(gaussians.num), jnp.float32(0.1), plan
+    known = valid, prior, jnp.ones(gaussians.num), jnp.float32(0.1), plan
     batch = FeatureBatch(gaussians, first.cameras, first.images, *known)
     sick = batch._replace(maps=jnp.full_like(first.images, jnp.nan))
     return feature_distiller(), prior, batch, sick, batch._replace(plan=replace(plan, capacity=16))

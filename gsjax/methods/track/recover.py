@@ -130,9 +130,9 @@ def with_unexplained(
         return shown
     measured = sight.depths[:, ::coarseness, ::coarseness]
     nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
-    strange = (measured > 0) & shown.covered & (measured < nearest)
-    labels = jnp.where(strange, num_groups + 1, shown.labels)
-    return shown._replace(labels=labels, depths=jnp.where(strange, measured, shown.depths))
+    unexplained = (measured > 0) & shown.covered & (measured < nearest)
+    labels = jnp.where(unexplained, num_groups + 1, shown.labels)
+    return shown._replace(labels=labels, depths=jnp.where(unexplained, measured, shown.depths))
 
 
 def guesses(
@@ -168,8 +168,8 @@ def guesses(
     turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1)) * (config.max_turn > 0)
     offsets = reference.means[:, paired].T - center
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
-    strange = (jnp.arange(count) % 2 == 1) & any_there
-    far = jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
+    unexplained = (jnp.arange(count) % 2 == 1) & any_there
+    far = jnp.concatenate([jnp.where(unexplained[:, None], away, shifts[:, :3]), turns], axis=1)
     nearly = _NEAR_GUESS * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
     near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(guess, far.shape))
     return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)
