@@ -10,7 +10,6 @@ import numpy as np
 from rich.table import Table as Grid
 
 from gsjax.engine.ending import print_grid
-from gsjax.engine.fit.orbit import NAME as ORBIT
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import in_words
 from gsjax.engine.messages import counted
@@ -28,6 +27,8 @@ from gsjax.scene.render import render_with_room
 from gsjax.viz.colors import side_by_side
 from gsjax.viz.plots import fit_curve, save
 
+ORBIT = "orbit"
+"""The video about the scene, among those of cameras."""
 _SHOWN = 8  # views in the report
 _LEAST_SIDE = 11  # of SSIM's window
 _PANEL_HEIGHT = 240  # pixels, at least, so that captions hide little
