@@ -1,10 +1,12 @@
 """gsjax: moving scenes from 3D Gaussians, in pure JAX.
 
-rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
+verbs       fit, track, parts, distill, deform: data in, a tick a step, `now.result` at the end
+settings    FitConfig, TrackConfig, PartsConfig, DistillConfig, DeformConfig
+data        open_photographs, open_sequence, Photographs, Sequence
+tracking    start_scene, scene_from_shapes
+files       save, load, read_ply, write_ply
 scene       Gaussians, Tags, Camera, Frame, render, plan_render
-data        open_sequence, Sequence
-tracking    start_scene, scene_from_shapes, track, track_step, TrackConfig
-files       read_ply, write_ply
+rasterize   rasterization, plan, Plan, sharded_rasterization, composite_tile
 speed       host_options, keep_freed_memory, keep_programs
 """
 
@@ -12,16 +14,16 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gsjax.data import Sequence, open_sequence
+    from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
+    from gsjax.engine.checkpoint import load, save
+    from gsjax.engine.verbs import fit
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
-    from gsjax.methods.track import (
-        TrackConfig,
-        scene_from_shapes,
-        start_scene,
-        track,
-        track_step,
-    )
+    from gsjax.methods.deform import DeformConfig
+    from gsjax.methods.distill import DistillConfig
+    from gsjax.methods.fit import FitConfig
+    from gsjax.methods.parts import PartsConfig
+    from gsjax.methods.track import TrackConfig, scene_from_shapes, start_scene, track
     from gsjax.optim.compiler import host_options, keep_freed_memory, keep_programs
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
@@ -35,16 +37,16 @@ __version__ = "0.1.0"
 
 # Loaded at first use (PEP 562): `gsjax --help` need not wait for JAX.
 _HOMES = {
-    "gsjax.data": ("Sequence", "open_sequence"),
+    "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
+    "gsjax.engine.checkpoint": ("load", "save"),
+    "gsjax.engine.verbs": ("fit",),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
-    "gsjax.methods.track": (
-        "TrackConfig",
-        "track_step",
-        "scene_from_shapes",
-        "start_scene",
-        "track",
-    ),
+    "gsjax.methods.deform": ("DeformConfig",),
+    "gsjax.methods.distill": ("DistillConfig",),
+    "gsjax.methods.fit": ("FitConfig",),
+    "gsjax.methods.parts": ("PartsConfig",),
+    "gsjax.methods.track": ("TrackConfig", "scene_from_shapes", "start_scene", "track"),
     "gsjax.optim.compiler": ("host_options", "keep_freed_memory", "keep_programs"),
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),
@@ -58,27 +60,35 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Camera",
+    "DeformConfig",
+    "DistillConfig",
+    "FitConfig",
     "Frame",
     "Gaussians",
+    "PartsConfig",
+    "Photographs",
     "Plan",
     "Sequence",
     "Tags",
     "TrackConfig",
     "composite_tile",
+    "fit",
     "host_options",
     "keep_freed_memory",
     "keep_programs",
+    "load",
+    "open_photographs",
     "open_sequence",
     "plan",
     "plan_render",
     "rasterization",
     "read_ply",
     "render",
+    "save",
     "scene_from_shapes",
     "sharded_rasterization",
     "start_scene",
     "track",
-    "track_step",
     "write_ply",
 ]
 

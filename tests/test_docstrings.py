@@ -15,7 +15,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "gsjax"
 LAYERS = (
     *("geometry", "rasterize", "scene", "losses", "optim", "methods"),
-    *("perception", "metrics", "data", "io", "viz", "cli"),
+    *("perception", "metrics", "data", "io", "viz", "engine", "cli"),
 )
 FEW = 2  # so many parameters may be left to their names and annotations
 ERRORS = ("ValueError", "TypeError", "OSError", "DataError")

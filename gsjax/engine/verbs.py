@@ -10,7 +10,6 @@ is its `result`:
 
 from gsjax.data.photographs import Photographs
 from gsjax.engine.drive import Drive, Tick, drive
-from gsjax.engine.fit.start import start_from
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.fit import Fit, FitConfig
 
@@ -37,6 +36,8 @@ def fit(
         ValueError: as `gsjax.methods.fit.Fit.start`.
         DataError: a photograph cannot be read.
     """
+    from gsjax.engine.fit.start import start_from  # matching is seldom needed, and slow to import
+
     frames = [photographs.frame(i) for i in range(photographs.num)]
     config, cloud = start_from(photographs, frames, FitConfig() if config is None else config)
     method = Fit(config, extra_losses)

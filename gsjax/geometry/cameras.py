@@ -184,7 +184,7 @@ def camera_centers(viewmats: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch
 
 
 def perturbed(
-    viewmats: Float[Array, "c 4 4"], twist: Float[Array, "6"], radius: float
+    viewmats: Float[Array, "c 4 4"], twist: Float[Array, "6"], radius: Float[Array, ""] | float
 ) -> Float[Array, "c 4 4"]:
     """View matrices of cameras that are rotated about their own centres and shifted, all by one twist.
 

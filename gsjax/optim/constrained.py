@@ -14,7 +14,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxopt.projection import projection_simplex
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 _DECAY, _SQUARE_DECAY, _EPS = 0.9, 0.999, 1e-15  # as for Adam elsewhere
@@ -27,6 +26,8 @@ def project_simplex(values: Float[Array, "*batch P"]) -> Float[Array, "*batch P"
     The derivative passes the tangents of the entries above 0, less their mean, and 0 for the others, also at
     kinks. An entry of -inf becomes 0; a row with a NaN or +inf becomes NaN and affects no other row.
     """
+    from jaxopt.projection import projection_simplex  # it warns on import, and few need it
+
     # A constant added to a row changes nothing; without the largest entry, sums of large values stay exact.
     offsets = jax.lax.stop_gradient(values.max(axis=-1, keepdims=True))
     rows = (values - offsets).reshape(-1, values.shape[-1])

@@ -222,7 +222,11 @@ def least_squares_step(
             "accepted": accepted,
             "skipped": ~sound,
         }
-        aux = {**keep_if(accepted, moved_aux, aux), **capacity, **info}
+        absent = {
+            "overflow": jnp.array(False),
+            "needed": jnp.int32(0),
+        }  # of a residual that draws with no plan
+        aux = {**absent, **keep_if(accepted, moved_aux, aux), **capacity, **info}
         params = keep_if(accepted, from_coordinates(params, moved), params)
         return params, keep_if(sound, search, state), aux
 

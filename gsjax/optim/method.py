@@ -86,7 +86,7 @@ class Method(Protocol[Problem]):
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[PyTree, tuple[str, ...]]:
         """What the next step is given, and the names in `run.plans` of the plans that it draws with, in the
-        order of `info["needed"]`."""
+        order of `info["needed"]`. Arguments as for `between`."""
         ...
 
     def result(self, problem: Problem, run: Run) -> Any:

@@ -12,6 +12,7 @@ from numbers import Real
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+from jaxtyping import Array, Int
 
 _LADDER_START, _LADDER_RATIO = 4096, math.sqrt(2.0)
 
@@ -151,7 +152,7 @@ class Plan:
         pixels = max(_LEAST_PIXELS, FEW_CHANNELS * pixels // max(channels, FEW_CHANNELS))
         return self.tiles_per_batch or max(1, pixels // self.tile_pixels)
 
-    def grown(self, needed: int, headroom: float = 1.0) -> "Plan":
+    def grown(self, needed: int | Int[Array, ""], headroom: float = 1.0) -> "Plan":
         """The same plan on the lowest rung that holds `needed` pairs, and never below this one.
 
         Raises:

@@ -48,7 +48,7 @@ def test_it_descends_and_names_its_losses(params):
         values.append(float(info["loss"]))
     assert values[-1] < 1e-6
     assert np.all(np.diff(values) < 0)
-    assert set(info) == {"loss", "skipped", "overflow", "first"}
+    assert set(info) == {"loss", "skipped", "overflow", "needed", "first"}
     assert not info["skipped"]
     np.testing.assert_allclose(params.a, [1.0, -2.0], atol=1e-3)
 

@@ -114,7 +114,8 @@ class Fit:
         return self.config.steps
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Relocates or divides, unlocks the next degree of the spherical harmonics, plans a new size."""
+        """Relocates or divides, unlocks the next degree of the spherical harmonics, plans a new size.
+        Arguments as for `Method.between`."""
         run = self._densified(problem, run, run.step - 1, progress)
         run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
         name, frame = self._turn(problem, run.step, progress)
@@ -125,7 +126,7 @@ class Fit:
         return run.having(plans=run.plans | {name: replace(plan, sh_degree=gaussians.sh_degree)})
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The photograph whose turn it is."""
+        """The photograph whose turn it is, and the plan for its size. Arguments as for `Method.batch`."""
         name, frame = self._turn(problem, run.step, progress)
         if problem.background is None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _BACKGROUND)
@@ -201,7 +202,13 @@ def shrink_at(config: FitConfig, progress: float) -> int:
 
 
 def all_seen_since(config: FitConfig, step: int, views: int) -> bool:
-    """Whether each photograph had a turn since this was last so; two rounds of turns hold a whole one."""
+    """Whether each photograph had a turn since this was last so; two rounds of turns hold a whole one.
+
+    Args:
+        config: how often the fit grows.
+        step: index of the step just made.
+        views: how many photographs there are.
+    """
     if config.strategy == "split":  # which forgets each time what was seen
         return config.split.every >= 2 * views
     period = -(-2 * views // config.growth.every) * config.growth.every
@@ -213,6 +220,11 @@ def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
 
     All are of one kind, with a mask where any has one that leaves something out, and with depth where any has
     some: each kind is a program of its own.
+
+    Args:
+        frames: all photographs, on the host.
+        view: the index of the photograph.
+        shrink: how many times smaller it is to be, 1 or more.
     """
     frame = frames[view]
     image = frame.images[0]

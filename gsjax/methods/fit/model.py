@@ -64,7 +64,10 @@ def exposed(
 
 
 def refined(
-    viewmats: Float[Array, "c 4 4"], twists: Float[Array, "views 6"], view: Int[Array, ""], radius: float
+    viewmats: Float[Array, "c 4 4"],
+    twists: Float[Array, "views 6"],
+    view: Int[Array, ""],
+    radius: Float[Array, ""] | float,
 ) -> Float[Array, "c 4 4"]:
     """View matrices of cameras that were turned about their centres and shifted. On average over photographs
     neither turned nor shifted, for else the scene could move along.

@@ -1,0 +1,159 @@
+"""The laws of steps, held by every step of the package: a case makes a small problem, and each law takes it.
+
+A step keeps the tree and shapes of its state; an update that is not finite, or that overflowed its plan,
+changes neither params nor state; `info` has loss, skipped, overflow and needed; `step` may be traced; it runs
+in `jax.lax.scan`; and it still works when another step wraps it.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from gsjax.optim.least_squares import least_squares_step
+from gsjax.optim.step import Step, gradient_step
+from tests.engine import cases
+
+KEY = jax.random.key(7)
+
+
+class Case(NamedTuple):
+    """A step and what it is tried with.
+
+    Attributes:
+        step: the step.
+        params: to begin with.
+        batch: one in which nothing is wrong.
+        sick: one with a number that is not finite; None if params are poisoned instead.
+        tight: one whose plan is too small; None for a step without a plan.
+        begin: params -> state, where that is more than `step.init`.
+    """
+
+    step: Step
+    params: Any
+    batch: Any
+    sick: Any
+    tight: Any = None
+    begin: Callable[[Any], Any] | None = None
+
+    def state(self) -> Any:
+        return self.step.init(self.params) if self.begin is None else self.begin(self.params)
+
+
+def of_a_gradient() -> Case:
+    def loss(params, batch, *, step, key):
+        return jnp.sum((params - batch) ** 2), {}
+
+    return Case(gradient_step(loss, optax.adam(0.1)), jnp.zeros(3), jnp.ones(3), jnp.full(3, jnp.nan))
+
+
+def of_least_squares() -> Case:
+    def residual(params, batch, *, step, key):
+        return params - batch, {}
+
+    return Case(least_squares_step(residual), jnp.zeros(3), jnp.ones(3), jnp.full(3, jnp.nan))
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "gradient": of_a_gradient,
+    "least squares": of_least_squares,
+    **{name: (lambda make=make: Case(*make())) for name, make in cases.STEPS.items()},
+}
+
+
+@cache
+def case_of(name: str) -> Case:
+    return CASES[name]()
+
+
+@cache
+def jitted(name: str) -> Callable:
+    update = case_of(name).step.update
+    return jax.jit(lambda params, state, batch, step: update(params, state, batch, step=step, key=KEY))
+
+
+@pytest.fixture(params=CASES)
+def name(request) -> str:
+    return request.param
+
+
+def shapes(tree):
+    return jax.tree.map(lambda a: (jnp.shape(a), jnp.result_type(a)), tree)
+
+
+def assert_same(new, old):
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b)), new, old)
+
+
+def test_params_and_state_keep_their_form_and_info_has_its_names(name):
+    case = case_of(name)
+    state = case.state()
+    params, after, info = jitted(name)(case.params, state, case.batch, jnp.asarray(3))
+    assert shapes(params) == shapes(case.params)
+    assert shapes(after) == shapes(state)
+    assert {"loss", "skipped", "overflow", "needed"} <= set(info)
+    assert info["loss"].shape == info["skipped"].shape == info["overflow"].shape == ()
+    assert not bool(info["skipped"])
+    assert not bool(info["overflow"])
+    assert np.isfinite(float(info["loss"]))
+    changed = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), (params, after), (case.params, state))
+    assert any(jax.tree.leaves(changed))
+
+
+def test_what_is_not_finite_changes_nothing(name):
+    case = case_of(name)
+    state = case.state()
+    params, after, info = jitted(name)(case.params, state, case.sick, jnp.asarray(3))
+    assert bool(info["skipped"])
+    assert_same((params, after), (case.params, state))
+
+
+def test_a_plan_that_is_too_small_changes_nothing_and_what_it_needs_is_enough(name):
+    case = case_of(name)
+    if case.tight is None:
+        pytest.skip("draws with no plan")
+    state = case.state()
+    params, after, info = jitted(name)(case.params, state, case.tight, jnp.asarray(3))
+    assert bool(info["overflow"])
+    assert bool(info["skipped"])
+    assert_same((params, after), (case.params, state))
+
+
+def test_it_runs_in_a_scan_as_it_does_alone(name):
+    case = case_of(name)
+    params, state = case.params, case.state()
+
+    def both(carry, step):
+        *carry, info = case.step.update(*carry, case.batch, step=step, key=KEY)
+        return tuple(carry), info["loss"]
+
+    carry, losses = jax.jit(lambda carry: jax.lax.scan(both, carry, jnp.arange(2)))((params, state))
+    for i in range(2):
+        params, state, info = jitted(name)(params, state, case.batch, jnp.asarray(i))
+    np.testing.assert_allclose(losses[-1], info["loss"], rtol=1e-3, atol=1e-6)
+    assert shapes(carry) == shapes((params, state))
+
+
+def test_a_step_that_wraps_it_works(name):
+    """An average of params over steps, as one keeps for evaluation."""
+    case = case_of(name)
+
+    def averaged(step: Step) -> Step:
+        def update(params, state, batch, *, step_=step, step, key):
+            inner, mean = state
+            params, inner, info = step_.update(params, inner, batch, step=step, key=key)
+            moved = jax.tree.map(lambda m, p: jnp.where(info["skipped"], m, 0.9 * m + 0.1 * p), mean, params)
+            return params, (inner, jax.tree.map(lambda m, p: m.astype(p.dtype), moved, params)), info
+
+        return Step(lambda params: (case.state(), params), update)
+
+    wrapped = averaged(case.step)
+    update = jax.jit(lambda p, s, b, i: wrapped.update(p, s, b, step=i, key=KEY))
+    params, state, info = update(case.params, wrapped.init(case.params), case.batch, jnp.asarray(0))
+    assert np.isfinite(float(info["loss"]))
+    assert shapes(state[1]) == shapes(params)
