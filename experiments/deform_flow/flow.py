@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from experiments.shared.deforming import Reconstructed, drawn
 from experiments.shared.recordings import recorded
-from gsjax.data.resizing import blended, picked
+from gsjax.data.resizing import area_resized, nearest_resized
 from gsjax.methods.deform import DeformConfig, Look, begin_deform, reconstruct
 from gsjax.metrics.image import psnr
 from gsjax.metrics.tracking import carried_points
@@ -57,8 +57,8 @@ class Pair:
             return width, height
 
         K = self.K * np.array([[width / self.depths[0].shape[1]], [height / self.depths[0].shape[0]], [1]])
-        image = blended(lambda t: self.images[t], size)(t)
-        return Look(image, None, picked(lambda t: self.depths[t], size)(t), np.eye(4), K, float(t))
+        image = area_resized(lambda t: self.images[t], size)(t)
+        return Look(image, None, nearest_resized(lambda t: self.depths[t], size)(t), np.eye(4), K, float(t))
 
 
 def pair(name: str = "deepdeform") -> Pair:
