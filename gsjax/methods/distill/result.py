@@ -135,8 +135,9 @@ class DistillResult:
             encoder = self.source.encoder()
         if negatives is None:
             negatives = () if self.source is None else self.source.negatives(text)
-        texts, embed = (text, *negatives), encoder.embed_text
-        return np.stack([embed(one) for one in texts]), texts[1:]
+        assert encoder is not None
+        texts = (text, *(negatives or ()))
+        return np.stack([encoder.embed_text(one) for one in texts]), texts[1:]
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene.
