@@ -28,7 +28,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         scene, teacher, iterations = _doubled(scene), _enlarged(teacher), FEW
     found = learned(scene, scene.taught, teacher, DistillConfig(iterations=iterations, seed=seed))
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
-    step_s = found.seconds / (iterations - 1)
+    step_s = found.seconds / iterations
     return {
         "gaussians": scene.gaussians.num,
         "step_ms": 1e3 * step_s,

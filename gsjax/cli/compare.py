@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from gsjax.engine.compare.comparison import Aspect, Comparison, Group, compare
+from gsjax.engine.compare.aspects import Aspect
+from gsjax.engine.compare.comparison import Comparison, Group, compare
 from gsjax.engine.compare.pictures import shows_the_same, write_strip
 from gsjax.engine.folder import expect_ours, fresh_folder, is_run
 from gsjax.engine.messages import counted
@@ -29,13 +30,13 @@ _LOG_WIDTH = 200
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax compare` is told."""
+    """Options of `gsjax compare`."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN RUN [RUN ...]")]
-    """Folders of runs of one command: `gsjax fit`, or `gsjax track`."""
+    """Folders of runs of one command: `gsjax fit`, `track`, `parts`, `distill` or `deform`."""
     out: Path | None = None
-    """Folder for comparison.json and report.html, with curves and pictures; without, only the tables are
-    printed. It must be new, empty, or hold an earlier comparison, which is replaced."""
+    """Folder for comparison.json and report.html, with curves and pictures. It must be new, empty, or hold an
+    earlier comparison, which is replaced. By default only the tables are printed."""
 
 
 def run(options: Options) -> int:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
-from gsjax.engine.fit.results import Compared, Judge, write_panel
+from gsjax.engine.fit.judge import Compared, Judge, write_panel
 from gsjax.engine.folder import replaced_folder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import in_words

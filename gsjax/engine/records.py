@@ -11,7 +11,7 @@ import yaml
 
 from gsjax.engine.folder import expect_run
 
-Kind = Literal["fit", "track"]
+Kind = Literal["fit", "track", "parts", "distill", "deform"]
 EVALUATION = Path("eval", "metrics.json")
 """Where `gsjax eval` writes what it found, within the folder of a run."""
 _SCORES: dict[Kind, tuple[str, ...]] = {
@@ -20,8 +20,14 @@ _SCORES: dict[Kind, tuple[str, ...]] = {
         *("dataset", "image", "frames", "tracked_cameras", "held_out_cameras", "objects", "iou"),
         *("tracked", "held_out", "update_hz", "gaussians", "machine"),
     ),
+    "parts": (
+        *("dataset", "image", "frames", "tracked_cameras", "held_out_cameras", "parts", "num_parts"),
+        *("tracked", "held_out", "update_s", "num_gaussians", "machine"),
+    ),
+    "distill": ("dataset", "size", "judged_by", "views", "test", "seconds", "steps", "trained", "machine"),
+    "deform": ("dataset", "size", "judged_by", "frames", "test", "tracks", "seconds", "steps", "machine"),
 }
-_CURVE = ("step", "seconds", "alive", "test_psnr")
+_CURVES: dict[Kind, tuple[str, ...]] = {"fit": ("step", "seconds", "alive", "test_psnr")}
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ def read_record(path: Path) -> Record:
 
     Raises:
         FileNotFoundError: there is no such folder, or it is no run's.
-        ValueError: a file of it cannot be read, or the run is neither of `gsjax fit` nor of `gsjax track`.
+        ValueError: a file of it cannot be read, or the run is of a command whose runs are not compared.
     """
     expect_run(path)
     config = read_config(path / "config.yml")
@@ -67,7 +73,7 @@ def read_record(path: Path) -> Record:
     if evaluation is not None and evaluation.get("scene_sha256") != digest(path / "scene.ply"):
         evaluation = None
         notes = (f"{path}: what `gsjax eval` found is of an earlier scene and is left out; run it again.",)
-    return Record(path, kind, config, metrics, _lines(path / "metrics.jsonl"), evaluation, notes)
+    return Record(path, kind, config, metrics, _lines(path / "metrics.jsonl", kind), evaluation, notes)
 
 
 def digest(file: Path) -> str | None:
@@ -96,13 +102,20 @@ def read_config(file: Path) -> dict[str, Any]:
 
 
 def _kind(path: Path, config: Mapping[str, Any]) -> Kind:
-    if "fit" in config and "test_every" in config:
-        return "fit"
-    if "track" in config and "eval_cameras" in config:
-        return "track"
+    """The command that made a run: `gsjax parts` has the settings of a fit among its own."""
+    marks: dict[Kind, tuple[str, ...]] = {
+        "parts": ("parts", "anchor"),
+        "distill": ("distill", "features"),
+        "deform": ("deform", "tools"),
+        "fit": ("fit", "test_every"),
+        "track": ("track", "eval_cameras"),
+    }
+    for kind, names in marks.items():
+        if all(name in config for name in names):
+            return kind
     raise ValueError(
-        f"{path}: expected a run of `gsjax fit` or `gsjax track`, found settings of another command "
-        f"({', '.join(list(config)[:6])})"
+        f"{path}: expected a run of {', '.join(f'`gsjax {kind}`' for kind in sorted(marks))}, found settings "
+        f"of another command or version ({', '.join(list(config)[:6])})"
     )
 
 
@@ -118,7 +131,7 @@ def _object(file: Path, wanted: tuple[str, ...]) -> dict[str, Any] | None:
     return found
 
 
-def _lines(file: Path) -> list[dict[str, Any]]:
+def _lines(file: Path, kind: Kind) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     try:
@@ -126,7 +139,7 @@ def _lines(file: Path) -> list[dict[str, Any]]:
     except ValueError as error:
         raise ValueError(f"{file}: expected a line of JSON each, found others ({error})") from error
     for row in rows:
-        _expect(file, row, _CURVE)
+        _expect(file, row, _CURVES.get(kind, ()))
     return rows
 
 

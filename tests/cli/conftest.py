@@ -13,14 +13,13 @@ import pytest
 from gsjax.cli import main, track
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
-from gsjax.engine.distill.file import StoredField, write_field
 from gsjax.engine.distill.scene import SceneOptions
 from gsjax.engine.distill.source import Source
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.records import digest
 from gsjax.engine.track import loop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
-from gsjax.methods.distill import FeatureField
+from gsjax.methods.distill import DistillResult, FeatureField
 from gsjax.methods.track import Tracked, first_pose, start_scene
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
@@ -141,5 +140,5 @@ def write_made_field(
     about = {"file": str(scene), "sha256": digest(scene), "num_gaussians": len(labels)}
     about["photographs"] = photographs
     folder.mkdir(parents=True, exist_ok=True)
-    write_field(folder / "field.npz", StoredField(field, None, source, about))
+    DistillResult(field, None, source, about).write(folder / "field.npz")
     return folder

@@ -4,14 +4,14 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from gsjax.engine.compare.aspects import ASPECTS, Aspect, data_in_words, data_of
 from gsjax.engine.machine import name as machine_name
 from gsjax.engine.records import Kind, Record
 from gsjax.engine.report import format_number
-from gsjax.engine.track.results import MOVED_MM
 
 _NOT_COMPARED = (
     "out",
@@ -22,46 +22,6 @@ _NOT_COMPARED = (
 )  # settings that say nothing of a result
 
 
-class Aspect(NamedTuple):
-    """What runs are compared by.
-
-    Attributes:
-        head, unit, decimals: of its column.
-        key: in comparison.json.
-        better: which of two numbers is; None where neither.
-        of: what must be the same for two numbers to be compared: the views, the data, or the machine too.
-    """
-
-    head: str
-    key: str
-    unit: str
-    decimals: int | None
-    better: Literal["more", "less"] | None
-    of: Literal["views", "data", "machine"]
-
-
-ASPECTS: dict[Kind, tuple[Aspect, ...]] = {
-    "fit": (
-        Aspect("PSNR", "psnr", "dB", 2, "more", "views"),
-        Aspect("SSIM", "ssim", "", 3, "more", "views"),
-        Aspect("MS-SSIM", "ms_ssim", "", 3, "more", "views"),
-        Aspect("LPIPS", "lpips", "", 3, "less", "views"),
-        Aspect("depth", "depth_mm", "mm", 1, "less", "views"),
-        Aspect("Gaussians", "num_gaussians", "", None, "less", "data"),
-        Aspect("time", "minutes", "min", 1, "less", "machine"),
-        Aspect("steps", "steps", "", None, None, "data"),
-    ),
-    "track": (
-        Aspect("centroid error", "centroid_error_mm", "mm", 2, "less", "data"),
-        Aspect("lowest IoU", "iou", "", 3, "more", "data"),
-        Aspect("PSNR", "psnr", "dB", 2, "more", "data"),
-        Aspect("PSNR held out", "psnr_held_out", "dB", 2, "more", "data"),
-        Aspect("SSIM held out", "ssim_held_out", "", 3, "more", "data"),
-        Aspect("rate", "update_hz", "Hz", 2, "more", "machine"),
-        Aspect("Gaussians", "num_gaussians", "", None, "less", "data"),
-        Aspect("frames", "frames", "", None, None, "data"),
-    ),
-}
 _OF_VIEWS = [aspect.key for aspect in ASPECTS["fit"] if aspect.of == "views"]
 
 
@@ -129,7 +89,7 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
         key = _data(record, records)
         groups.setdefault(key, Group(key[0], [])).labels.append(label)
     if len(groups) > 1:
-        apart = "; ".join(f"{_in_words(key)}: {', '.join(g.labels)}" for key, g in groups.items())
+        apart = "; ".join(f"{data_in_words(*key)}: {', '.join(g.labels)}" for key, g in groups.items())
         notes.append(f"Only runs of the same data are compared with each other: {apart}.")
     scores: dict[str, dict[str, float | None]] = {}
     for group in groups.values():
@@ -139,8 +99,8 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
             scores |= _fit_scores(members, group.views)
             comparable = _comparable_fits(members, group.views, notes)
         else:
-            scores |= {label: _track_scores(record) for label, record in members.items()}
-            comparable = {aspect.key for aspect in ASPECTS["track"]}
+            scores |= {label: _scores(record) for label, record in members.items()}
+            comparable = {aspect.key for aspect in ASPECTS[kind]}
         if len(members) > 1 and len({_machine(record) for record in members.values()} - {None}) > 1:
             notes.append(f"{', '.join(members)}: run on different machines; time is not compared.")
             comparable -= {aspect.key for aspect in ASPECTS[kind] if aspect.of == "machine"}
@@ -185,28 +145,11 @@ def _data(record: Record, records: Sequence[Record]) -> tuple[str, Any]:
         found = None if same is None else same.metrics
     if found is None:
         return Path(str(record.config.get("dataset"))).name, None
-    if record.kind == "fit":
-        return found["dataset"], tuple(found["size"])
-    image, frames = found["image"], found["frames"]
-    cameras = tuple(found["tracked_cameras"]), tuple(found["held_out_cameras"])
-    of_frames = frames["first_id"], frames["last_id"], frames["tracked"]
-    return found["dataset"], (image["width"], image["height"], of_frames, cameras)
+    return found["dataset"], data_of(record.kind, found)
 
 
 def _words(record: Record) -> tuple[Any, ...]:
     return tuple(str(record.config.get(name)) for name in ("dataset", "scale", "read"))
-
-
-def _in_words(key: tuple[str, Any]) -> str:
-    dataset, more = key
-    if more is None:
-        return dataset
-    size = f"{dataset} at {more[0]}x{more[1]}"
-    if len(more) == 2:
-        return size
-    (first, last, count), (tracked, held_out) = more[2:]
-    by = f", judged by {[*held_out]}" if held_out else ""
-    return f"{size}, {count} frames {first} to {last}, cameras {[*tracked]}{by}"
 
 
 def _held_out(record: Record) -> dict[str, dict[str, Any]]:
@@ -306,27 +249,10 @@ def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
     return notes
 
 
-def _track_scores(record: Record) -> dict[str, float | None]:
-    """Of a run of the tracker, as the cards of its report have them."""
+def _scores(record: Record) -> dict[str, float | None]:
+    """Of a run of any other kind."""
     found = record.metrics
-    if found is None:
-        return {aspect.key: None for aspect in ASPECTS["track"]}
-    errors = [
-        scored["centroid_error_mm"]
-        for scored in found["objects"].values()
-        if scored["centroid_error_mm"] is not None and scored["moved_mm"] > MOVED_MM
-    ]
-    overlaps = [value for value in found["iou"].values() if value is not None]
-    return {
-        "centroid_error_mm": max(errors, default=None),
-        "iou": min(overlaps, default=None),
-        "psnr": found["tracked"]["psnr"],
-        "psnr_held_out": found["held_out"]["psnr"],
-        "ssim_held_out": found["held_out"]["ssim"],
-        "update_hz": found["update_hz"],
-        "num_gaussians": found["gaussians"]["all"],
-        "frames": found["frames"]["tracked"],
-    }
+    return {a.key: None if found is None else a.value(found) for a in ASPECTS[record.kind]}
 
 
 def _machine(record: Record) -> str | None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gsjax.engine.fit.results import Judge
+from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.schedule import looks
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.frame import Frame

@@ -14,8 +14,9 @@ from rich.console import Console
 from gsjax.engine.drive import Drive, drive
 from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.fit.ablation import ablate
+from gsjax.engine.fit.judge import Judge, Scores
 from gsjax.engine.fit.orbit import write_orbit
-from gsjax.engine.fit.results import Judge, Scores, print_results, write_results
+from gsjax.engine.fit.results import print_results, write_results
 from gsjax.engine.fit.schedule import Budget, Looks, looks, schedule_of
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsjax.engine.drive import Tick
-from gsjax.engine.fit.results import Judge
+from gsjax.engine.fit.judge import Judge
 from gsjax.engine.progress import Progress, Schedule
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.fit.method import shrink_at

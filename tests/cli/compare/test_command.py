@@ -10,7 +10,7 @@ import yaml
 
 from gsjax.cli import main
 from gsjax.engine.compare.comparison import labels
-from gsjax.engine.fit.results import PANELS
+from gsjax.engine.pictures import PANELS
 from gsjax.engine.records import digest
 from gsjax.viz.colors import side_by_side
 

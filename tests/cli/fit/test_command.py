@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-import gsjax.engine.fit.results
+import gsjax.engine.fit.judge
 import gsjax.engine.fit.run
 import gsjax.engine.photographs
 from gsjax.cli import main
@@ -185,7 +185,7 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
 @pytest.mark.parametrize(
     ("module", "what", "lacks"),
     [
-        (gsjax.engine.fit.results, "write_panel", "scoring"),
+        (gsjax.engine.fit.judge, "write_panel", "scoring"),
         (gsjax.engine.fit.run, "ablate", "looking at"),
         (gsjax.engine.fit.run, "write_orbit", "drawing a video"),
     ],

@@ -121,7 +121,7 @@ def test_lpips_is_there_with_weights_and_said_to_be_absent_without(gsjax_eval, r
 
 def test_pictures_of_enough_pixels_have_ms_ssim(tmp_path, capfd):
     from gsjax.cli.evaluate import scores
-    from gsjax.engine.fit.results import Compared
+    from gsjax.engine.fit.judge import Compared
     from gsjax.geometry.cameras import Camera
     from gsjax.scene.frame import Frame
 
@@ -197,7 +197,7 @@ def test_what_cannot_be_scored_is_said(gsjax_eval, run, tmp_path, weights):
     config.write_text("# gsjax run\n" + yaml.safe_dump({"track": {}, "eval_cameras": []}))
     assert "expected a run of `gsjax fit`, found one of `gsjax track`" in gsjax_eval()[1]
     config.write_text("# gsjax run\nsource: camera:0\n")
-    assert "settings of another command (source)" in gsjax_eval()[1]
+    assert "settings of another command or version (source)" in gsjax_eval()[1]
     config.write_text("# gsjax run\n}{")
     assert "config.yml: expected the settings of a run, found what is no YAML" in gsjax_eval()[1]
     config.write_text(whole)
