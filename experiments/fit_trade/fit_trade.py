@@ -13,7 +13,7 @@ from experiments.shared.recordings import recorded
 from experiments.static_fit.static_fit import SCENES
 from gsjax.data import open_photographs
 from gsjax.engine.drive import drive
-from gsjax.engine.fit.results import Judge
+from gsjax.engine.fit.judge import Judge
 from gsjax.engine.fit.schedule import Budget
 from gsjax.engine.photographs import split
 from gsjax.engine.progress import Progress

@@ -14,6 +14,7 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
 
+NAME = "orbit"
 _FRAMES, _FPS, _LONGEST = 90, 30, 480
 
 
@@ -36,7 +37,7 @@ def write_orbit(
     viewmats = orbit(np.concatenate([frame.cameras.viewmat for frame in frames]), focus, _FRAMES)
     behind = jnp.array([judge.background or (0.0, 0.0, 0.0)])
     mode, plan = "antialiased" if judge.config.antialiased else "classic", None
-    with VideoWriter(folder.video(ORBIT), _FPS) as video:
+    with VideoWriter(folder.video(NAME), _FPS) as video:
         for viewmat in viewmats:
             placed = on_device(Camera(viewmat[None], K, width, height, camera.near))
             drawn, plan = render_with_room(gaussians, placed, plan, backgrounds=behind, rasterize_mode=mode)

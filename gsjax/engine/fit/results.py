@@ -5,14 +5,13 @@ from typing import Any
 from rich.table import Table as Grid
 
 from gsjax.engine.ending import print_grid
+from gsjax.engine.fit.orbit import NAME as ORBIT
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import in_words
 from gsjax.engine.messages import counted
 from gsjax.engine.report import Media, Table, write_report
 from gsjax.viz.plots import fit_curve, save
 
-ORBIT = "orbit"
-"""The video about the scene, among those of cameras."""
 _SHOWN = 8  # views in the report
 _COLUMNS = (  # key, head, unit and decimals, where views have it
     ("view", "view", "", None),
