@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments
 import numpy as np
 from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
-from gsjax.methods.deform import DeformConfig, GraphConfig
+from gsjax.methods.deform import DeformConfig, GraphConfig, Lesson
 
 BASE = DeformConfig(warmup=200, iterations=800, start_pixels=1.8)
 CHANNELS = BASE.channels
@@ -24,13 +24,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         config = replace(config, warmup=config.warmup + config.iterations, iterations=0, warmup_frames="all")
     elif variant == "no graph":
         config = replace(config, graph=GraphConfig(kind="none"))
-    codes = np.eye(2, CHANNELS) if semantic else None
-    looks = [data.look(t, ids=data.classes(t) if semantic else None) for t in data.train]
-    found = learned(looks, config, codes)
+    lesson = Lesson([data.classes(t) for t in data.train], np.eye(2, CHANNELS)) if semantic else None
+    found = learned([data.frame(t) for t in data.train], config, lesson)
     return {
         **scores(found, data),
         **copies(data),
         **track_errors(found, data),
         **summary(found),
-        "fps": frames_per_second(found, data.look(0)),
+        "fps": frames_per_second(found, data.frame(0)),
     }

@@ -20,11 +20,13 @@ from scipy.ndimage import map_coordinates
 from trimesh.registration import procrustes
 
 from gsjax.data import Sequence
+from gsjax.engine.drive import drive
 from gsjax.engine.recording import open_recording
 from gsjax.geometry.cameras import project
 from gsjax.geometry.flow import seen_in_both
 from gsjax.io.ply import read_ply
-from gsjax.methods.parts import PartsConfig, Start, first_parts, follow
+from gsjax.methods.parts import Parts, PartsConfig, Start
+from gsjax.methods.parts.discovery import closed, weights_of_run
 from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.compiler import host_options
 from gsjax.perception.optical_flow import DisFlow
@@ -101,16 +103,20 @@ def points_lifted(given: Problem) -> Tracked:
 
 def followed(given: Problem) -> Tracked:
     """As `gsjax parts` does, but for the masks; the parts stay those that masks tell of."""
-    config = replace(PartsConfig(), unify=replace(PartsConfig().unify, every=0))
-    parts = first_parts(given.start, given.sequence.num_frames, config)
-    for update in follow(given.sequence, given.start, parts, config):
-        parts = update.parts
+    usual = PartsConfig()
+    unify, refine = replace(usual.unify, every=0), replace(usual.refine, iterations=0)
+    config = replace(usual, unify=unify, refine=refine)
+    method = Parts(config)
+    problem, run = method.start(given.sequence, given.start)
+    *_, now = drive(method, problem, run, headroom=config.headroom)
+    run = closed(now.run, config)
+    parts = run.kept
     rotations, offsets = jax.vmap(partial(rigid_motions, parts.canonical.centers))(
         HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))
     )
     motions = np.broadcast_to(np.eye(4), given.motions.shape).copy()
     motions[..., :3, :3], motions[..., :3, 3] = rotations, offsets
-    return Tracked(_masks(given, motions, parts.weights), motions)
+    return Tracked(_masks(given, motions, weights_of_run(run)), motions)
 
 
 def _tracks(

@@ -187,14 +187,14 @@ def _ask_deformation(options: Options, console: Console) -> int:
     question, changes = _question_of_deformation(options), _changes(options)
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
-            stored = read_deformation(options.run / DEFORMATION)
+            result = read_deformation(options.run / DEFORMATION)
         warn_of_partial(options.run, notes)
-        told = answer_deformation(options.run, stored, question, changes, folder, notes, console)
+        told = answer_deformation(options.run, result, question, changes, folder, notes, console)
     if "classes" in told:
         found = ", ".join(f"{name}: {count:,}" for name, count in told["classes"].items())
         print(f"{'found':<10}{found} of {told['of']:,} Gaussians, in frame {told['frame']}")
     else:
-        _print(question.words, "m" if stored.metric else "", "frames", told, perf_counter() - begun)
+        _print(question.words, "m" if result.timeline.metric else "", "frames", told, perf_counter() - begun)
     print(f"query     {folder}: selection.npz, recolored.ply, frames/, masks/, video.mp4")
     return 0
 
