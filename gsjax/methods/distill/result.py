@@ -128,8 +128,8 @@ class DistillResult:
         """
         if encoder is None and self.source is None:
             raise ValueError(
-                "encoder: expected one that reads texts in the space of this field's features, found none, and "
-                "the source of the features is not known; give one, or use `scores`"
+                "encoder: expected one that reads texts in the space of this field's features, found none, "
+                "and the source of the features is not known; give one, or use `scores`"
             )
         reader: LanguageEncoder = self.source.encoder() if encoder is None else encoder
         if negatives is not None:
