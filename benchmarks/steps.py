@@ -16,12 +16,13 @@ from benchmarks.timing import compile_program, median_and_p95, sample
 from benchmarks.workloads import ball
 from gsjax.data import open_sequence
 from gsjax.engine.drive import drive
+from gsjax.engine.track.tracking import track
 from gsjax.engine.verbs import deform as deform_steps
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
 from gsjax.methods.deform import DeformConfig, GraphConfig
 from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
-from gsjax.methods.track import PRESETS, start_scene, track
+from gsjax.methods.track import PRESETS, start_scene
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
 from gsjax.scene.gaussians import gaussians_from_activated

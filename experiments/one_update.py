@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,9 +12,11 @@ from gsjax.data import Sequence
 from gsjax.methods.track import (
     PRESETS,
     StartConfig,
+    TrackBatch,
+    Tracked,
     TrackedScene,
+    first_look,
     first_pose,
-    first_state,
     plan_tracker,
     start_scene,
 )
@@ -98,7 +101,9 @@ def update_of(
     centers = group_means(pose.means, jnp.asarray(groups), scene.num_objects)
     near_plan = plan_render(place(around, pose), last.cameras, headroom=CONFIG.headroom)
     batch = RefineBatch(around, frame, near_plan, pose, centers, tiles_to_pixels(tiles, last))
-    points = first_state(scene, pose, last, CONFIG, plan).pixels
+    points = jax.jit(first_look, static_argnums=2)(
+        Tracked(scene, pose), TrackBatch(last, plan), CONFIG
+    ).pixels
 
     truth, cameras = sequence.truth, range(sequence.num_cameras)
     assert truth is not None

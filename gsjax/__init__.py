@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
     from gsjax.engine.checkpoint import load, save
-    from gsjax.engine.verbs import deform, distill, fit, parts
+    from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
     from gsjax.methods.deform import DeformConfig
     from gsjax.methods.distill import DistillConfig
     from gsjax.methods.fit import FitConfig
     from gsjax.methods.parts import PartsConfig
-    from gsjax.methods.track import TrackConfig, scene_from_shapes, start_scene, track
+    from gsjax.methods.track import TrackConfig, scene_from_shapes, start_scene
     from gsjax.optim.compiler import host_options, keep_freed_memory, keep_programs
     from gsjax.rasterize.compositing import composite_tile
     from gsjax.rasterize.plan import Plan
@@ -39,14 +39,14 @@ __version__ = "0.1.0"
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
     "gsjax.engine.checkpoint": ("load", "save"),
-    "gsjax.engine.verbs": ("deform", "distill", "fit", "parts"),
+    "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
     "gsjax.methods.deform": ("DeformConfig",),
     "gsjax.methods.distill": ("DistillConfig",),
     "gsjax.methods.fit": ("FitConfig",),
     "gsjax.methods.parts": ("PartsConfig",),
-    "gsjax.methods.track": ("TrackConfig", "scene_from_shapes", "start_scene", "track"),
+    "gsjax.methods.track": ("TrackConfig", "scene_from_shapes", "start_scene"),
     "gsjax.optim.compiler": ("host_options", "keep_freed_memory", "keep_programs"),
     "gsjax.rasterize.compositing": ("composite_tile",),
     "gsjax.rasterize.plan": ("Plan",),

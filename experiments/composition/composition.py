@@ -24,23 +24,26 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import GraphConfig, nodes_of
 from gsjax.methods.track import (
     PRESETS,
+    FrameShape,
+    GrowConfig,
     StartConfig,
+    Track,
     TrackBatch,
-    TrackState,
-    first_pose,
-    first_state,
-    place,
-    plan_tracker,
+    Tracked,
     start_scene,
-    track_step,
 )
 from gsjax.metrics.segmentation import LabelOverlap
+from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame, part_of
 from gsjax.scene.render import plan_render, render
 
 RECORDING = "tabletop_1"
 CAMERAS, MASK_CAMERA, HELD_OUT, EVERY = (0, 1), 1, 2, 6
-TRACKER = replace(PRESETS["fast"], start=StartConfig(object_pixels=2.5, background_pixels=6.0, iterations=60))
+TRACKER = replace(
+    PRESETS["fast"],
+    start=StartConfig(object_pixels=2.5, background_pixels=6.0, iterations=60),
+    grow=GrowConfig(slots=0),  # what joined an object would have no features
+)
 NODES, CHANNELS, RADIUS, RATE = 16, 8, 0.5, 0.03  # nodes of each group; metres
 WARM = 10  # frames after which all classes have been learned, whatever the noise
 PATCH = 16  # pixels of the picture
@@ -62,8 +65,8 @@ class Problem(NamedTuple):
     codebook: np.ndarray
     truth: np.ndarray  # the class of each Gaussian
     held_out: list[tuple[Any, np.ndarray]]  # camera and true mask of every sixth frame
-    plan: Any  # of the tracker
-    first: TrackState
+    shape: FrameShape
+    first: Run  # of the tracker
 
 
 @cache
@@ -80,8 +83,6 @@ def problem() -> Problem:
     codebook = np.zeros((len(codes), CHANNELS), np.float32)
     codebook[:, : len(axes)] = codes @ axes.T  # lengths and angles as they were
     nodes = nodes_of(scene.gaussians, NODES, np.asarray(scene.labels))
-    pose = first_pose(scene)
-    plan = plan_tracker(scene, pose, frames[0], TRACKER)
     alone = recording.select(cameras=(HELD_OUT,))
     held_out = [(alone.frame(t).cameras, alone.mask(t, 0)) for t in range(0, seen.num_frames, EVERY)]
     return Problem(
@@ -92,8 +93,7 @@ def problem() -> Problem:
         codebook,
         true_labels(scene.gaussians, at_first),
         held_out,
-        plan,
-        first_state(scene, pose, frames[0], TRACKER, plan),
+        *Track(TRACKER).start(scene, frames[0]),
     )
 
 
@@ -101,14 +101,14 @@ def problem() -> Problem:
 def stepper(graph: str, shrink: int) -> tuple[Callable, tuple, Camera]:
     """The jitted step of a kind of graph, its first state, and cameras that features are drawn in."""
     p, config = problem(), GRAPHS[graph]
-    tracker = track_step(TRACKER, p.scene.num_objects, TrackBatch(p.scene, p.frames[0], p.plan))
+    tracker = Track(TRACKER).step(p.shape)
     views = part_of(p.frames[0], shrink=shrink).cameras
     plan = plan_render(p.scene.gaussians, views, headroom=2.0)
     how = (jnp.asarray(p.codebook), RADIUS, optax.adam(RATE), config, plan)
     _, init, step = composed(tracker, p.nodes, *how)
     features = jnp.zeros((len(p.nodes.rows), CHANNELS))
     memory = empty_memory(2 * config.window + 1, len(p.nodes.rows))
-    return jitted(step), (first_pose(p.scene), p.first, features, init(features), memory), views
+    return jitted(step), (p.first.params, p.first.state, features, init(features), memory), views
 
 
 def noisy(mask: np.ndarray, kind: str, share: float, random: np.random.Generator) -> np.ndarray:
@@ -138,10 +138,10 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     taught = [[noisy(one, options["wrong"], options["share"], random) for one in pair] for pair in p.masks]
     in_space, overlap = [], LabelOverlap()
     for t in range(1, len(p.frames)):
-        batch = TrackBatch(p.scene, p.frames[t], p.plan)
-        given = batch, views, jnp.asarray(np.stack(taught[t])[:, cells, cells]), jnp.float32(t / 10)
-        state, told = step(state, *given)
-        assert not bool(told["skipped"] | told["overflow"].any())
+        batch, key = TrackBatch(p.frames[t], p.first.plans["track"]), jax.random.key(t)
+        given = batch, views, jnp.asarray(np.stack(taught[t])[:, cells, cells]), jnp.float32(t / 10), key
+        state, info = step(state, *given)
+        assert not bool(info["skipped"] | info["overflow"].any())
         labels = labels_of_gaussians(state[2])
         in_space.append(of_gaussians(labels, p.truth))
         if t % EVERY == 0 and t >= WARM:
@@ -158,7 +158,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         "early_iou_3d": np.mean(in_space[: WARM - 1]),
         "step_ms": ms,
         "times_without": ms / without_ms,
-        "losses": [f"{k}: {np.asarray(v).mean():.4f}" for k, v in told.items() if k != "overflow"],
+        "losses": [f"{k}: {np.asarray(v).mean():.4f}" for k, v in info.items() if k != "overflow"],
         "over_time": [f"{value:.3f}" for value in in_space],
         "things": [f"{k}: {overlap.iou(k):.2f}" for k in things],
     }
@@ -187,8 +187,8 @@ def of_gaussians(labels: np.ndarray, truth: np.ndarray) -> float:
 
 
 @jax.jit
-def _shares(scene, pose, camera, plan, classes):
-    drawn = render(place(scene, pose), camera, plan, features=classes)
+def _shares(gaussians, camera, plan, classes):
+    drawn = render(gaussians, camera, plan, features=classes)
     assert drawn.features is not None
     return drawn.features[0]
 
@@ -199,9 +199,9 @@ def _held_out_plan():
     return plan_render(p.scene.gaussians, p.held_out[0][0], headroom=2.0)
 
 
-def drawn_labels(pose: Any, labels: np.ndarray, camera: Any) -> np.ndarray:
+def drawn_labels(tracked: Tracked, labels: np.ndarray, camera: Any) -> np.ndarray:
     """Which class most of each pixel of the held-out camera is."""
     p = problem()
     classes = jax.nn.one_hot(labels, len(p.codebook))
-    shares = _shares(p.scene, pose, camera, _held_out_plan(), classes)
+    shares = _shares(tracked.gaussians(), camera, _held_out_plan(), classes)
     return np.asarray(shares.argmax(axis=-1))

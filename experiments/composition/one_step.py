@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from gsjax.methods.deform import feature_loss, graph_loss, graph_of, seen_ids
-from gsjax.methods.track import TrackBatch, place
+from gsjax.methods.track import TrackBatch
 from gsjax.optim.step import gradient_step
 from gsjax.scene.render import render
 
 
 class Memory(NamedTuple):
-    """Of the last T frames: when, where each node was, and what the teacher said of it (-1: nothing)."""
+    """The last T frames: when, where each node was, and what the teacher had for it (-1: nothing)."""
 
     times: Float[Array, "T"]
     places: Float[Array, "T n 3"]
@@ -31,7 +31,7 @@ def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
     """The losses of a frame, the optimizer's first state, and the step.
 
     Args:
-        tracker: a `Step`, from `track_step`.
+        tracker: a `Step`, from `gsjax.methods.track.step`.
         nodes: Gaussians that have features, of which the others blend theirs (`nodes_of`).
         codebook: what the teacher may say, a row a class.
         radius: of the scene, metres.
@@ -54,20 +54,20 @@ def composed(tracker, nodes, codebook, radius, optimizer, config, plan):
 
     learner = gradient_step(loss, optimizer)
 
-    def step(state, batch: TrackBatch, views, ids, time):
-        pose, tracking, features, learning, memory = state
-        pose, tracking, tracked = tracker.update(pose, tracking, batch, step=0, key=None)
-        gaussians, graph = place(batch.scene, pose), None
+    def step(state, batch: TrackBatch, views, ids, time, key):
+        tracked, tracking, features, learning, memory = state
+        tracked, tracking, followed = tracker.update(tracked, tracking, batch, step=0, key=key)
+        gaussians, graph = tracked.gaussians(), None
         if config.kind != "none":
             places = gaussians.means[nodes.rows]
             new = Memory(time, places, seen_ids(places, batch.frame.cameras, ids, batch.frame.depths))
             memory = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), memory, new)
-            said = codebook[jnp.maximum(memory.ids, 0)]
-            graph = graph_of(config, radius, nodes.rows, *memory[:2], said, memory.ids >= 0)
+            taught = codebook[jnp.maximum(memory.ids, 0)]
+            graph = graph_of(config, radius, nodes.rows, *memory[:2], taught, memory.ids >= 0)
         given = gaussians, views, ids, graph
-        features, learning, told = learner.update(features, learning, given, step=0, key=None)
-        told |= {"tracker": tracked["residual"], "lost": tracked["lost"]}
-        told["overflow"] |= tracked["overflow"]
-        return (pose, tracking, features, learning, memory), told
+        features, learning, info = learner.update(features, learning, given, step=0, key=None)
+        info |= {"tracker": followed["residual"], "lost": followed["lost"]}
+        info["overflow"] |= followed["overflow"]
+        return (tracked, tracking, features, learning, memory), info
 
     return loss, learner.init, step

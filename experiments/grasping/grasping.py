@@ -188,8 +188,8 @@ class Attempt:
         motion, body = truth, self.start.body
         if self.source == "tracker":
             self.box.append(self.conveyor.cameras.frame(self.conveyor.data))
-            tracked = next(self.tracking)
-            means[: len(tracked.pose.means)] = tracked.pose.means
+            moved = next(self.tracking).result.pose.means
+            means[: len(moved)] = moved
             motion = motion_between(body.points, means[body.rows])
         else:  # the other objects ride on the belt as well
             moving = means[: self.start.scene.num_moving]

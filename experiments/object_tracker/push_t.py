@@ -19,7 +19,8 @@ import tyro
 
 import gsjax
 from gsjax.engine import machine
-from gsjax.methods.track import Pose, first_pose, render_labels, scene_from_shapes, track
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import Pose, first_pose, render_labels, scene_from_shapes
 from gsjax.metrics.segmentation import iou_of_masks
 
 SPECK = 100  # pixels: smaller patches of the colour are not the block
@@ -66,8 +67,8 @@ def main(
 
     moving, still, updates = [score(start, 0)], [score(start, 0)], []
     frames = (seen.frame(t) for t in range(1, seen.num_frames))
-    for t, tracked_frame in enumerate(track(scene, first, frames), start=1):
-        moving.append(score(tracked_frame.pose, t))
+    for t, now in enumerate(track(scene, first, frames), start=1):
+        moving.append(score(now.result.pose, t))
         still.append(score(start, t))
         updates.append(tracked_frame.seconds)
         print(f"{judged.times[t] - judged.times[0]:5.2f} s  IoU {np.round(moving[-1], 3)}", flush=True)

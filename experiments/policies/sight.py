@@ -30,7 +30,7 @@ class Tracking:
         if self.frames is None:
             return self._start(frame)
         self.box.append(frame)
-        now = np.asarray(next(self.frames).pose.means)[self.rows]
+        now = np.asarray(next(self.frames).result.pose.means)[self.rows]
         pose = motion_between(self.first, now)
         pose[:3, 3] = now.mean(0)
         return pose

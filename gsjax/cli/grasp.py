@@ -40,7 +40,7 @@ _FEASIBLE, _IN_THE_WAY = (84, 222, 130), (235, 110, 90)
 
 @dataclass(frozen=True)
 class Options(Seeded, ObjectQuery):
-    """What `gsjax grasp` is told."""
+    """Options of `gsjax grasp`."""
 
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ("robot",)
     """Objects that are no obstacles, as far as the run has them: the arm that is to grasp. No name: none."""
@@ -51,7 +51,7 @@ class Options(Seeded, ObjectQuery):
     samples: int = 512
     """Grasps tried in each frame. They ride with the object, so those of one frame are those of the next."""
     gripper: Gripper = field(default_factory=Gripper)
-    """The gripper, in metres; a Franka Panda's hand unless told."""
+    """The gripper, in metres; default: a Franka Panda's hand."""
 
     def __post_init__(self):
         if self.approach is not None and not 0 < math.hypot(*self.approach) < math.inf:
@@ -121,7 +121,7 @@ def find_grasps(options: Options, saved: SavedRun, answer: Answer, console: Cons
         console: shows how far it is.
 
     Raises:
-        ValueError: nothing says which side of the object's surface is outside.
+        ValueError: it is not known which side of the object's surface is outside.
     """
     scene, means = saved.tracking.scene, saved.tracking.means()
     points = means[:, answer.rows]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gsjax.data.opencv_cameras import open_camera, snapshots
 from gsjax.data.stream import Arrival, NewestSnapshots, Snapshot, replay
+from gsjax.engine.drive import Tick
 from gsjax.engine.ending import ended, exit_code
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
@@ -24,7 +25,8 @@ from gsjax.engine.messages import FITTING, MEASURING, Notes, stage
 from gsjax.engine.options import Common, FirstMasks, Overwriting, Selection, checked, expect_positive
 from gsjax.engine.recording import draw_ahead, first_mask, label_names, open_recording
 from gsjax.engine.track.scoring import budget_metrics
-from gsjax.methods.track import PRESETS, Tracked, TrackedScene, start_scene, track
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import PLAN, PRESETS, TrackedScene, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 from gsjax.scene.frame import Frame
 
@@ -35,7 +37,7 @@ CONFIG = PRESETS["fast"]  # how a scene starts; what follows is chosen for the b
 
 @dataclass(frozen=True)
 class SourceAndOut:
-    """What is followed, and where that is kept."""
+    """The source to follow, and the folder of the run."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """camera:0 for an RGB-D camera (OpenCV, OpenNI 2), or a recording, replayed back and forth."""
@@ -45,14 +47,14 @@ class SourceAndOut:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common, Overwriting, FirstMasks, Selection, SourceAndOut):
-    """What `gsjax live` is told."""
+    """Options of `gsjax live`."""
 
     minutes: float = 1.0
     """How long to follow, once the scene is fitted and updates are compiled, which takes some minutes."""
     hz: float = 30.0
     """Frames a second: of the replay, and what the budget comes from."""
     budget_ms: float | None = None
-    """What an update may take; the time between two frames unless given."""
+    """Time that an update may take, milliseconds; default: the time between two frames."""
     patience: float = 10.0
     """Seconds to wait for a frame before giving up."""
 
@@ -169,37 +171,35 @@ class Log:
         self.late, self.skipped, self.counts, self.chosen, self.plans = 0, 0, {}, None, set()
         self._memory_at = 0.0
 
-    def add(self, update: Tracked, arrival: Arrival, budget: float) -> None:
+    def add(self, now: Tick, arrival: Arrival, budget: float) -> None:
         """One update.
 
         Args:
-            update: what the tracker says.
+            now: the tracker after it.
             arrival: the frame, and when it came.
             budget: seconds, beyond which an update is late.
         """
-        now = perf_counter()
-        self.times.append(now)
+        time, info = perf_counter(), now.info
+        self.times.append(time)
         self.stamps.append(arrival.snapshot.stamp)
-        self.latencies.append(now - arrival.time)
-        self.seconds.append(update.seconds)
-        self.late += update.seconds > budget
-        self.skipped += bool(update.info["skipped"])
-        self.everywhere.append(update.everywhere)
-        self.chosen = update.chosen
-        self.plans.add(update.plan)
-        self.lost.append(np.asarray(update.info["lost"]))
-        self.turn_known.append(np.asarray(update.info["turn_known"]))
-        self.poses.append(
-            self._carried(*jax.device_get((update.info["motion"].twists, update.info["centers"])))
-        )
-        if now - self._memory_at > _MEMORY_EVERY_S:
-            self._memory_at = now
+        self.latencies.append(time - arrival.time)
+        self.seconds.append(now.seconds)
+        self.late += now.seconds > budget
+        self.skipped += bool(info["skipped"])
+        self.everywhere.append(int(info["looked_for"].sum()))
+        self.chosen = now.run.kept.chosen
+        self.plans.add(now.run.plans[PLAN])
+        self.lost.append(np.asarray(info["lost"]))
+        self.turn_known.append(np.asarray(info["turn_known"]))
+        self.poses.append(self._carried(*jax.device_get((info["motion"].twists, info["centers"]))))
+        if time - self._memory_at > _MEMORY_EVERY_S:
+            self._memory_at = time
             self.memory_mb.append(resident_mb())
 
     def _carried(self, twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """Where the groups' first middles are now, and how they are turned.
+        """Where the groups' first centres are now, and how they are turned.
 
-        The tracker's own middles shift with what joins a group; these go where its motion carries them.
+        The tracker's own centres shift with what joins a group; these go where its motion carries them.
         """
         before, turns = centers - twists[:, :3], Rotation.from_rotvec(twists[:, 3:])
         old = before if self._centers is None else self._centers
@@ -270,7 +270,7 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
     Args:
         options: budget, patience and how long.
         source: where frames come from.
-        log: is told of every update.
+        log: keeps every update.
         console: shows how far it is.
     """
     budget_ms = 1e3 / options.hz if options.budget_ms is None else options.budget_ms
@@ -290,11 +290,10 @@ def follow(options: Options, source: Source, log: Log, console: Console) -> Base
         console.print(MEASURING)
         # Drawn between updates: a thread of its own would make some of them late.
         with Live(console=console, auto_refresh=False, transient=True) as shown:
-            updates = track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms)
-            for update in updates:
+            for now in track(source.scene, source.first, frames(), CONFIG, budget_ms=budget_ms):
                 if not arrived:
                     continue
-                log.add(update, arrived[0], budget_ms / 1e3)
+                log.add(now, arrived[0], budget_ms / 1e3)
                 if len(log.times) % 15 == 0:
                     worst, counts = 1e3 * max(log.latencies), newest.counts
                     words = f"{counts.used} frames, {counts.dropped} dropped, {worst:.0f} ms at worst"

@@ -53,19 +53,19 @@ from gsjax.scene.frame import Frame
 
 @dataclass(frozen=True, kw_only=True)
 class Options(FirstMasks, OfRecording):
-    """What `gsjax track` is told."""
+    """Options of `gsjax track`."""
 
     budget_ms: float | None = None
-    """What an update may take, milliseconds. Settings are then chosen by measured cost; of those given, only
-    how the scene starts and how much may join it count."""
+    """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of those given,
+    only how the scene starts, how much may join it and the seed count."""
     preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
-    """The tracker's settings unless given: for small errors, between, for 30 Hz, or as in the paper."""
+    """Default settings of the tracker: for small errors, between, for 30 Hz, or as in the paper."""
     track: TrackConfig = field(default_factory=TrackConfig)
     """The tracker's own settings."""
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options where a preset is named: the tracker's are those of the preset unless given. A budget names
+    """The options where a preset is named: the tracker's default to those of the preset. A budget names
     `fast`, for a scene of fewer Gaussians to start from."""
     flags = [argument.split("=")[0].replace("_", "-") for argument in arguments]
     if "--budget-ms" in flags and "--preset" not in flags:
@@ -96,15 +96,14 @@ def run(options: Options) -> int:
         draw_ahead(recording, console)
         seconds = {"preparing": perf_counter() - begun}
         first = recording.tracked.frame(0)
-        after = None
         if options.resume:
-            tracking, after = load(folder.resume, first, options.track)
+            tracking = load(folder.resume, options.track)
             notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
         else:
             scene, seconds["start"] = _start(recording, first, mask, options.track, console, notes)
             tracking = begin(scene)
         saver = Saver(folder.resume, tracking.resumed)
-        how = {"budget_ms": options.budget_ms, "after": after, "saved": saver}
+        how = {"budget_ms": options.budget_ms, "saved": saver}
         tracking = follow(tracking, first, recording.tracked, options.track, console, **how)
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
@@ -206,7 +205,7 @@ def _judge(
 
 
 def _budget(tracking: Tracking, budget_ms: float | None) -> dict[str, Any] | None:
-    """What a budget led to."""
+    """The settings that a budget led to."""
     if budget_ms is None or tracking.chosen is None:
         return None
     updates = 1e3 * np.asarray(tracking.update_s[1:])
@@ -221,7 +220,7 @@ def _budget(tracking: Tracking, budget_ms: float | None) -> dict[str, Any] | Non
 def _what_ran(
     tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
 ) -> dict[str, Any]:
-    """The part of metrics.json that says what ran, and how fast."""
+    """The part of metrics.json about what ran, and how fast."""
     ids, updates = recording.tracked.frame_ids, np.asarray(tracking.update_s[1:]) * 1e3
     return {
         "kind": "track",
@@ -283,7 +282,7 @@ def _note_what_is_missing(
     values: np.ndarray | None,
     notes: Notes,
 ) -> None:
-    """Say what was not scored, and why."""
+    """Note what was not scored, and why."""
     sequence = recording.judged
     if mask.source == "segment":
         notes.add("Objects were found by the weight-free segmenter; they are named by size.")

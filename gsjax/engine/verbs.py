@@ -16,6 +16,7 @@ import jax
 from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
+from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher

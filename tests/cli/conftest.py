@@ -15,12 +15,14 @@ from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.engine.distill.scene import SceneOptions
 from gsjax.engine.distill.source import Source
+from gsjax.engine.drive import Tick
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.records import digest
 from gsjax.engine.track import loop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.methods.distill import DistillResult, FeatureField
-from gsjax.methods.track import Tracked, first_pose, start_scene
+from gsjax.methods.track import PLAN, Kept, Track, Tracked, first_pose, start_scene
+from gsjax.optim.method import Run
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
@@ -66,12 +68,18 @@ def unfitted(frame, mask, mask_camera, config):
     return start_scene(frame, mask, mask_camera, replace(config, start=start))
 
 
+def still_tick(scene, step: int, info: dict, seconds: float = 0.01) -> Tick:
+    """That of a tracker whose objects are where they were at first."""
+    run = Run(Tracked(scene, first_pose(scene)), None, step, {PLAN: None}, Kept(1))
+    return Tick(Track(), None, run, info, seconds, 0.0)
+
+
 def standing_still(scene, first, frames, config, **how):
     """`track` for objects that never move."""
-    for _ in frames:
+    for t, _ in enumerate(frames, 1):
         seen = np.ones(scene.num_objects, bool)
-        info = {"visible": seen, "lost": ~seen, "turn_known": seen, "joined": 0, "skipped": False}
-        yield Tracked(scene, first_pose(scene), None, info, 0.01, 0.0, None, 0)
+        info = {"visible": seen, "lost": ~seen, "turn_known": seen, "looked_for": ~seen}
+        yield still_tick(scene, t, info | {"joined": 0, "skipped": False})
 
 
 @pytest.fixture

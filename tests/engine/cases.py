@@ -3,18 +3,33 @@
 from dataclasses import replace
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.data.simulated import tabletop
 from gsjax.methods.deform import Deform
 from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
 from gsjax.methods.fit import Fit, FitConfig, StartConfig
 from gsjax.methods.parts import PartsConfig, RefineBatch, RefineParams
 from gsjax.methods.parts import step as parts_step
+from gsjax.methods.track import (
+    PLAN,
+    PRESETS,
+    AlignConfig,
+    FeatureBatch,
+    GrowConfig,
+    Track,
+    TrackBatch,
+    feature_distiller,
+    start_scene,
+)
+from gsjax.methods.track import StartConfig as TrackStart
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import at_rest
 from gsjax.scene.initialize import gaussians_from_points
+from gsjax.scene.render import plan_render
 from tests.methods.around import cameras_around
 from tests.methods.photographed_blobs import photographed_blobs
 from tests.methods.tissue import CONFIG, tissue
@@ -26,6 +41,14 @@ FIT = FitConfig(
 
 GRID = FeatureGridConfig(
     levels=2, least_resolution=4, most_resolution=8, log2_entries=9, features=2, hidden=8
+)
+
+
+TRACK = replace(
+    PRESETS["fast"],
+    start=TrackStart(object_pixels=3.0, background_pixels=8.0, max_extent=1.0, iterations=0),
+    align=AlignConfig(iterations=1, reach=0.0, turns=(), pixels=16, centers=16),
+    grow=GrowConfig(slots=32, candidates=16),
 )
 
 
@@ -100,10 +123,42 @@ def refine_step_case():
     return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan), tight
 
 
+@cache
+def little_table():
+    """Two frames of one camera, and the scene at the first."""
+    sequence = tabletop(0, 2, 48, 36, 1)
+    frames = sequence.frame(0), sequence.frame(1)
+    return *frames, start_scene(frames[0], sequence.mask(0, 0), 0, TRACK)
+
+
+def track_step_case():
+    first, second, scene = little_table()
+    tracker = Track(TRACK)
+    shape, run = tracker.start(scene, first)
+    plan = run.plans[PLAN]
+    batch = TrackBatch(second, plan)
+    sick = TrackBatch(eqx.tree_at(lambda f: f.images, second, jnp.full_like(second.images, jnp.nan)), plan)
+    tight = batch._replace(plan=replace(plan, near=replace(plan.near, capacity=16)))
+    return tracker.step(shape), run.params, batch, sick, tight, lambda params: run.state
+
+
+def features_case():
+    first, _, scene = little_table()
+    gaussians, plan = scene.gaussians, plan_render(scene.gaussians, first.cameras)
+    valid = jnp.ones(first.images.shape[:3])
+    prior = jax.random.normal(jax.random.key(0), (gaussians.num, 3))
+    known = valid, prior, jnp.ones(gaussians.num), jnp.float32(0.1), plan
+    batch = FeatureBatch(gaussians, first.cameras, first.images, *known)
+    sick = batch._replace(maps=jnp.full_like(first.images, jnp.nan))
+    return feature_distiller(), prior, batch, sick, batch._replace(plan=replace(plan, capacity=16))
+
+
 STEPS = {
     "fit": fit_step_case,
     "distill": distill_step_case,
     "deform": deform_step_case,
     "parts, a frame": stream_step_case,
     "parts, all frames": refine_step_case,
+    "track": track_step_case,
+    "features": features_case,
 }

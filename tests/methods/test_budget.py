@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsjax.methods.track import PRESETS, GrowConfig, TrackConfig, track
+from gsjax import track
+from gsjax.methods.track import PRESETS, GrowConfig, TrackConfig
 from gsjax.methods.track.budget import Costs, Governor, choose, ladder
 
 RUNGS = ladder(TrackConfig(), 3)
@@ -32,6 +33,10 @@ COSTS = {
     "fast_half_the_resolution_2_cameras": 7.0,
     "fast_half_the_resolution_1_camera": 4.0,
 }
+
+
+def test_every_rung_has_the_seed_of_the_settings():
+    assert {rung.seed for rung in ladder(TrackConfig(seed=3), 2).values()} == {3}
 
 
 def test_the_ladder_goes_from_the_richest_to_one_camera():
@@ -108,10 +113,10 @@ def test_what_updates_cost_is_measured_with_the_second_frame(table, started, mon
     class Measured(Exception):
         pass
 
-    def measured(scene, pose, first, second, config):
+    def measured(start, second, config):
         raise Measured(second)
 
-    monkeypatch.setattr("gsjax.methods.track.tracking._measured", measured)
+    monkeypatch.setattr("gsjax.engine.track.tracking._measured", measured)
     for following, expected in ((frames[1:], frames[1]), ([], frames[0])):
         with pytest.raises(Measured) as seen:
             next(track(started, frames[0], following, budget_ms=33.0))
@@ -121,7 +126,7 @@ def test_what_updates_cost_is_measured_with_the_second_frame(table, started, mon
 @pytest.mark.slow
 def test_objects_are_followed_within_a_generous_budget(table, started, quick, centroid_errors):
     sequence, frames, _ = table()
-    for t, result in enumerate(track(started, frames[0], frames[1:], quick, budget_ms=100.0), start=1):
-        assert max(centroid_errors(sequence, started, result.pose, t).values()) < 5e-3
-        assert result.chosen.name in ladder(quick, 2)
-        assert 0 <= result.everywhere <= started.num_objects
+    for t, now in enumerate(track(started, frames[0], frames[1:], quick, budget_ms=100.0), start=1):
+        assert max(centroid_errors(sequence, started, now.result.pose, t).values()) < 5e-3
+        assert now.run.kept.chosen.name in ladder(quick, 2)
+        assert 0 <= now.info["looked_for"].sum() <= started.num_objects

@@ -16,15 +16,17 @@ from jaxtyping import Array, Int
 from gsjax.geometry.cameras import unproject
 from gsjax.methods.deform import GraphConfig, graph_of, nodes_of, seen_ids
 from gsjax.methods.track import (
+    PLAN,
     PRESETS,
     AlignConfig,
+    FrameShape,
+    GrowConfig,
+    Track,
     TrackBatch,
     first_pose,
-    first_state,
     place,
-    plan_tracker,
-    track_step,
 )
+from gsjax.optim.method import Run
 from gsjax.scene.deformation import Nodes
 from gsjax.scene.render import plan_render
 
@@ -44,7 +46,8 @@ def page_names() -> dict:
 
 class Small(NamedTuple):
     config: Any
-    plan: Any
+    shape: FrameShape
+    run: Run
     batches: list[TrackBatch]
     ids: Int[Array, "t c h w"]
     nodes: Nodes
@@ -55,21 +58,21 @@ def small(table, started):
     """Three frames of a table, a tracker that looks nowhere but where things were, and nodes."""
     sequence, frames, _ = table()
     align = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
-    config = replace(PRESETS["fast"], align=align)
-    plan = plan_tracker(started, first_pose(started), frames[0], config)
-    batches = [TrackBatch(started, frame, plan) for frame in frames[:3]]
+    config = replace(PRESETS["fast"], align=align, grow=GrowConfig(slots=0))
+    shape, run = Track(config).start(started, frames[0])
+    batches = [TrackBatch(frame, run.plans[PLAN]) for frame in frames[:3]]
     ids = np.stack([[sequence.mask(t, c) for c in (0, 1)] for t in range(3)])
     nodes = nodes_of(started.gaussians, 8, np.asarray(started.labels))
-    return Small(config, plan, batches, jnp.asarray(ids, jnp.int32), nodes)
+    return Small(config, shape, run, batches, jnp.asarray(ids, jnp.int32), nodes)
 
 
 @pytest.fixture(scope="module")
 def composed(small):
     """composed(kind of graph) -> loss, init, step of the page, and the tracker in it."""
     page = page_names()
-    scene, cameras = small.batches[0].scene, small.batches[0].frame.cameras
+    scene, cameras = small.run.params.scene, small.batches[0].frame.cameras
     plan = plan_render(scene.gaussians, cameras, headroom=2.0)
-    tracker = track_step(small.config, scene.num_objects, small.batches[0])
+    tracker = Track(small.config).step(small.shape)
 
     def make(kind):
         how = (RADIUS, optax.adam(0.1), graph_config(kind), plan)
@@ -86,14 +89,14 @@ class TestOneStep:
     @pytest.mark.slow
     def test_a_gradient_reaches_features_and_poses(self, small, composed):
         loss, *_ = composed("none")
-        batch = small.batches[1]
+        batch, scene = small.batches[1], small.run.params.scene
 
         def of(features, pose):
-            given = place(batch.scene, pose), batch.frame.cameras, small.ids[1], None
+            given = place(scene, pose), batch.frame.cameras, small.ids[1], None
             return loss(features, given, step=0, key=None)[0]
 
         features = 0.1 * jax.random.normal(jax.random.key(0), (len(small.nodes.rows), 8))
-        to_features, to_pose = jax.jit(jax.grad(of, argnums=(0, 1)))(features, first_pose(batch.scene))
+        to_features, to_pose = jax.jit(jax.grad(of, argnums=(0, 1)))(features, first_pose(scene))
         assert (jnp.abs(to_features).sum(axis=1) > 0).mean() > 0.5
         assert jnp.isfinite(to_pose.means).all()
         assert (jnp.abs(to_pose.means).sum(axis=1) > 0).mean() > 0.5
@@ -102,31 +105,30 @@ class TestOneStep:
     @pytest.mark.parametrize("kind", ["matching", "similarity"])
     def test_it_is_the_separate_steps_one_after_the_other(self, small, composed, kind):
         loss, init, step, tracker = composed(kind)
-        scene, frame, *_ = small.batches[0]
-        features, nodes, pose = jnp.zeros((len(small.nodes.rows), 8)), small.nodes.rows, first_pose(scene)
-        tracking = first_state(scene, pose, frame, small.config, small.plan)
+        features, nodes = jnp.zeros((len(small.nodes.rows), 8)), small.nodes.rows
+        tracked, tracking = small.run.params, small.run.state
         memory = page_names()["empty_memory"](3, len(nodes))
-        state = pose, tracking, features, init(features), memory
-        step, tracks = jax.jit(step), jax.jit(partial(tracker.update, step=0, key=None))
+        state = tracked, tracking, features, init(features), memory
+        step, tracks = jax.jit(step), jax.jit(partial(tracker.update, step=0))
         for t in (1, 2):
-            batch = small.batches[t]
+            batch, key = small.batches[t], jax.random.key(t)
             before = state
-            state, told = step(state, batch, batch.frame.cameras, small.ids[t], jnp.float32(t))
-            assert not told["skipped"]
-            assert not told["overflow"].any()
-            pose, tracking, tracked = tracks(pose, tracking, batch)
-            np.testing.assert_allclose(state[0].means, pose.means, atol=1e-5)
-            np.testing.assert_allclose(told["tracker"], tracked["residual"], rtol=1e-3, atol=1e-5)
+            state, info = step(state, batch, batch.frame.cameras, small.ids[t], jnp.float32(t), key)
+            assert not info["skipped"]
+            assert not info["overflow"].any()
+            tracked, tracking, followed = tracks(tracked, tracking, batch, key=key)
+            np.testing.assert_allclose(state[0].pose.means, tracked.pose.means, atol=1e-5)
+            np.testing.assert_allclose(info["tracker"], followed["residual"], rtol=1e-3, atol=1e-5)
         assert step._cache_size() == 1
         # The last step of the features by hand: of the graph of what its memory holds.
         memory, config = state[4], graph_config(kind)
         np.testing.assert_array_equal(memory.ids[:2], before[4].ids[1:])
-        said = CODES[jnp.maximum(memory.ids, 0)]
-        graph = graph_of(config, RADIUS, nodes, *memory[:2], said, memory.ids >= 0)
-        given = place(batch.scene, state[0]), batch.frame.cameras, small.ids[2], graph
+        taught = CODES[jnp.maximum(memory.ids, 0)]
+        graph = graph_of(config, RADIUS, nodes, *memory[:2], taught, memory.ids >= 0)
+        given = state[0].gaussians(), batch.frame.cameras, small.ids[2], graph
         value, terms = loss(before[2], given, step=0, key=None)
-        np.testing.assert_allclose(told["loss"], value, rtol=1e-4)
-        assert set(terms) - {"overflow"} <= set(told)
+        np.testing.assert_allclose(info["loss"], value, rtol=1e-4)
+        assert set(terms) - {"overflow"} <= set(info)
 
 
 class TestSeenIds:

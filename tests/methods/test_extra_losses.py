@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gsjax.engine.drive import drive
+from gsjax.engine.track.tracking import track
 from gsjax.losses.extra import extra_terms
 from gsjax.methods.deform import Deform, DeformConfig, deform_loss, with_field
 from gsjax.methods.deform import batch_of as deform_batch_of
@@ -19,7 +20,7 @@ from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.refine import RefineBatch as PartsBatch
 from gsjax.methods.parts.refine import RefineParams, refine_step
 from gsjax.methods.parts.stream import skinning_weights, stream_loss
-from gsjax.methods.track import AlignConfig, track
+from gsjax.methods.track import AlignConfig
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
 from gsjax.methods.track.refine import refine, refine_loss
@@ -169,9 +170,10 @@ def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     assert calls[0] > 0
     assert calls == calls[:1] * len(calls)  # nothing was traced after the first frame
 
-    def lift(tracked, group):
-        member = np.asarray(tracked.scene.labels[: tracked.scene.num_moving]) == group
-        return float(np.asarray(tracked.pose.means)[member, 2].mean())
+    def lift(now, group):
+        scene, pose = now.result
+        member = np.asarray(scene.labels[: scene.num_moving]) == group
+        return float(np.asarray(pose.means)[member, 2].mean())
 
     assert plain.info["visible"][0]
     assert lift(now, 1) > lift(plain, 1) + 2e-3

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -157,12 +159,18 @@ def test_the_transpose_is_exact_and_the_step_is_pure(little, maps):
     batch = FeatureBatch(
         scene.gaussians, frame.cameras, jnp.asarray(maps), ones, features, weights, jnp.float32(0.1), plan
     )
-    step = feature_distiller(batch)
-    state = step.init(features)
-    again = step.init(features)
-    first, second, info = step.update(features, state, batch, step=0, key=None)
-    np.testing.assert_array_equal(state.residual, again.residual)
+    step = feature_distiller()
+    blank = step.init(features)
+    still, state, info = step.update(features, blank, batch, step=0, key=None)
+    np.testing.assert_array_equal(still, features)  # the first only finds the residual
+    assert info["loss"] == state.energy.sum() > 0
+    first, second, info = step.update(features, state, batch, step=1, key=None)
     assert not info["skipped"]
+    small = batch._replace(plan=replace(plan, capacity=2))
+    kept, _, info = step.update(features, state, small, step=1, key=None)
+    assert info["overflow"] & info["skipped"]
+    assert info["needed"] > 2
+    np.testing.assert_array_equal(kept, features)
     assert (second.energy < state.energy).all()
     poisoned = state._replace(direction=state.direction.at[0, 0].set(jnp.nan))
     kept, _, info = step.update(features, poisoned, batch, step=0, key=None)

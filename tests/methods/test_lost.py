@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsjax import track
 from gsjax.geometry.cameras import camera_centers
-from gsjax.methods.track import GrowConfig, RefineConfig, first_pose, track
+from gsjax.methods.track import GrowConfig, RefineConfig, first_pose
 from gsjax.methods.track.align import coarse_shifts
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
@@ -25,7 +26,7 @@ from gsjax.methods.track.recover import (
     depths_of_others,
     guesses,
     recover,
-    since,
+    relative_twists,
     with_unexplained,
 )
 from gsjax.methods.track.reference import (
@@ -36,7 +37,7 @@ from gsjax.methods.track.reference import (
     radii,
     reference_points,
 )
-from gsjax.methods.track.update import in_search_round
+from gsjax.methods.track.stages.follow import in_search_round
 
 CARTON, GAP = 2, 0.015
 SIZE = {"width": 160, "height": 120}
@@ -251,7 +252,7 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
     center = jnp.array([0.3, -0.2, 0.5])
     there = carry(points, twists[0], center).means
     moved = carry(points, twists[1], center)
-    again = carry(moved, since(twists[0], twists[1]), center + twists[1, :3]).means
+    again = carry(moved, relative_twists(twists[0], twists[1]), center + twists[1, :3]).means
     np.testing.assert_allclose(again, there, atol=1e-4)
 
 
@@ -295,7 +296,7 @@ def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, qui
     assert not updates[-1].info["lost"][group - 1]
     others = np.delete(np.asarray(updates[-1].info["lost"]), group - 1)
     assert not others.any()
-    found = np.asarray(updates[-1].pose.means)[mine[: started.num_moving]].mean(0)
+    found = np.asarray(updates[-1].result.pose.means)[mine[: started.num_moving]].mean(0)
     assert np.linalg.norm(found - np.asarray(started.gaussians.means)[mine].mean(0)) < 0.01
 
 
@@ -314,5 +315,7 @@ def test_without_depth_what_vanishes_is_said_to_be_lost_and_stays(table, started
     group = started.label_ids.index(CARTON)
     assert [bool(u.info["lost"][group - 1]) for u in updates] == [False, True, True]
     mine = np.asarray(started.labels[: started.num_moving]) == group
-    before, after = (np.asarray(p.means)[mine].mean(0) for p in (first_pose(started), updates[-1].pose))
+    before, after = (
+        np.asarray(p.means)[mine].mean(0) for p in (first_pose(started), updates[-1].result.pose)
+    )
     assert np.linalg.norm(after - before) < 0.05

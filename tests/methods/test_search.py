@@ -12,7 +12,7 @@ from gsjax.methods.track.lost import Confidence
 from gsjax.methods.track.points import Points, carry, pixels_of_groups, tones
 from gsjax.methods.track.recover import Relocation
 from gsjax.methods.track.search import (
-    TELLS_TURN,
+    TURN_KNOWN,
     Sought,
     first_watch,
     least,
@@ -154,7 +154,7 @@ def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
     center = middle(jax.tree.map(lambda a: a[0], points))
     how = (CONFIG, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(1))
     sought = search(jnp.zeros((1, 1, 6)), points, center[None], seen, *how)
-    assert (float(sought.leads[0]) > TELLS_TURN) == printed
+    assert (float(sought.leads[0]) > TURN_KNOWN) == printed
     assert float(jnp.linalg.norm(sought.found.twists[0, :3])) < 1e-3
 
 

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -9,20 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax import track
+from gsjax.engine.checkpoint import load, save
 from gsjax.methods.track import (
+    PLAN,
     AlignConfig,
     GrowConfig,
     MatchConfig,
+    Track,
+    TrackBatch,
     TrackConfig,
     TrackedScene,
     first_pose,
-    plan_tracker,
+    method,
     start_scene,
-    track,
-    tracking,
 )
 from gsjax.methods.track.grow import with_slots
-from gsjax.methods.track.update import TrackBatch, track_step
+from gsjax.methods.track.method import matching_reduction
+from gsjax.methods.track.update import track_step
 from gsjax.optim.step import Step
 from gsjax.scene.gaussians import take
 
@@ -48,7 +53,7 @@ def traced(table, started, quick):
         return Step(step.init, update)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tracking, "track_step", counted)
+        patch.setattr(method, "track_step", counted)
         return list(track(started, frames[0], frames[1:], quick)), len(traces)
 
 
@@ -60,10 +65,12 @@ def tracked(traced):
 def test_objects_are_followed(table, started, tracked, centroid_errors):
     sequence, frames, _ = table()
     assert len(tracked) == len(frames) - 1
-    for t, result in enumerate(tracked, start=1):
-        errors = centroid_errors(sequence, started, result.pose, t)
+    for t, now in enumerate(tracked, start=1):
+        assert now.step == t
+        errors = centroid_errors(sequence, started, now.result.pose, t)
         assert max(errors.values()) < 5e-3, errors
-        assert not result.info["skipped"]
+        assert not now.info["skipped"]
+        assert 0 < now.info["loss"] < 0.5
     assert tracked[0].compile_seconds > 0
     assert tracked[-1].compile_seconds == 0
 
@@ -77,7 +84,7 @@ def test_what_moves_is_followed_and_not_left_behind(table, quick, centroid_error
     scene = start_scene(frames[start], late.mask(0, 0), 0, quick)
     *_, last = track(scene, frames[start], frames[start + 1 :], quick)
     moved = centroid_errors(late, scene, first_pose(scene), late.num_frames - 1)
-    errors = centroid_errors(late, scene, last.pose, late.num_frames - 1)
+    errors = centroid_errors(late, scene, last.result.pose, late.num_frames - 1)
     movers = [name for name, metres in moved.items() if metres > 15e-3]
     assert movers, moved
     for name in movers:
@@ -95,26 +102,28 @@ def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, q
         align=replace(quick.align, everywhere=2),
         coarseness=2,
     )
-    for t, result in enumerate(track(started, frames[0], frames[1:], config), start=1):
-        errors = centroid_errors(sequence, started, result.pose, t)
+    for t, now in enumerate(track(started, frames[0], frames[1:], config), start=1):
+        errors = centroid_errors(sequence, started, now.result.pose, t)
         assert max(errors.values()) < 5e-3, errors
-        assert not result.info["skipped"]
+        assert not now.info["skipped"]
     with pytest.raises(ValueError, match=r"redraw: expected all where refine.iterations is above 0"):
         replace(quick, redraw="moving")
 
 
 @pytest.mark.parametrize(
-    ("config", "changes", "said"),
+    ("config", "changes", "message"),
     [
-        (AlignConfig, {"everywhere": -1}, "AlignConfig.everywhere: expected 0 or more, found -1"),
-        (AlignConfig, {"shading": float("nan")}, "AlignConfig.shading: expected 0 or more, found nan"),
-        (AlignConfig, {"turns": (0.2, -0.2)}, "AlignConfig.turns: expected more than 0, pi at most, found"),
-        (MatchConfig, {"min_score": float("nan")}, "MatchConfig.min_score: expected -1 or more, found nan"),
-        (GrowConfig, {"min_gap": -0.1}, "GrowConfig.min_gap: expected more than 0, found -0.1"),
+        (AlignConfig, {"everywhere": -1}, "track.align.everywhere: expected at least 0, found -1"),
+        (AlignConfig, {"shading": float("nan")}, "track.align.shading: expected at least 0, found nan"),
+        (AlignConfig, {"turns": (0.2, -0.2)}, "track.align.turns: expected more than 0, pi at most, found"),
+        (AlignConfig, {"color_scale": 0}, "track.align.color_scale: expected more than 0, found 0"),
+        (MatchConfig, {"min_score": float("nan")}, "track.match.min_score: expected at least -1, found nan"),
+        (GrowConfig, {"min_gap": -0.1}, "track.grow.min_gap: expected more than 0, found -0.1"),
+        (TrackConfig, {"headroom": 0.9}, "track.headroom: expected at least 1, found 0.9"),
     ],
 )
-def test_settings_without_meaning_are_refused(config, changes, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_settings_without_meaning_are_refused(config, changes, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         config(**changes)
 
 
@@ -130,20 +139,30 @@ def test_labels_keep_the_masks_values(table, started):
 
 def test_going_on_from_pose_and_state_is_the_same_as_never_stopping(table, started, tracked, quick):
     _, frames, _ = table()
-    half = tracked[0]
-    rest = track(half.scene, frames[1], frames[2:], quick, after=half)
+    rest = track(started, frames[1], frames[2:], quick, after=tracked[0])
     for again, before in zip(rest, tracked[1:], strict=True):
-        np.testing.assert_allclose(again.pose.means, before.pose.means, atol=1e-5)
+        assert again.step == before.step
+        jax.tree.map(np.testing.assert_array_equal, again.result, before.result)
+
+
+def test_a_tick_is_stored_and_gone_on_with(table, started, tracked, quick, tmp_path):
+    _, frames, _ = table()
+    save(tmp_path / "run.npz", tracked[1])
+    now = load(tmp_path / "run.npz")
+    assert now.method == tracked[1].method
+    np.testing.assert_array_equal(now.result.gaussians().means, tracked[1].result.gaussians().means)
+    (last,) = track(started, frames[2], frames[3:], quick, after=now)
+    jax.tree.map(np.testing.assert_array_equal, last.result, tracked[2].result)
 
 
 @pytest.mark.slow
 def test_the_background_moves_only_where_it_is_told_to(table, started, tracked, quick):
     _, frames, _ = table()
     background = np.asarray(started.gaussians.means)[started.num_moving :]
-    np.testing.assert_array_equal(background_of(tracked[0].scene), background)
+    np.testing.assert_array_equal(background_of(tracked[0].result.scene), background)
     config = replace(quick, refine=replace(quick.refine, background_rate=1e-4))
-    (result,) = track(started, frames[0], frames[1:2], config)
-    moved = np.linalg.norm(background_of(result.scene) - background, axis=-1)
+    (now,) = track(started, frames[0], frames[1:2], config)
+    moved = np.linalg.norm(background_of(now.result.scene) - background, axis=-1)
     assert 1e-5 < moved.max() < 1e-4 * quick.refine.iterations * 3**0.5 * 1.5
 
 
@@ -157,45 +176,44 @@ def test_parts_of_the_tracker_can_be_left_out(table, started, tracked, quick, ce
     sequence, frames, _ = table()
     config = replace(quick, warm_start=False, matching=False)
     before, last = tracked[0], tracked[1]
-    (result,) = track(started, frames[1], frames[2:3], config, after=before)
+    (now,) = track(started, frames[1], frames[2:3], config, after=before)
     assert last.info["found"].any()
-    assert not result.info["found"].any()
-    hurled = eqx.tree_at(
-        lambda s: s.motion, before.state, jax.tree.map(lambda a: a + 0.05, before.state.motion)
-    )
-    (again,) = track(started, frames[1], frames[2:3], config, after=before._replace(state=hurled))
-    jax.tree.map(np.testing.assert_array_equal, again.pose, result.pose)
-    errors = centroid_errors(sequence, started, result.pose, 2)
+    assert not now.info["found"].any()
+    state = before.run.state
+    hurled = state._replace(motion=jax.tree.map(lambda a: a + 0.05, state.motion))
+    hurled = replace(before, run=before.run.having(state=hurled))
+    (again,) = track(started, frames[1], frames[2:3], config, after=hurled)
+    jax.tree.map(np.testing.assert_array_equal, again.result.pose, now.result.pose)
+    errors = centroid_errors(sequence, started, now.result.pose, 2)
     assert max(errors.values()) < 10e-3, errors
 
 
 @pytest.mark.slow
-def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick, monkeypatch):
+def test_an_overflow_changes_nothing_and_track_plans_again(table, started, tracked, quick):
     """Capacities too small for the scene, in the step alone and then under `track`."""
     _, frames, _ = table()
-    scene = with_slots(started, quick.grow.slots)  # as track would
-    pose = first_pose(scene)
-    plan = plan_tracker(scene, pose, frames[0], quick)
+    tracker = Track(quick)
+    shape, run = tracker.start(started, frames[0])
+    plan = run.plans[PLAN]
     small = replace(plan, num_near=16, full=replace(plan.full, capacity=4096))
-    step = track_step(quick, scene.num_objects, TrackBatch(scene, frames[0], plan))
-    state = jax.jit(step.init)(pose)
-    batch = TrackBatch(scene, frames[1], small)
-    new, new_state, info = jax.jit(lambda p, s, b: step.update(p, s, b, step=0, key=None))(pose, state, batch)
+    update = jax.jit(partial(tracker.step(shape).update, step=0))
+    batch = TrackBatch(frames[1], small)
+    params, state, info = update(run.params, run.state, batch, key=jax.random.key(0))
     assert info["overflow"]
     assert info["skipped"]
-    jax.tree.map(np.testing.assert_array_equal, (new, new_state), (pose, state))
+    jax.tree.map(np.testing.assert_array_equal, (params, state), (run.params, run.state))
     assert not np.any(info["motion"].twists)
     np.testing.assert_array_equal(info["turn_known"], state.watch.turn_known)
 
-    monkeypatch.setattr(tracking, "plan_tracker", lambda *_: small)
-    before = tracked[0]._replace(scene=scene, pose=pose, state=state)
-    (result,) = track(started, frames[0], frames[1:2], quick, after=before)
-    assert result.plan.num_near >= int(info["needed"].num_near) > 16
-    assert result.plan.full.capacity >= int(info["needed"].full) > 4096
-    assert not result.info["overflow"]
+    before = replace(tracked[0], run=run.having(plans={PLAN: small}))
+    (now,) = track(started, frames[0], frames[1:2], quick, after=before)
+    plan = now.run.plans[PLAN]
+    assert plan.num_near >= int(info["needed"].num_near) > 16
+    assert plan.full.capacity >= int(info["needed"].full) > 4096
+    assert not now.info["overflow"]
     # Rounding decides between two turns of an arm's part that agree equally well: a millimetre.
     own = slice(started.num_moving)
-    np.testing.assert_allclose(result.pose.means[own], tracked[0].pose.means[own], atol=2e-3)
+    np.testing.assert_allclose(now.result.pose.means[own], tracked[0].result.pose.means[own], atol=2e-3)
 
 
 def test_an_update_is_traced_once(traced):
@@ -210,11 +228,12 @@ def test_a_few_broken_pixels_are_counted_and_change_little(table, started, track
     _, frames, _ = table()
     pixels = getattr(frames[1], what).at[0, 30:34, 40:50].set(value)
     broken = eqx.tree_at(lambda f: getattr(f, what), frames[1], pixels)
-    (result,) = track(started, frames[0], [broken], quick)
-    assert result.info["broken_pixels"] == 40
-    assert not result.info["skipped"]
-    jax.tree.map(lambda a: np.testing.assert_array_equal(jnp.isfinite(a), True), (result.pose, result.state))
-    moved = np.linalg.norm(np.asarray(result.pose.means - tracked[0].pose.means), axis=-1)
+    (now,) = track(started, frames[0], [broken], quick)
+    assert now.info["broken_pixels"] == 40
+    assert not now.info["skipped"]
+    pose = now.result.pose
+    jax.tree.map(lambda a: np.testing.assert_array_equal(jnp.isfinite(a), True), (pose, now.run.state))
+    moved = np.linalg.norm(np.asarray(pose.means - tracked[0].result.pose.means), axis=-1)
     assert np.median(moved[: started.num_moving]) < 1e-3
 
 
@@ -234,8 +253,8 @@ def test_going_on_works_when_every_slot_is_taken(table, started, quick):
     config = replace(quick, grow=replace(quick.grow, slots=2))
     *_, full = track(started, frames[0], frames[1:3], config)
     assert full.info["joined"] == 2
-    (rest,) = track(full.scene, frames[2], frames[3:], config, after=full)
-    assert len(rest.pose.means) == len(full.pose.means)
+    (rest,) = track(started, frames[2], frames[3:], config, after=full)
+    assert len(rest.result.pose.means) == len(full.result.pose.means)
 
 
 def test_a_frame_of_another_size_is_named(table, started, quick):
@@ -261,7 +280,8 @@ def test_one_object_larger_than_its_template_is_reduced(started, table, slots):
     )
     scene = with_slots(alone, slots) if slots else alone
     config = replace(TrackConfig(), match=MatchConfig(patch=8))
-    assert tracking._reduction(scene, frames[0], config) == tracking._reduction(alone, frames[0], config) > 1
+    reductions = [matching_reduction(one, frames[0], config) for one in (scene, alone)]
+    assert reductions[0] == reductions[1] > 1
 
 
 @pytest.mark.slow
@@ -269,7 +289,9 @@ def test_a_still_scene_stays_still(table, quick):
     _, frames, mask = table(still=True)
     scene = start_scene(frames[0], mask, 0, quick)
     *_, last = track(scene, frames[0], frames[1:], quick)
-    drift = np.linalg.norm(np.asarray(last.pose.means[: scene.num_moving] - first_pose(scene).means), axis=-1)
+    drift = np.linalg.norm(
+        np.asarray(last.result.pose.means[: scene.num_moving] - first_pose(scene).means), axis=-1
+    )
     assert drift.mean() < 1e-3
 
 
@@ -278,7 +300,7 @@ def test_one_camera_is_enough(table, quick, centroid_errors):
     sequence, frames, mask = table(cameras=1)
     scene = start_scene(frames[0], mask, 0, quick)
     *_, last = track(scene, frames[0], frames[1:], quick)
-    errors = centroid_errors(sequence, scene, last.pose, len(frames) - 1)
+    errors = centroid_errors(sequence, scene, last.result.pose, len(frames) - 1)
     assert max(errors.values()) < 8e-3, errors
 
 
@@ -288,7 +310,7 @@ def test_an_object_that_is_gone_does_not_disturb_the_others(table, quick, centro
     sequence, frames, mask = table(frames=26, **{fate: True})
     scene = start_scene(frames[0], mask, 0, quick)
     *_, last = track(scene, frames[0], frames[1:], quick)
-    assert jnp.isfinite(last.pose.means).all()
-    errors = centroid_errors(sequence, scene, last.pose, len(frames) - 1)
+    assert jnp.isfinite(last.result.pose.means).all()
+    errors = centroid_errors(sequence, scene, last.result.pose, len(frames) - 1)
     assert errors["block"] < 5e-3, errors
     assert errors["carton"] < 15e-3, errors

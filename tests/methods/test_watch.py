@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track.lost import Confidence
 from gsjax.methods.track.recover import Relocation
-from gsjax.methods.track.search import TELLS_TURN, Found, Sought, first_watch
+from gsjax.methods.track.search import TURN_KNOWN, Found, Sought, first_watch
 
 
 def test_a_watch_knows_what_is_usual_and_who_waits():
@@ -75,7 +75,7 @@ def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
     watch, none, one = first_watch(jnp.ones(1)), jnp.zeros(1), jnp.array([True])
     told = [
         (0.8, 0.2, True),  # agrees, lead of its turn, whether its turn is known then
-        (0.8, TELLS_TURN - 0.01, False),
+        (0.8, TURN_KNOWN - 0.01, False),
         (0.9, 0.2, False),  # it may have been turned in between
         (0.2, 0.2, False),  # lost
         (0.62, 0.2, False),  # found, but hardly as it was

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from gsjax.data import Sequence, read_seven_scenes
-from gsjax.methods.track import PRESETS, first_pose, start_scene, track
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import PRESETS, first_pose, start_scene
 from gsjax.perception.segmenters import PlaneOrRegionSegmenter
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")
@@ -43,9 +44,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     begun = np.asarray(first_pose(scene).means)
     strayed = np.full((FRAMES, len(names)), np.nan)
     strayed[0], skipped = 0.0, 0
-    for t, update in enumerate(track(scene, first, (sequence.frame(t) for t in range(1, FRAMES)), config), 1):
-        means, seen = np.asarray(update.pose.means)[:count], np.asarray(update.info["visible"])
-        skipped += int(update.info["skipped"])
+    for t, now in enumerate(track(scene, first, (sequence.frame(t) for t in range(1, FRAMES)), config), 1):
+        means, seen = np.asarray(now.result.pose.means)[:count], np.asarray(now.info["visible"])
+        skipped += int(now.info["skipped"])
         for i, name in enumerate(names):
             parts = np.flatnonzero(values == name)
             if seen[parts - 1].any():

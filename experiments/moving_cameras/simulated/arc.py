@@ -13,16 +13,10 @@ import numpy as np
 
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
+from gsjax.engine.drive import Tick
 from gsjax.engine.track.results import MOVED_MM
-from gsjax.methods.track import (
-    PRESETS,
-    TrackConfig,
-    Tracked,
-    TrackedScene,
-    first_pose,
-    start_scene,
-    track,
-)
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, first_pose, start_scene
 from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
 
 FRAMES, WIDTH, HEIGHT, CAMERAS, MASK_CAMERA = 24, 240, 180, 2, 1
@@ -63,17 +57,17 @@ def started(recording: Sequence, config: TrackConfig) -> TrackedScene:
     return start_scene(recording.frame(0), mask, MASK_CAMERA, config)
 
 
-def followed(scene: TrackedScene, recording: Sequence, config: TrackConfig) -> Iterator[Tracked]:
+def followed(scene: TrackedScene, recording: Sequence, config: TrackConfig) -> Iterator[Tick]:
     """One update a frame, each when it is asked for."""
     return track(scene, recording.frame(0), (recording.frame(t) for t in range(1, FRAMES)), config)
 
 
-def score(recording: Sequence, scene: TrackedScene, ran: tuple[Tracked, ...]) -> dict[str, ObjectScore]:
+def score(recording: Sequence, scene: TrackedScene, ran: tuple[Tick, ...]) -> dict[str, ObjectScore]:
     """Errors by name, of all Gaussians whose true object is known, whatever the tracker takes them for."""
     truth, count = recording.truth, scene.num_moving
     assert truth is not None
     background = np.asarray(scene.gaussians.means)[count:]
-    poses = [first_pose(scene), *(update.pose for update in ran)]
+    poses = [first_pose(scene), *(now.result.pose for now in ran)]
     means = np.stack([np.concatenate([np.asarray(pose.means)[:count], background]) for pose in poses])
     cameras = range(recording.num_cameras)
     labels = true_labels(

@@ -1,4 +1,4 @@
-"""The host loop: frames in, poses out, and everything timed."""
+"""A recording followed: frames in, poses out, and everything timed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,18 +12,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsjax.data import Sequence
+from gsjax.engine.drive import Tick
+from gsjax.engine.interrupts import shielded
 from gsjax.engine.machine import usable_cores
 from gsjax.engine.messages import COMPILING, MEASURING
 from gsjax.engine.recording import Prefetched
-from gsjax.methods.track import (
-    EMPTY,
-    Pose,
-    TrackConfig,
-    Tracked,
-    TrackedScene,
-    first_pose,
-    track,
-)
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import EMPTY, PLAN, Pose, TrackConfig, TrackedScene, first_pose
 from gsjax.methods.track.budget import Chosen
 from gsjax.scene.frame import Frame
 
@@ -36,11 +31,11 @@ _SHOWN_EVERY_S = 0.1
 
 @dataclass
 class Tracking:
-    """What tracking gave so far: the first frame, and one entry more for each update.
+    """What tracking gave so far: the first frame, and one more entry for each update.
 
     Attributes:
         scene: at the first frame.
-        final: after the last frame, with what has joined the objects.
+        tick: the newest, with what has joined the objects; None before the first update.
         joined: how many Gaussians had joined by each frame.
         poses: of the moving Gaussians in each frame, and after the first of those that join; on the host.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
@@ -51,17 +46,16 @@ class Tracking:
         plans: how many plans there were; more than one means that it had to plan again.
         visible: [K] of each update, which objects some camera saw.
         lost: [K] of each update, which objects were not where they were believed to be.
-        turn_known: [K] of each update, which objects' turns since the first frame pictures told.
+        turn_known: [K] of each update, whether the turn of each object since the first frame is known.
         skipped: updates that changed nothing, because a number in them was not finite.
         everywhere: of each update, how many groups it looked for everywhere.
-        chosen: the settings chosen for a budget, or None.
         resumed: how many frames an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
     """
 
     scene: TrackedScene
     poses: list[Pose]
-    final: TrackedScene | None = None
+    tick: Tick | None = None
     joined: list[int] = field(default_factory=lambda: [0])
     update_s: list[float] = field(default_factory=lambda: [0.0])
     compile_s: float = 0.0
@@ -74,9 +68,31 @@ class Tracking:
     turn_known: list[np.ndarray] = field(default_factory=list)
     skipped: int = 0
     everywhere: list[int] = field(default_factory=list)
-    chosen: Chosen | None = None
     resumed: int = 0
     stopped: BaseException | None = None
+
+    def add(self, now: Tick) -> None:
+        """One frame more."""
+        self.tick, info = now, now.info
+        self.poses.append(jax.device_get(now.result.pose))
+        self.joined.append(int(info["joined"]))
+        self.update_s.append(now.seconds)
+        self.compile_s += now.compile_seconds
+        self.everywhere.append(int(info["looked_for"].sum()))
+        self.visible.append(np.asarray(info["visible"]))
+        self.lost.append(np.asarray(info["lost"]))
+        self.turn_known.append(np.asarray(info["turn_known"]))
+        self.skipped += int(info["skipped"])
+
+    @property
+    def final(self) -> TrackedScene | None:
+        """The scene after the last frame; None before the first update."""
+        return None if self.tick is None else self.tick.result.scene
+
+    @property
+    def chosen(self) -> Chosen | None:
+        """The settings chosen for a budget, or None."""
+        return None if self.tick is None else self.tick.run.kept.chosen
 
     @property
     def num_frames(self) -> int:
@@ -101,18 +117,19 @@ class Tracking:
 
     def at(self, t: int) -> tuple[TrackedScene, Pose]:
         """The scene and its pose in frame t, in the same shapes for all t; what joined later is hidden."""
-        if self.final is None:
-            return self.scene, self.poses[t]
-        count, pose = self.scene.num_moving, self.poses[t]
-        slots = self.final.num_moving - len(pose.means)  # the first frame has none
+        final, pose = self.final, self.poses[t]
+        if final is None:
+            return self.scene, pose
+        count = self.scene.num_moving
+        slots = final.num_moving - len(pose.means)  # the first frame has none
         if slots:
             pose = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], slots, axis=0)]), pose)
-        labels = np.asarray(self.final.labels).copy()
-        later = slice(count + self.joined[t], self.final.num_moving)
-        labels[later] = self.final.num_objects + 1
-        logits = np.asarray(self.final.gaussians.logit_opacities).copy()
+        labels = np.asarray(final.labels).copy()
+        later = slice(count + self.joined[t], final.num_moving)
+        labels[later] = final.num_objects + 1
+        logits = np.asarray(final.gaussians.logit_opacities).copy()
         logits[later] = EMPTY
-        scene = eqx.tree_at(lambda s: (s.labels, s.gaussians.logit_opacities), self.final, (labels, logits))
+        scene = eqx.tree_at(lambda s: (s.labels, s.gaussians.logit_opacities), final, (labels, logits))
         return scene, pose
 
 
@@ -129,25 +146,23 @@ def follow(
     console: Console,
     *,
     budget_ms: float | None = None,
-    after: Tracked | None = None,
-    saved: Callable[..., None] = lambda tracking, update, *, last: None,
+    saved: Callable[..., None] = lambda tracking, *, last: None,
 ) -> Tracking:
     """Track all frames that are left. Ctrl-C or an error ends the loop; what was tracked until then stays.
 
     Args:
-        tracking: what there is so far; it is added to, and returned.
+        tracking: what there is so far, from `begin` or an earlier run; it is added to, and returned.
         first: what the tracked cameras saw at first.
         tracked: the tracked cameras; only images and depth are loaded.
         config: the tracker's.
         console: for the progress bar.
         budget_ms: what an update may take, or None.
-        after: the last update, where tracking goes on from an earlier run.
-        saved: called after each update, and once more, with `last` on, where the loop is stopped early.
+        saved: called after each update, and once more, with `last` on, where the loop ends.
     """
     shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
     ahead = 0 if shared else LOADED_AHEAD
     frames = Prefetched(tracked.frame, range(tracking.num_frames, tracked.num_frames), ahead)
-    update = after
+    after = tracking.tick
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=None),
@@ -163,34 +178,22 @@ def follow(
             "tracking", total=tracked.num_frames, completed=tracking.num_frames, rate="compiling"
         )
         try:
-            for update in track(tracking.scene, first, frames, config, budget_ms=budget_ms, after=after):
-                tracking.poses.append(jax.device_get(update.pose))
-                tracking.final = update.scene
-                tracking.joined.append(int(update.info["joined"]))
-                tracking.update_s.append(update.seconds)
-                tracking.compile_s += update.compile_seconds
-                tracking.everywhere.append(update.everywhere)
-                tracking.chosen = update.chosen
+            for now in track(tracking.scene, first, frames, config, budget_ms=budget_ms, after=after):
                 if not plans:
-                    known = update.seconds + update.compile_seconds + frames.waited
+                    known = now.seconds + now.compile_seconds + frames.waited
                     tracking.planning_s = max(0.0, perf_counter() - begun - known)
-                tracking.visible.append(np.asarray(update.info["visible"]))
-                tracking.lost.append(np.asarray(update.info["lost"]))
-                tracking.turn_known.append(np.asarray(update.info["turn_known"]))
-                tracking.skipped += int(update.info["skipped"])
-                plans.add(update.plan)
-                saved(tracking, update, last=False)
+                shielded(tracking.add, now)
+                plans.add(now.run.plans[PLAN])
+                saved(tracking, last=False)
                 progress.update(task, advance=1, rate=_rate(tracking))
                 if perf_counter() - drawn > _SHOWN_EVERY_S:
                     progress.refresh()
                     drawn = perf_counter()
-            if update is not None and update.info:
-                saved(tracking, update, last=True)
         except (KeyboardInterrupt, Exception) as stopped:
             tracking.stopped = stopped
             progress.update(task, rate="stopped")
-            if update is not None and update.info:
-                saved(tracking, update, last=True)
+        if tracking.tick is not after:
+            saved(tracking, last=True)
     tracking.loop_s = perf_counter() - begun
     tracking.loading_s, tracking.plans = frames.waited, len(plans)
     return tracking

@@ -35,14 +35,14 @@ _VIDEO_HEIGHT = 480  # smaller pictures are enlarged
 
 @dataclass(frozen=True)
 class ObjectQuery(Common, ClipWeights, ObjectText):
-    """What is asked of a run, and how it is understood."""
+    """The question to a run, and how it is understood."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax track`."""
     text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT")]
     """Which object: "red can"."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to show it from. The first held out one, else the first tracked, unless given."""
+    """Id of the camera to show it from; default: the first held-out one, else the first tracked."""
 
 
 class Answer(NamedTuple):
@@ -95,11 +95,11 @@ def ask_for_object(options: ObjectQuery, console: Console) -> None:
                     frame_id = recording.tracked.frame_ids[view.t]
                     write_png(new / "masks" / f"{frame_id:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
                     video.write(show(view, mask, answer.group))
-            told = {"text": options.text, "encoder": options.encoder, "camera": camera}
-            told |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
-            told |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
-            told |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
-            write_json(new / "query.json", told)
+            found = {"text": options.text, "encoder": options.encoder, "camera": camera}
+            found |= {"group": answer.group, "label": saved.tracking.scene.label_ids[answer.group]}
+            found |= {"name": answer.name, "scores": answer.scores, "margin": answer.margin}
+            found |= {"min_score": answer.min_score, "pixels": pixels, "notes": notes.all}
+            write_json(new / "query.json", found)
     hidden = sum(count == 0 for count in pixels)
     unseen = f"; camera {camera} does not see it in {hidden} of {len(pixels)} frames" if hidden else ""
     score = f"cosine {answer.scores[answer.name]:.2f}, and {answer.min_score:.2f} is asked for"
@@ -113,7 +113,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
     Args:
         options: the run and the text.
         console: for the scores.
-        notes: told of what is odd.
+        notes: for warnings.
 
     Raises:
         ValueError, OSError: as `ask_for_object`.
@@ -138,7 +138,7 @@ def ask(options: ObjectQuery, console: Console, notes: Notes) -> tuple[SavedRun,
         )
     if margin < _CLOSE:
         second = _ranked(scores)[1][0]
-        notes.warn(f"{second} fits {options.text!r} about as well; say more to tell them apart")
+        notes.warn(f"{second} fits {options.text!r} about as well; say more to distinguish them")
     _print_scores(scores, saved.names[group])
     rows = np.flatnonzero(np.asarray(saved.tracking.scene.labels) == group)
     return saved, Answer(group, saved.names[group], scores, margin, float(min_score), rows)

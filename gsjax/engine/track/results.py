@@ -37,7 +37,7 @@ TIMES = (
     ("evaluation", "afterwards: rendering, scoring and videos"),
     ("total", "all of it"),
 )
-MOVED_MM = 30.0  # an object that moved less says little about a tracker
+MOVED_MM = 30.0  # an object that moved less is no test of a tracker
 
 
 def object_rows(found: dict[str, Any]) -> list[dict[str, Any]]:

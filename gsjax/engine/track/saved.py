@@ -18,7 +18,7 @@ _AGAIN = "track again with this version of gsjax, or name another folder"
 
 @dataclass(frozen=True, eq=False)
 class SavedRun:
-    """What `gsjax track` left.
+    """A run of `gsjax track`.
 
     Attributes:
         path: the folder.
@@ -35,7 +35,7 @@ class SavedRun:
     names: dict[int, str]
 
     def seen_by(self, camera: int | None) -> Recording:
-        """The recording with one camera only; the first held out one, else the first tracked, unless given.
+        """The recording with one camera only; the first held out one, else the first tracked, by default.
 
         Raises:
             ValueError: the run had no such camera.

@@ -63,7 +63,7 @@ def metrics(
     values: np.ndarray | None,
 ) -> dict[str, Any]:
     """The scores of metrics.json; what was not scored is None: the motion of an object that is not tracked,
-    though some Gaussian may lie on it. docs/track.md says what each score means.
+    though some Gaussian may lie on it. docs/track.md explains each score.
 
     Args:
         tracking: the scene and its poses.
@@ -158,7 +158,7 @@ def lost_over_frames(
     """In which updates the tracker held the object, or a part of it, for lost.
 
     Args:
-        tracking: the scene and what the tracker said of it.
+        tracking: the scene and the tracker's flags.
         values: the mask value of each group, [K+1], or None.
         label: the object's.
     """
@@ -189,7 +189,7 @@ def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int)
 def _of_object(
     tracking: Tracking, flags: list[np.ndarray], values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates parts"]:
-    """Of all flags those of one object's groups."""
+    """The flags of one object's groups."""
     ids = np.asarray(tracking.scene.label_ids) if values is None else values
     return np.asarray(flags, bool).reshape(len(flags), len(ids) - 1)[:, ids[1:] == label]
 

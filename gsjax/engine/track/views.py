@@ -9,7 +9,7 @@ from gsjax.methods.track import place, render_labels
 
 
 def views(tracking: Tracking, recording: Recording, every: int = 1) -> Iterator[list[View]]:
-    """The views of all cameras, a list for every so-manieth frame; one frame is in memory at a time.
+    """The views of all cameras, a list for every n-th frame; one frame is in memory at a time.
 
     Masks of all frames are opened here, for scoring: call it when tracking has ended.
     """

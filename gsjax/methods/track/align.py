@@ -87,7 +87,7 @@ class Residuals(NamedTuple):
 
 
 def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
-    """Of one group's points."""
+    """The residuals of one group's points."""
     height, width, channels = sight.pixels.shape[1:]
     scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
 

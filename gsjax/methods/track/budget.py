@@ -1,8 +1,8 @@
-"""A budget for updates: what is left out so that each one is done in time.
+"""A time budget for updates: what is left out so that each one is done in time.
 
 Once, before the first frame, the richest settings whose measured cost fits are chosen from a ladder. Then,
-from frame to frame, a `Governor` says how many groups may be looked for everywhere, which is what a compiled
-update lets vary. What came late is paid back by the updates that follow.
+from frame to frame, a `Governor` decides how many groups may be looked for everywhere, which a compiled
+update can vary. Updates that were late are paid back by those that follow.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _LEARNING = 0.1  # weight of an update in the running estimate of what one costs
 
 
 class Costs(NamedTuple):
-    """What an update costs, in seconds."""
+    """Cost of an update, in seconds."""
 
     base: float  # without looking for anything everywhere
     search: float  # for each group that is looked for everywhere
@@ -47,7 +47,7 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 
     def rung(preset: TrackConfig) -> TrackConfig:
         grow = replace(preset.grow, slots=config.grow.slots)
-        return replace(preset, start=config.start, headroom=config.headroom, grow=grow)
+        return replace(preset, start=config.start, headroom=config.headroom, seed=config.seed, grow=grow)
 
     rungs = {name: rung(PRESETS[name]) for name in ("accurate", "balanced", "fast")}
     small = replace(rungs["fast"], shrink=2)
@@ -99,12 +99,12 @@ class Governor:
         self._budget, self._costs, self._most, self._debt = budget, costs, most, 0.0
 
     def allowed(self) -> int:
-        """Of the next update."""
+        """The number for the next update."""
         left = _USED * self._budget - self._debt - self._costs.base
         return int(min(max(left / max(self._costs.search, 1e-6), 0), self._most))
 
     def spent(self, seconds: float, searched: int) -> None:
-        """Tell what an update took, and how many groups it looked for."""
+        """Record what an update took, and how many groups it looked for."""
         owed = self._debt + seconds - self._budget
         self._debt = min(max(owed, 0.0), _MOST_OWED * self._budget)
         error = seconds - searched * self._costs.search - self._costs.base

@@ -2,19 +2,11 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
+import numpy as np
 
-def _check(
-    config: Any, *, above_zero: tuple[str, ...] = (), at_least: dict[str, float] | None = None
-) -> None:
-    """Raises ValueError where a setting has no meaning; NaN never has."""
-    rules = [(name, "more than 0", getattr(config, name) > 0) for name in above_zero]
-    rules += [(n, f"{low} or more", getattr(config, n) >= low) for n, low in (at_least or {}).items()]
-    for name, expected, holds in rules:
-        if not holds:
-            found = getattr(config, name)
-            raise ValueError(f"{type(config).__name__}.{name}: expected {expected}, found {found}")
+from gsjax.methods.settings import ABOVE_ZERO, expect
 
 
 @dataclass(frozen=True)
@@ -24,7 +16,7 @@ class StartConfig:
     object_pixels: float = 1.5
     """Width of the voxels that keep one point of an object each, in pixels of the camera that saw it."""
     background_pixels: float = 4.0
-    """The same for the background, which is only looked at."""
+    """The same for the background, which is only rendered."""
     max_extent: float = 0.35
     """Objects longer than this are seldom rigid (a robot arm): they are followed in parts, metres."""
     part_size: float = 0.15
@@ -40,9 +32,8 @@ class StartConfig:
 
     def __post_init__(self):
         sizes = ("object_pixels", "background_pixels", "max_extent", "part_size")
-        _check(
-            self, above_zero=(*sizes, "label_distance", "label_step", "depth_gap"), at_least={"iterations": 0}
-        )
+        lengths = ("label_distance", "label_step", "depth_gap")
+        expect(self, "track.start.", **dict.fromkeys(sizes + lengths, ABOVE_ZERO), iterations=(0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -61,8 +52,8 @@ class MatchConfig:
     """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
 
     def __post_init__(self):
-        least = {"patch": 8, "radius": 1, "margin": 0, "min_score": -1}
-        _check(self, above_zero=("max_residual",), at_least=least)
+        expect(self, "track.match.", max_residual=ABOVE_ZERO, patch=(8, np.inf), radius=(1, np.inf))
+        expect(self, "track.match.", margin=(0, np.inf), min_score=(-1, np.inf))
 
 
 @dataclass(frozen=True)
@@ -78,15 +69,15 @@ class AlignConfig:
     centers: int = 256
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 1.0
-    """What a centre counts beside a pixel. It keeps from drifting; a pixel looks more like the new frame."""
+    """Weight of a centre beside a pixel. Centres prevent drift; pixels look more like the new frame."""
     pixels: int = 192
-    """Pixels of the last frame that speak for a group in each camera, and as many of its keyframe."""
+    """Pixels of the last frame that stand for a group in each camera, and as many of its keyframe."""
     keyframe_turn: float = 0.4
     """The keyframe counts less as a group turns, and beyond this turn the last frame replaces it, radians."""
     max_thickness: float = 0.06
     """Measured depth further than this from the model's is not of the same object, metres."""
     shading: float = 0.3
-    """What brightness counts beside chroma: 1 as much, 0 nothing. What turns is lit differently."""
+    """Weight of brightness beside chroma, 0 to 1. What turns is lit differently."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
@@ -104,24 +95,14 @@ class AlignConfig:
 
     def __post_init__(self):
         scales = ("color_scale", "depth_scale", "max_thickness", "widen", "spacing", "max_step")
-        _check(
-            self,
-            above_zero=scales,
-            at_least={
-                "iterations": 0,
-                "centers": 1,
-                "center_weight": 0,
-                "pixels": 1,
-                "reach": 0,
-                "keyframe_turn": 0,
-                "shading": 0,
-                "max_turn": 0,
-            },
-        )
+        shares = ("iterations", "center_weight", "reach", "keyframe_turn", "shading", "max_turn")
+        expect(self, "track.align.", **dict.fromkeys(scales, ABOVE_ZERO))
+        expect(self, "track.align.", **dict.fromkeys(shares, (0, np.inf)))
+        expect(self, "track.align.", centers=(1, np.inf), pixels=(1, np.inf))
         if self.everywhere is not None:
-            _check(self, at_least={"everywhere": 0})
+            expect(self, "track.align.", everywhere=(0, np.inf))
         if not all(0 < turn <= math.pi for turn in self.turns):
-            raise ValueError(f"AlignConfig.turns: expected more than 0, pi at most, found {self.turns}")
+            raise ValueError(f"track.align.turns: expected more than 0, pi at most, found {self.turns}")
 
 
 @dataclass(frozen=True)
@@ -150,15 +131,11 @@ class RefineConfig:
     """Colour differences beyond this are of something else, 0 to 1."""
 
     def __post_init__(self):
-        rates = {
-            "translation_rate": 0,
-            "rotation_rate": 0,
-            "delta_rate": 0,
-            "delta_weight": 0,
-            "background_rate": 0,
-        }
         limits = ("delta_scale", "depth_limit", "color_limit")
-        _check(self, above_zero=limits, at_least={"iterations": 0, "depth_weight": 0, **rates})
+        rates = ("translation_rate", "rotation_rate", "delta_rate", "background_rate")
+        expect(self, "track.refine.", **dict.fromkeys(limits, ABOVE_ZERO))
+        expect(self, "track.refine.", **dict.fromkeys(rates, (0, np.inf)), delta_weight=(0, np.inf))
+        expect(self, "track.refine.", iterations=(0, np.inf), depth_weight=(0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -168,19 +145,19 @@ class GrowConfig:
     slots: int = 4096
     """Gaussians that may join over the whole recording; 0 leaves growing out."""
     candidates: int = 256
-    """Pixels that are looked at in a frame."""
+    """Pixels that are examined in a frame."""
     reach: int = 6
     """How far from an object's outline they may be, pixels."""
     min_gap: float = 0.008
-    """What is measured this much nearer than the model is not explained by it, metres."""
+    """Depth measured this much nearer than the model is not explained by it, metres."""
     distance: float = 0.012
     """How near a pixel must be to a Gaussian to continue its object, metres ..."""
     color: float = 0.15
     """... and in colour, 0 to 1. Both count together, and the background's Gaussians compete."""
 
     def __post_init__(self):
-        lengths = ("min_gap", "distance", "color")
-        _check(self, above_zero=lengths, at_least={"slots": 0, "candidates": 1, "reach": 0})
+        expect(self, "track.grow.", **dict.fromkeys(("min_gap", "distance", "color"), ABOVE_ZERO))
+        expect(self, "track.grow.", slots=(0, np.inf), candidates=(1, np.inf), reach=(0, np.inf))
 
 
 @dataclass(frozen=True)
@@ -197,28 +174,30 @@ class TrackConfig:
     warm_start: bool = True
     """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
     cameras: tuple[int, ...] = ()
-    """The frame's cameras that are followed with, counted from 0; all unless given."""
+    """Cameras of the frame to track with, counted from 0; default: all."""
     shrink: int = 1
-    """Pictures are averaged over so many pixels each way before anything else."""
+    """Pictures are averaged over blocks of this many pixels each way before anything else."""
     redraw: Literal["all", "moving"] = "moving"
     """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
     coarseness: int = 1
     """With "moving": pictures shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
     headroom: float = 1.5
     """Room in the rasterizer's plan for what the motion will add."""
+    seed: int = 0
+    """Seed of the random places where what is lost is looked for."""
 
     def __post_init__(self):
-        _check(self, at_least={"headroom": 1, "coarseness": 1, "shrink": 1})
+        expect(self, "track.", headroom=(1, np.inf), coarseness=(1, np.inf), shrink=(1, np.inf))
         if self.coarseness > 1 and (self.redraw == "all" or self.matching):
             raise ValueError(
-                f"TrackConfig.coarseness: expected 1 unless redraw is moving and matching off, found "
+                f"track.coarseness: expected 1 unless redraw is moving and matching off, found "
                 f"{self.coarseness}"
             )
         if self.redraw not in ("all", "moving"):
-            raise ValueError(f"TrackConfig.redraw: expected all or moving, found {self.redraw!r}")
+            raise ValueError(f"track.redraw: expected all or moving, found {self.redraw!r}")
         if self.redraw == "moving" and self.refine.iterations:
             raise ValueError(
-                "TrackConfig.redraw: expected all where refine.iterations is above 0, found moving; set "
+                "track.redraw: expected all where refine.iterations is above 0, found moving; set "
                 "refine.iterations to 0, or draw all"
             )
 
@@ -237,5 +216,5 @@ FAST = replace(
 )
 PRESETS = {"accurate": TrackConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
 """`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on one core,
-and looks for two objects everywhere in an update. `paper` has all of the paper's stages, template matching
+and searches everywhere for two objects in an update. `paper` has all of the paper's stages, template matching
 and photometric refinement too, which cost much and gain little: see docs/results-tracking.md."""

@@ -7,12 +7,12 @@ it shows in, weighted by how much it shows there:
 
     f = (W^T m) / (W^T 1)
 
-*Distillation* looks for those features whose render comes closest to the maps:
+*Distillation* finds the features whose render comes closest to the maps:
 
     min_f  |W f - a m|^2 + damping |f - f_projected|^2
 
 in which a = W 1 is the rendered alpha: what is half transparent shows half a feature. It is a linear least
-squares problem, so conjugate gradients solve it without a rate that somebody would have to choose; W^T 1 is
+squares problem, so conjugate gradients solve it without a learning rate; W^T 1 is
 the preconditioner, for it bounds what a row of W^T W can add up to. Both give a constant map back as it is.
 """
 
@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.geometry.neighbors import nearest
@@ -41,7 +41,7 @@ _CHANNELS = 16  # rendered at a time: hundreds, as foundation models have, compi
 
 
 class FeatureBatch(NamedTuple):
-    """What distillation is given.
+    """The batch of the distillation.
 
     Attributes:
         gaussians: the scene, frozen.
@@ -65,11 +65,19 @@ class FeatureBatch(NamedTuple):
 
 
 class DistillState(NamedTuple):
-    """Conjugate gradients, a solution of its own for each channel."""
+    """Conjugate gradients, a solution of its own for each channel.
+
+    Attributes:
+        residual: of the normal equations.
+        direction: in which the features go next.
+        energy: squared preconditioned residual of each channel.
+        begun: whether the residual is known; the first update only finds it.
+    """
 
     residual: Float[Array, "n d"]
     direction: Float[Array, "n d"]
     energy: Float[Array, "d"]
+    begun: Bool[Array, ""]
 
 
 def project_features(
@@ -118,46 +126,50 @@ def distill_features(
     prior, weights = _project(scene, frame, maps, valid, plan)
     known = (jnp.asarray(weights), jnp.asarray(damping, maps.dtype), plan)
 
+    step = feature_distiller()
+
     def solve(part: Array, prior: Array) -> Array:
         batch = FeatureBatch(scene.gaussians, frame.cameras, part, valid, prior, *known)
-        step = feature_distiller(batch)
         features, state = prior, step.init(prior)
-        for i in range(iterations):
+        for i in range(iterations + 1):  # the first finds the residual
             features, state, _ = step.update(features, state, batch, step=i, key=None)
         return features
 
     return _in_chunks(solve, maps, prior)
 
 
-def feature_distiller(first: FeatureBatch) -> Step:
-    """Conjugate gradients on distillation's normal equations, one iteration an update.
+def feature_distiller() -> Step:
+    """Conjugate gradients on distillation's normal equations, one iteration an update. The first update finds
+    the residual that the others lessen, and moves nothing.
 
-    params: the features [N,D], which begin as `first.prior`. state: `DistillState`. batch: `FeatureBatch`,
-    the same each time. info: `energy` [D], the squared preconditioned residual of each channel.
+    params: the features [N,D], which begin as the batch's `prior`. state: `DistillState`. batch:
+    `FeatureBatch`, the same each time. `step` and `key` are not used. `info` has `energy` [D], the squared
+    preconditioned residual of each channel, whose sum is `loss`.
     """
 
     def init(params: Float[Array, "n d"]) -> DistillState:
-        gaussians, cameras, maps, valid, prior, _, damping, plan = first
-        residual = _residual(params, maps, gaussians, cameras, valid, plan)
-        residual += damping * (prior - params)
-        direction = residual / _bound(first)
-        return DistillState(residual, direction, jnp.sum(residual * direction, axis=0))
+        nothing = jnp.zeros_like(params)
+        return DistillState(nothing, nothing, nothing.sum(0), jnp.asarray(False))
 
     def update(params, state: DistillState, batch: FeatureBatch, *, step: Any, key: Any):
-        gaussians, cameras, maps, valid, _, _, damping, plan = batch
-        nothing = jnp.zeros_like(maps)
-        along = -_residual(state.direction, nothing, gaussians, cameras, valid, plan)
-        along += damping * state.direction
+        gaussians, cameras, maps, valid, prior, _, damping, plan = batch
+        begun = state.begun
+        # W is linear: with these two, one render serves to find the residual and to apply W^T W.
+        at, towards = jnp.where(begun, state.direction, params), jnp.where(begun, 0.0, maps)
+        pull, (overflow, needed) = _residual(at, towards, gaussians, cameras, valid, plan)
+        along = damping * state.direction - pull
         length = _ratio(state.energy, jnp.sum(state.direction * along, axis=0))
-        features = params + length * state.direction
-        residual = state.residual - length * along
+        features = jnp.where(begun, params + length * state.direction, params)
+        first = pull + damping * (prior - params)
+        residual = jnp.where(begun, state.residual - length * along, first)
         scaled = residual / _bound(batch)
         energy = jnp.sum(residual * scaled, axis=0)
         direction = scaled + _ratio(energy, state.energy) * state.direction
-        new = (features, DistillState(residual, direction, energy))
-        sound = all_finite(new)
+        new = (features, DistillState(residual, direction, energy, jnp.asarray(True)))
+        sound = all_finite(new[:1] + new[1][:3]) & ~overflow
         params, state = keep_if(sound, new, (params, state))
-        return params, state, {"energy": state.energy, "skipped": ~sound}
+        info = {"loss": state.energy.sum(), "energy": state.energy, "skipped": ~sound}
+        return params, state, info | {"overflow": overflow, "needed": needed}
 
     return Step(init, update)
 
@@ -192,16 +204,18 @@ def _residual(
     valid: Float[Array, "c height width"],
     plan: Plan,
     faded: bool = True,
-) -> Float[Array, "n d"]:
-    """W^T (a m - W f) over the valid pixels; not `faded` leaves out a. All that is costly happens here."""
+) -> tuple[Float[Array, "n d"], tuple[Bool[Array, ""], Int[Array, ""]]]:
+    """W^T (a m - W f) over the valid pixels; whether the plan overflowed, and what it needed. Not `faded`
+    leaves out a. All that is costly happens here."""
 
     def draw(features):
         rendered = render(gaussians, cameras, plan, features=features)
-        return rendered.features, rendered.alphas
+        meta = rendered.meta
+        return rendered.features, (rendered.alphas, (meta.overflow.any(), meta.needed.max()))
 
-    drawn, transpose, alphas = jax.vjp(draw, features, has_aux=True)
+    drawn, transpose, (alphas, room) = jax.vjp(draw, features, has_aux=True)
     target = alphas[..., None] * maps if faded else maps
-    return transpose(valid[..., None] * (target - drawn))[0]
+    return transpose(valid[..., None] * (target - drawn))[0], room
 
 
 def _project(
@@ -211,7 +225,7 @@ def _project(
 
     def gather(part: Array) -> Array:
         nothing = jnp.zeros((scene.gaussians.num, part.shape[-1]), part.dtype)
-        return _residual(nothing, part, scene.gaussians, frame.cameras, valid, plan, faded=False)
+        return _residual(nothing, part, scene.gaussians, frame.cameras, valid, plan, faded=False)[0]
 
     sums = _in_chunks(gather, jnp.concatenate([maps, jnp.ones_like(maps[..., :1])], axis=-1))
     weights, points = sums[:, -1], np.asarray(scene.gaussians.means)

@@ -1,22 +1,49 @@
-"""Photometric optimisation of the first frame's Gaussians, before anything moves."""
+"""The scene at the first frame, and its photometric optimisation before anything moves."""
 
+import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsjax.losses.photometric import photometric_loss, truncated_l1
-from gsjax.methods.track.scene import TrackedScene
+from gsjax.methods.track.config import TrackConfig
+from gsjax.methods.track.scene import TrackedScene, labelled_cloud, scene_from_cloud
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
-from gsjax.scene.frame import Frame
+from gsjax.rasterize.plan import with_room
+from gsjax.scene.frame import Frame, without_broken
 from gsjax.scene.render import plan_render, render
 
 # Means hardly move: depth has measured them. What is learned is how to blend into the pictures.
 RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
+
+
+def start_scene(
+    frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackConfig | None = None
+) -> TrackedScene:
+    """A labelled, photometrically optimised scene from the first RGB-D frame and one camera's mask.
+
+    Args:
+        frame: what the cameras see at first, with depth.
+        mask: labels [H, W] of one camera's image; 0 is background.
+        mask_camera: which camera of the frame the mask belongs to, counted from 0.
+        config: how it starts; default: the default settings.
+
+    Raises:
+        ValueError: there is no depth, or the mask does not fit the images.
+    """
+    config = TrackConfig() if config is None else config
+    frame, broken = without_broken(eqx.tree_at(lambda f: f.images, frame, frame.colors))
+    if broken:
+        warnings.warn(f"the first frame has {broken} pixels that are not finite; unused", stacklevel=2)
+    scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
+    return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
 def fit_loss(gaussians, batch, *, step, key):
@@ -61,13 +88,15 @@ def fit_scene(
     gaussians, info, skipped = scene.gaussians, {}, 0
     state = _STEP.init(gaussians)
     plan = plan_render(gaussians, frame.cameras, headroom=headroom)
+
+    def advanced(gaussians, state, i, plan):
+        result = _advance()(gaussians, state, (frame, plan), i)
+        return result, SimpleNamespace(**result[-1])
+
     for i in range(iterations):
-        while True:
-            new, new_state, info = _advance()(gaussians, state, (frame, plan), i)
-            if not info["overflow"].any():
-                break
-            plan = plan.grown(int(info["needed"].max()), headroom)
-        gaussians, state, skipped = new, new_state, skipped + int(info["skipped"])
+        step = partial(advanced, gaussians, state, i)
+        (gaussians, state, info), plan = with_room(step, plan, headroom)
+        skipped += int(info["skipped"])
     if iterations and skipped == iterations:
         raise ValueError("the first frame could not be fitted: its loss is not finite, whatever the step")
     return eqx.tree_at(lambda s: s.gaussians, scene, gaussians), info
@@ -78,7 +107,7 @@ _STEP = gradient_step(fit_loss, per_field_adam(RATES))
 
 @cache
 def _advance() -> Callable:
-    """The jitted step; made late, because its options ask which machine this is."""
+    """The jitted step; made late, because its options depend on the machine."""
     return jax.jit(
         lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
         compiler_options=host_options(),

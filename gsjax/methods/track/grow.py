@@ -69,8 +69,8 @@ def grow(
         scene, pose: with slots (see `with_slots`), as they stand.
         shown: what they show in the frame's cameras.
         frame: what the cameras saw at this pose, with depth.
-        step: any number that differs from frame to frame: it picks which pixels are looked at.
-        coarseness: what is shown is of every so-manieth pixel.
+        step: any number that differs from frame to frame: it picks which pixels are examined.
+        coarseness: n, where `shown` has every n-th pixel.
         lost: objects that nothing joins, for they are not where they are believed to be.
     """
     assert frame.depths is not None

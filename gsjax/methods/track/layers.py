@@ -42,7 +42,7 @@ class Backdrop(NamedTuple):
 
     @property
     def covers(self) -> Bool[Array, "c height width"]:
-        """Where it is more than half opaque."""
+        """Pixels where it is more than half opaque."""
         return self.alphas > 0.5
 
 
@@ -60,7 +60,7 @@ def render_labels(
 
 
 def shown_by(rendered: Rendered) -> Shown:
-    """Of the whole scene, drawn by `render_labels`."""
+    """What the whole scene shows, drawn by `render_labels`."""
     assert rendered.features is not None
     covered = rendered.alphas > 0.5
     labels = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
@@ -68,12 +68,12 @@ def shown_by(rendered: Rendered) -> Shown:
 
 
 def background_of(scene: TrackedScene) -> Gaussians:
-    """What does not move."""
+    """The Gaussians that do not move."""
     return jax.tree.map(lambda a: a[scene.num_moving :], scene.gaussians)
 
 
 def moving_of(scene: TrackedScene, pose: Pose) -> Gaussians:
-    """What moves, where `pose` says."""
+    """The Gaussians that move, placed by `pose`."""
     moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
     return eqx.tree_at(lambda g: (g.means, g.quats), moving, (pose.means, pose.quats))
 
@@ -110,11 +110,11 @@ def are_same(a: Camera, b: Camera) -> Bool[Array, ""]:
 
 
 def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
-    """For `show_moving`, of which only labels and depths are asked: shares of a pixel below 3 % are left out,
-    and all that lies behind once less than a tenth is left. A Gaussian that would leave less than 1 % is not
-    drawn, so none may take that much alone: `alpha_max`. So where one alone is all that shows of an opaque
-    thing, depth leans by up to 9 % of the way to what moves behind it. Small tiles fit small Gaussians, and a
-    few of them end sooner than many (tuned on a CPU).
+    """A plan for `show_moving`, of which only labels and depths are needed: shares of a pixel below 3 % are
+    left out, and all that lies behind once less than a tenth is left. A Gaussian that would leave less than
+    1 % is not drawn, so none may take that much alone: `alpha_max`. So where one alone is all that shows of
+    an opaque thing, depth leans by up to 9 % of the way to what moves behind it. Small tiles fit small
+    Gaussians, and a few of them end sooner than many (tuned on a CPU).
 
     Args:
         moving: the Gaussians that move.

@@ -1,9 +1,9 @@
-"""What is lost: telling that it is.
+"""Detect lost objects.
 
-Residuals of the alignment say when a group gets lost, but not that it is: pixels of the last frame are taken
-from where the group was believed to be, and agree again with whatever stands there. The Gaussians of the
-first frame do not: where the group is not, cameras see past them, or other colours. So they decide whether it
-is lost, and whether it is found again (see `recover`).
+Residuals of the alignment rise when a group gets lost, but not while it is: pixels of the last frame are
+taken from where the group was believed to be, and agree again with whatever stands there. The Gaussians of
+the first frame do not: where the group is not, cameras see past them, or other colours. So they decide
+whether it is lost, and whether it is found again (see `recover`).
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gsjax.methods.track.points import Points, Sight, rotated, sum_of_three
 
 COLOR_SCALE = 0.15  # a difference of tones that is large, after turns and shadows since the first frame
-_FEWEST = 6.0  # points that can tell
+_FEWEST = 6.0  # points that decide
 _FLAT = 0.9  # share of a group's points that lie in the background's surface where it is a card upon it
 
 LOST, DOUBTFUL, FOUND = 0.35, 0.6, 0.6
@@ -24,7 +24,7 @@ it may be elsewhere, above the third it is found there. docs/results-hard-cases.
 
 
 class Confidence(NamedTuple):
-    """What the cameras say of where each group is believed to be."""
+    """How well what the cameras see agrees with where each group is believed to be."""
 
     agrees: Float[Array, "k"]  # share of what can be seen of it that looks as at first, 0 to 1
     shows: Float[Array, "k"]  # the same of all of it: what is hidden or out of the picture is missing
@@ -43,11 +43,11 @@ def confidence(
     Args:
         centers: of each group, with the tones that they had; `seen` is 1 in cameras that look for them.
         sight: what the cameras see now.
-        gap: measured depth may differ by so much, metres. What is further is seen past the group, which
-            disagrees; what is nearer hides it, and says nothing.
-        background: its depth where it is known, metres, else 0; of every so-manieth pixel. Where a camera
+        gap: how far measured depth may be off, metres. Depth beyond that is seen past the group, which
+            disagrees; nearer depth hides it, and counts as nothing.
+        background: its depth where it is known, metres, else 0; of every n-th pixel. Where a camera
             measures just that, it does not see the group, however near: what slips into a wall would agree
-            with the wall. Of a card that lies flat on it with all it has, that says nothing.
+            with the wall. A card that lies flat on it is exempt.
         others: the same of other groups, on which nothing lies like a card.
     """
     height, width = sight.pixels.shape[1:3]

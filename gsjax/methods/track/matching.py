@@ -21,7 +21,7 @@ from gsjax.scene.frame import Frame
 
 
 class Template(NamedTuple):
-    """What is looked for: the last scene, or the last images, with the share of each object in each pixel."""
+    """The last scene, or the last images, with the share of each object in each pixel."""
 
     colors: Float[Array, "c h w 3"]
     depths: Float[Array, "c h w"]

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import multiply_quats, quats_to_matrices
 from gsjax.methods.track.scene import TrackedScene
@@ -60,6 +60,20 @@ def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[A
     turned = jnp.einsum("mij,mj->mi", rotation.as_matrix()[member], pose.means - center)
     means = center + turned + motion.twists[member, :3] + motion.delta
     return Pose(means, multiply_quats(rotation.wxyz[member], pose.quats))
+
+
+def select_motion(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "m"]) -> Motion:
+    """The motion `a` of the chosen groups, and `b` of the others.
+
+    Args:
+        chosen: of all groups.
+        a, b: motions of all groups and Gaussians.
+        groups: 1..K, of each Gaussian.
+    """
+    return Motion(
+        jnp.where(chosen[:, None], a.twists, b.twists),
+        jnp.where(chosen[groups - 1][:, None], a.delta, b.delta),
+    )
 
 
 def place(scene: TrackedScene, pose: Pose) -> Gaussians:

@@ -7,6 +7,7 @@ import jax
 from jaxtyping import Array, Bool, Int
 
 from gsjax.methods.track.config import TrackConfig
+from gsjax.methods.track.frames import prepared
 from gsjax.methods.track.layers import background_of, moving_of, plan_moving, reduced, thinned
 from gsjax.methods.track.motion import Pose, place
 from gsjax.methods.track.region import near_background, near_scene
@@ -42,7 +43,7 @@ class TrackPlan:
 
 
 class Needed(NamedTuple):
-    """What a step needed of each capacity."""
+    """How much of each capacity a step needed."""
 
     full: Int[Array, ""]
     near: Int[Array, ""]
@@ -55,8 +56,16 @@ class Needed(NamedTuple):
 
 
 def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackConfig) -> TrackPlan:
-    """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds."""
-    headroom = config.headroom
+    """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds.
+
+    On the host.
+
+    Args:
+        scene, pose: as they stand, with slots for what joins.
+        frame: what all cameras saw at this pose.
+        config: the tracker's.
+    """
+    headroom, (frame, _) = config.headroom, prepared(frame, config)
     if config.redraw == "moving":
         views, moving = (
             reduced(frame.cameras, config.coarseness),

@@ -1,4 +1,4 @@
-"""What is aligned of each group: points with tones, as many for each, that a camera looks for.
+"""Points that are aligned: with tones, the same number for each group, each looked for by some cameras.
 
 They are pixels of the last frame, which look most like the new one; pixels of a keyframe, carried along since
 then; and centres of the Gaussians that the first mask named. The last frame alone would drift, and what once
@@ -41,7 +41,7 @@ class Sight(NamedTuple):
 
     @property
     def tones(self) -> Float[Array, "c height width 3"]:
-        """What is compared: the first three channels of the pixels."""
+        """The first three channels of the pixels, which are compared."""
         return self.pixels[..., :3]
 
     @property
@@ -153,7 +153,7 @@ def pixels_of_groups(
             than a group is thick is something else.
         num_groups: K, static.
         config: with how many pixels.
-        coarseness: labels and depths are of every so-manieth pixel.
+        coarseness: n, where labels and depths are of every n-th pixel.
     """
     sight = sight._replace(pixels=sight.pixels[:, ::coarseness, ::coarseness])
     width = sight.pixels.shape[2]

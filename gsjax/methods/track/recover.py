@@ -1,8 +1,8 @@
-"""Where a lost group may be: of many guesses, what the cameras show most of, aligned.
+"""Recovery of a lost group: many places are guessed and aligned, and the one where most of it shows is kept.
 
 Residuals cannot choose, for they take what hides a group, or lies outside the pictures, for a disagreement.
-So `confidence` does, with the Gaussians of the first frame that would face each camera. What it comes up with
-is a guess, from which the next frame goes on, until so much of the group shows there that it is found: in two
+So `confidence` does, with the Gaussians of the first frame that would face each camera. The result is a
+guess, from which the next frame goes on, until enough of the group shows there for it to be found: in two
 frames, for of many guesses one may agree by chance.
 """
 
@@ -21,29 +21,27 @@ from gsjax.methods.track.points import Points, Sight, sum_of_three
 from gsjax.methods.track.reference import ReferencePoints, as_facing
 
 _LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
-_NEAR_HUNCH = 0.3  # radians; how a guess that goes on from a guess is turned
+_NEAR_GUESS = 0.3  # radians; how a guess that goes on from a guess is turned
 _STARTS = 8  # guesses that are aligned
 _ROUNDS = 2  # in which turns of the best are tried
 
 
-def since(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
+def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
     """The same places as after `twists`, from where groups are after `moved`, both about the same centres."""
     turns = jaxlie.SO3.exp(twists[..., 3:]) @ jaxlie.SO3.exp(moved[..., 3:]).inverse()
     return jnp.concatenate([twists[..., :3] - moved[..., :3], turns.log()], axis=-1)
 
 
 class Relocation(NamedTuple):
-    """Where a lost group may be instead."""
+    """Another place where a lost group may be."""
 
     twists: Float[Array, "*k 6"]  # from where it is believed to be
     sure: Confidence
-    before: (
-        Confidence  # of where it was said to be in the last frame, aligned: found by chance, it is not there
-    )
+    before: Confidence  # of the last frame's guess, aligned: what agreed by chance does not again
 
 
 class SearchContext(NamedTuple):
-    """What a lost group is looked for in."""
+    """The images that a lost group is looked for in, and what hides it there."""
 
     sight: Sight
     background: Float[Array, "c h w"] | None  # its depth, metres, where it is known; else 0
@@ -60,13 +58,13 @@ def recover(
     config: AlignConfig,
     gap: float,
 ) -> Relocation:
-    """Where one lost group shows most.
+    """The place where most of one lost group shows.
 
     Args:
         key: of the random places.
         reference: of the group.
         center: what it turns about.
-        guess: what this said in the last frame, from where the group is believed to be now.
+        guess: the result of the last frame, from where the group is believed to be now.
         around: what it is looked for in.
         gap: see `confidence`.
     """
@@ -107,7 +105,7 @@ def recover(
 
 
 def evidence(sure: Confidence) -> Float[Array, "*k"]:
-    """What speaks for a group's being somewhere: much of it shows, and what shows of it agrees."""
+    """Evidence that a group is in a place: much of it shows there, and what shows agrees."""
     return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
 
 
@@ -126,15 +124,15 @@ def with_unexplained(
     Args:
         gap: what is measured this much nearer than the background is not explained by it, metres ...
         thickness: ... and this much nearer than a group, metres.
-        coarseness: `shown` has every so-manieth pixel.
+        coarseness: n, where `shown` has every n-th pixel.
     """
     if sight.depths is None:
         return shown
     measured = sight.depths[:, ::coarseness, ::coarseness]
     nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
-    strange = (measured > 0) & shown.covered & (measured < nearest)
-    labels = jnp.where(strange, num_groups + 1, shown.labels)
-    return shown._replace(labels=labels, depths=jnp.where(strange, measured, shown.depths))
+    unexplained = (measured > 0) & shown.covered & (measured < nearest)
+    labels = jnp.where(unexplained, num_groups + 1, shown.labels)
+    return shown._replace(labels=labels, depths=jnp.where(unexplained, measured, shown.depths))
 
 
 def guesses(
@@ -146,13 +144,13 @@ def guesses(
     guess: Float[Array, "6"],
     config: AlignConfig,
 ) -> Float[Array, "h 6"]:
-    """Where a lost group may be: half of them at strange pixels and a quarter near by, turned at random, and
-    a quarter near the guess.
+    """Places where a lost group may be: half of them at unexplained pixels and a quarter near by, turned at
+    random, and a quarter near the guess.
 
     Args:
         key: of the random places.
         shifts: what is tried near by.
-        reference: of the group. Those of about a strange pixel's colour are brought to it.
+        reference: of the group. Those of about an unexplained pixel's colour are brought to it.
         center: what the group turns about.
         unexplained_pixels: pixels that no group explains, as each camera sees them.
         guess: see `recover`.
@@ -170,8 +168,8 @@ def guesses(
     turns *= _LARGEST_TURN * jax.random.uniform(angle, (count, 1)) * (config.max_turn > 0)
     offsets = reference.means[:, paired].T - center
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
-    strange = (jnp.arange(count) % 2 == 1) & any_there
-    far = jnp.concatenate([jnp.where(strange[:, None], away, shifts[:, :3]), turns], axis=1)
-    nearly = _NEAR_HUNCH * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
+    unexplained = (jnp.arange(count) % 2 == 1) & any_there
+    far = jnp.concatenate([jnp.where(unexplained[:, None], away, shifts[:, :3]), turns], axis=1)
+    nearly = _NEAR_GUESS * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
     near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(guess, far.shape))
     return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)

@@ -1,6 +1,6 @@
-"""The Gaussians that the first mask named, carried along: what a group has to look like.
+"""Reference points: the Gaussians that the first mask named, carried along with their groups.
 
-What joined it later may be a neighbour's.
+They define what a group has to look like. What joined it later may be a neighbour's.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from gsjax.methods.track.scene import TrackedScene
 
 
 class ReferencePoints(NamedTuple):
-    """Up to p of each group's, where it is believed to be."""
+    """Up to p reference points of each group, where it is believed to be."""
 
     means: Float[Array, "*k 3 p"]
     normals: Float[Array, "*k 3 p"]  # outward; 0 where both sides can be seen
@@ -38,7 +38,7 @@ class ReferencePoints(NamedTuple):
 
 
 def reference_points(scene: TrackedScene, pose: Pose, config: AlignConfig) -> ReferencePoints:
-    """Those of every group, as many as are aligned."""
+    """The reference points of every group, as many as are aligned."""
     groups = scene.labels[: scene.num_moving]
     # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
@@ -50,13 +50,13 @@ def reference_points(scene: TrackedScene, pose: Pose, config: AlignConfig) -> Re
 
 
 def radii(reference: ReferencePoints, centers: Float[Array, "k 3"]) -> Float[Array, "k"]:
-    """How far they lie from what their groups turn about, root mean square, metres."""
+    """Root mean square distance of the reference points from the centres of their groups, metres."""
     squared = jnp.sum((reference.means - centers[..., None]) ** 2, axis=-2)
     return jnp.sqrt(jnp.sum(squared * reference.real, axis=-1) / jnp.maximum(reference.real.sum(-1), 1))
 
 
 def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap: float) -> Points:
-    """Those of every group, of which cameras look for what they saw in the last frame.
+    """The reference points of every group; each camera looks for those that it saw in the last frame.
 
     Args:
         reference: of every group.
@@ -75,7 +75,7 @@ def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap:
 def as_facing(
     reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], sight: Sight
 ) -> Points:
-    """Those of one group after a twist about its centre, of which cameras look for what faces them.
+    """The reference points of one group after a twist about its centre; cameras look for what faces them.
 
     What hides a group where it is believed to be need not hide it elsewhere.
 

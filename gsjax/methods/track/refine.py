@@ -25,7 +25,7 @@ from gsjax.scene.render import Rendered, render
 
 
 class RefineBatch(NamedTuple):
-    """What the refinement is given and does not train."""
+    """What the refinement does not train."""
 
     scene: TrackedScene
     frame: Frame
@@ -46,7 +46,7 @@ def refine_loss(
 ) -> tuple[Float[Array, ""], dict[str, Any]]:
     """Truncated colour and depth differences over the region of interest, and what delta costs.
 
-    Pixels of the region count by their rendered alpha, taken as a constant: what no Gaussian covers says
+    Pixels of the region count by their rendered alpha, taken as a constant: what no Gaussian covers counts
     nothing, and uncovering it gains nothing.
 
     Args:
@@ -173,7 +173,7 @@ def refine(
         return (optax.apply_updates(trained, updates), state), {**info, "loss": value, "culled": culled}
 
     trained = (motion, shifts)
-    end: Any  # optax says less of what it returns than it is given
+    end: Any  # optax annotates less than it returns
     end, infos = jax.lax.scan(iterate, (trained, optimizer.init(trained)), None, length=config.iterations)
     motion, shifts = end[0]
     overflow, needed = infos.pop("overflow").any(), infos.pop("needed").max()

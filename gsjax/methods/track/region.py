@@ -52,6 +52,6 @@ def shift_background(scene: TrackedScene, shifts: Float[Array, "b 3"]) -> Tracke
 
 
 def spread(near: Bool[Array, "background"], values: Float[Array, "near 3"]) -> Float[Array, "background 3"]:
-    """What belongs to the rows of `near_scene`, given back to the whole background; 0 elsewhere."""
+    """Values of the rows of `near_scene`, scattered to the whole background; 0 elsewhere."""
     rows = jnp.nonzero(near, size=len(values), fill_value=len(near))[0]
     return jnp.zeros((len(near), 3), values.dtype).at[rows].set(values, mode="drop")

@@ -1,4 +1,4 @@
-"""Where has each group gone? Several starts are aligned with the images, and what agrees best is kept.
+"""Search for where each group has gone: several starts are aligned with the images, and the best is kept.
 
 Every group goes on from the better of its starts. That loses what jumps or changes its spin, and then it
 agrees badly; so the groups that agree worst, as many as there is time for, are looked for everywhere around.
@@ -25,8 +25,8 @@ _IN_DOUBT = 0.5  # what being lost, or hardly looking as at first, counts beside
 _PATIENCE = 0.05  # what a frame of waiting counts beside a residual as usual
 _OTHER_TURN = 0.14  # radians; what is turned by more than this is turned otherwise
 _CALM = 2.0  # a residual above that beside the usual one: a group has just moved, and is followed first
-_AGREES_AT_ALL = 0.5  # residual above which a group is hidden or elsewhere, and says nothing of its turn
-TELLS_TURN = 0.045  # lead that says how a group is turned; docs/results-hard-cases.md has both sides of it
+_AGREES_AT_ALL = 0.5  # residual above which a group is hidden or elsewhere, and its turn is not known
+TURN_KNOWN = 0.045  # lead above which a group's turn is known; docs/results-hard-cases.md has both sides
 _FOUND_TURNED = 0.65  # share that must agree of what is found again for it to be turned as it was at first
 
 
@@ -97,8 +97,8 @@ def look_everywhere(
     one shift is tried from one start, the next from another. Then turns to all sides are tried from the best,
     because a knock changes a spin from one frame to the next, and a round thing may roll without its shape
     changing. Half the points choose among these; all of them have the last word. A turn that ends elsewhere
-    and agrees nearly as well says that pictures do not tell the turn. The lead is a share of what agrees, for
-    what is hidden agrees with no turn. Where little agrees, or no turn was tried, it is infinite.
+    and agrees nearly as well shows that pictures do not determine the turn. The lead is a share of what
+    agrees, for what is hidden agrees with no turn. Where little agrees, or no turn was tried, it is infinite.
 
     Args:
         known: where the group was found already, and how well that agrees.
@@ -142,7 +142,7 @@ def look_everywhere(
 
 
 class Watch(NamedTuple):
-    """How each group has been followed, which says where to look first."""
+    """How each group has been followed, which decides where to look first."""
 
     usual: Float[Array, "k"]  # residual of late
     waited: Float[Array, "k"]  # frames since it was last looked for everywhere
@@ -181,7 +181,9 @@ class Watch(NamedTuple):
         lost = jnp.where(self.lost, ~is_found(sure, self.showed), sure.agrees < LOST)
         lost = jnp.where(sure.tells, lost, self.lost)
         as_at_first = sure.tells & (sure.agrees > _FOUND_TURNED)
-        told = jnp.where(self.lost | retaken, as_at_first, self.turn_known) & (sought.leads > TELLS_TURN)
+        turn_known = jnp.where(self.lost | retaken, as_at_first, self.turn_known) & (
+            sought.leads > TURN_KNOWN
+        )
         watch = Watch(
             usual,
             jnp.where(sought.looked_for, 0.0, self.waited + 1.0),
@@ -189,14 +191,14 @@ class Watch(NamedTuple):
             jnp.where(sure.tells, sure.agrees, self.agrees),
             lost,
             self.showed,
-            told & ~lost,
+            turn_known & ~lost,
             elsewhere & is_found(sought.again.sure, self.showed) & ~retaken & ~self.glimpsed,
         )
         return watch._replace(glimpsed=watch.glimpsed & watch.doubtful)
 
 
 def first_watch(showed: Float[Array, "k"]) -> Watch:
-    """Before the first frame, of which `showed` says how much of each group was seen."""
+    """The watch before the second frame; `showed` is how much of each group was seen in the first."""
     nothing, certain = jnp.zeros_like(showed), jnp.ones_like(showed)
     no, yes = nothing > 0, certain > 0
     return Watch(jnp.full_like(showed, 0.1), nothing, nothing, certain, no, showed, yes, no)
@@ -227,7 +229,7 @@ def search(
             usual for them, or that have waited longest; before all others what was glimpsed elsewhere.
         astray: groups that are lost, or may be: they are recovered where others are followed, unless they are
             not lost and have just moved; None: nobody.
-        recover: says where the astray group of this index may be instead.
+        recover: index of an astray group -> where it may be instead.
     """
     judged = jax.vmap(judge, in_axes=(0, None, None, None, None))
     best = least(judged(starts, points, centers, sight, config), starts)

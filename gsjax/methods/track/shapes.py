@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -30,6 +31,7 @@ from gsjax.methods.track.motion import Motion, first_pose, move
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
+from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
@@ -48,7 +50,7 @@ class Shape(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is."""
+        """Its name."""
         ...
 
     @property
@@ -219,7 +221,7 @@ def _scores(shape: Shape, poses: np.ndarray, frame: Frame) -> np.ndarray:
 
 
 def _observed_colors(scene: TrackedScene, frame: Frame):
-    """Of each Gaussian in each camera: its pixel's colour, whether that exists, whether an object is near."""
+    """Each Gaussian's colour in each camera, whether it has one, and whether an object is near."""
     rendered = render_labels(scene, first_pose(scene), frame, plan_render(scene.gaussians, frame.cameras))
     assert rendered.features is not None
     objects = 1 - rendered.features[..., 0] / jnp.maximum(rendered.alphas, 1e-3)
@@ -239,7 +241,7 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
 def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
     """Each Gaussian takes the median over cameras of the colours it is seen in.
 
-    The background listens to no pixel that an object may cover, and where none is left to its nearest
+    The background uses no pixel that an object may cover, and where none is left to its nearest
     neighbour; an object's Gaussian to none that looks unlike its group, for something stands in front.
     """
     colors, inside, covered = (np.asarray(a) for a in _observed_colors(scene, frame))
@@ -276,11 +278,13 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
     still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
     rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0, background_rate=0.0)
-    while True:
-        motion, _, info = _refine_rigidly()(still, RefineBatch(scene, frame, plan, pose, centers, roi), rates)
-        if not info["overflow"]:
-            break
-        plan = plan.grown(int(info["needed"]), config.headroom)
+
+    def refined(plan):
+        batch = RefineBatch(scene, frame, plan, pose, centers, roi)
+        motion, _, info = _refine_rigidly()(still, batch, rates)
+        return motion, SimpleNamespace(**info)
+
+    motion, _ = with_room(refined, plan, config.headroom)
     moved = move(pose, motion, centers, groups)
     count = scene.num_moving
     gaussians = eqx.tree_at(
@@ -296,5 +300,5 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
 
 @cache
 def _refine_rigidly() -> Callable:
-    """The jitted refinement; made late, because its options ask which machine this is."""
+    """The jitted refinement; made late, because its options depend on the machine."""
     return jax.jit(refine, static_argnums=2, compiler_options=host_options())

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,13 +194,13 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
 
     def flagged(scene, first, frames, config, **how):
         ids[:] = scene.label_ids[1:]
-        for t, update in enumerate(still(scene, first, frames, config), 1):
+        for t, now in enumerate(still(scene, first, frames, config), 1):
             lost, known = np.zeros(len(ids), bool), np.ones(len(ids), bool)
             lost[[ids.index(CAN), ids.index(BALL)]] = t == 1
             lost[ids.index(CARTON)] = t == 2
             known[ids.index(BALL)] = t == 2
             known[ids.index(CARTON)] = t < 2
-            yield update._replace(info=update.info | {"lost": lost, "turn_known": known})
+            yield replace(now, info=now.info | {"lost": lost, "turn_known": known})
 
     monkeypatch.setattr(gsjax.engine.track.loop, "track", flagged)
     assert gsjax_track(pristine, "--cameras", "1")[0] == 0

@@ -11,7 +11,8 @@ import pytest
 import gsjax.cli.live
 import gsjax.data.stream
 from gsjax.cli import main
-from gsjax.methods.track import Tracked, first_pose, start_scene
+from gsjax.methods.track import start_scene
+from tests.cli.conftest import still_tick
 
 
 def standing_still(scene, first, frames, config, *, budget_ms):
@@ -20,9 +21,9 @@ def standing_still(scene, first, frames, config, *, budget_ms):
     info = {"motion": SimpleNamespace(twists=jnp.zeros((groups, 6))), "centers": jnp.ones((groups, 3))}
     info["lost"] = jnp.arange(groups) == groups - 1
     info["turn_known"] = jnp.arange(groups) > 0
+    info["looked_for"] = jnp.arange(groups) < 2
     for count, _ in enumerate(frames):
-        now = info | {"skipped": count == 2}
-        yield Tracked(scene, first_pose(scene), None, now, 0.001, 0.0, None, 2)
+        yield still_tick(scene, count + 1, info | {"skipped": count == 2}, 0.001)
 
 
 def unfitted(frame, mask, camera, config):

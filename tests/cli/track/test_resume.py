@@ -3,9 +3,9 @@
 import errno
 import json
 import warnings
+from types import SimpleNamespace
 from unittest.mock import Mock
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,9 +13,9 @@ import pytest
 import gsjax.engine.saving
 import gsjax.engine.track.loop
 import gsjax.engine.track.resume
-import gsjax.methods.track
 from gsjax.engine.track.loop import Tracking
-from gsjax.methods.track import Pose, Tracked, track
+from gsjax.engine.track.tracking import track
+from gsjax.methods.track import Pose
 
 OPTIONS = ("--cameras", "0", "1", "--preset", "fast", "--track.start.iterations", "5")
 
@@ -87,15 +87,13 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
 
     def tracked_up_to(frames: int):
         rows = [Pose(jnp.full((3, 3), float(t)), jnp.full((3, 4), float(t))) for t in range(frames)]
-        notes = {"joined": 0, "update_s": [], "skipped": 0, "visible": [], "lost": [], "turn_known": []}
-        return Mock(spec=Tracking, poses=rows, num_frames=frames, scene=None, everywhere=[], **notes)
+        tick = SimpleNamespace(run=None)
+        lists = {name: [] for name in ("joined", "update_s", "visible", "lost", "turn_known", "everywhere")}
+        return Mock(spec=Tracking, poses=rows, num_frames=frames, scene=None, tick=tick, skipped=0, **lists)
 
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    update = Mock(spec=Tracked, scene=None, pose=None, state=None, chosen=None)
-    monkeypatch.setattr(gsjax.engine.track.resume, "_shapes", lambda scene: {})
-    monkeypatch.setattr(gsjax.engine.track.resume, "_chosen_metadata", lambda chosen: None)
     saver, written = gsjax.engine.track.resume.Saver(tmp_path), []
     for frames, save in ((10, written.append), (20, full), (30, written.append)):
         monkeypatch.setattr(
@@ -103,9 +101,7 @@ def test_parts_whose_state_did_not_follow_are_written_again(tmp_path, monkeypatc
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            saver(tracked_up_to(frames), update, last=True)
+            saver(tracked_up_to(frames), last=True)
     assert len(written) == 2
-    saved = gsjax.engine.track.resume._saved_poses(
-        tmp_path, 30, jax.tree.structure(tracked_up_to(1).poses[0])
-    )
+    saved = gsjax.engine.track.resume._saved_poses(tmp_path, 30, tracked_up_to(1).poses[0])
     assert [float(pose.means[0, 0]) for pose in saved] == list(range(1, 30))

@@ -1,0 +1,114 @@
+"""The tracker as one value. Its frames are no steps of descent, so no `drive` runs it but the generator of
+`gsjax.engine.track.tracking`, on the same runs and ticks."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from gsjax.losses.extra import ExtraLosses, named_losses
+from gsjax.methods.track.budget import Chosen
+from gsjax.methods.track.config import TrackConfig
+from gsjax.methods.track.frames import FrameShape, prepared, shape_of
+from gsjax.methods.track.grow import with_slots
+from gsjax.methods.track.motion import first_pose
+from gsjax.methods.track.plan import plan_tracker
+from gsjax.methods.track.scene import TrackedScene
+from gsjax.methods.track.state import TrackBatch, Tracked, TrackState
+from gsjax.methods.track.update import first_look, track_step
+from gsjax.optim.method import Run
+from gsjax.optim.step import Step
+from gsjax.scene.frame import Frame
+
+PLAN = "track"
+"""Name of the plan in `Run.plans`."""
+
+
+class Kept(NamedTuple):
+    """What a run keeps beside parameters, state and plan.
+
+    Attributes:
+        reduction: factor by which images shrink for template matching.
+        chosen: the settings that were chosen for a budget; None without one.
+    """
+
+    reduction: int
+    chosen: Chosen | None = None
+
+
+@dataclass(frozen=True)
+class Track:
+    """The object-aware tracker.
+
+    Attributes:
+        config: how objects are tracked.
+        extra_losses: custom losses beside the refinement's; see `track_step`.
+    """
+
+    config: TrackConfig = field(default_factory=TrackConfig)
+    extra_losses: ExtraLosses = ()
+
+    def __post_init__(self):
+        named_losses(self.extra_losses)
+
+    def start(self, scene: TrackedScene, first: Frame) -> tuple[FrameShape, Run]:
+        """The tracker at the first frame, with slots for what joins objects where there is depth.
+
+        Args:
+            scene: from `start_scene` or `scene_from_shapes`.
+            first: the frame that it shows, as all cameras saw it.
+        """
+        if self.config.grow.slots and first.depths is not None:
+            scene = with_slots(scene, self.config.grow.slots)
+        return self.start_at(Tracked(scene, first_pose(scene)), first)
+
+    def start_at(self, params: Tracked, frame: Frame) -> tuple[FrameShape, Run]:
+        """The tracker at a frame that shows its objects where `params` has them; the scene stays as it is.
+
+        Args:
+            params: a scene with its slots, and a pose.
+            frame: as all cameras saw it.
+        """
+        plan = plan_tracker(params.scene, params.pose, frame, self.config)
+        state = _first_look(params, TrackBatch(frame, plan), self.config)
+        kept = Kept(matching_reduction(params.scene, frame, self.config))
+        return shape_of(frame), Run(params, state, 0, {PLAN: plan}, kept)
+
+    def step(self, shape: FrameShape, reduction: int = 1) -> Step:
+        """See `track_step`."""
+        return track_step(self.config, shape, reduction, self.extra_losses)
+
+    def result(self, problem: FrameShape | None, run: Run) -> Tracked:
+        """The scene and where its objects are."""
+        return run.params
+
+
+@partial(jax.jit, static_argnames="config")
+def _first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> TrackState:
+    return first_look(params, batch, config)
+
+
+def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -> int:
+    """By how much images shrink for matching, so that the largest object but one fits its template.
+
+    The largest is commonly a robot, which is far larger than what it handles. On the host.
+
+    Args:
+        scene: at the first frame.
+        frame: as all cameras saw it.
+        config: the tracker's.
+    """
+    frame, _ = prepared(frame, config)
+    groups = np.asarray(scene.labels[: scene.num_moving])
+    means = np.asarray(scene.gaussians.means[: scene.num_moving], np.float64)
+    sizes = []
+    for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):
+        local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = K[0, 0] * local[:, :2] / np.maximum(local[:, 2:], 1e-3)
+        there = [k for k in range(1, scene.num_objects + 1) if (groups == k).any()]  # no empty slots
+        sizes.append([np.ptp(pixels[groups == k], axis=0).max() for k in there])
+    largest = np.sort(np.max(sizes, axis=0))
+    size = largest[-2] if len(largest) > 1 else largest[-1]
+    return max(1, int(np.ceil(size / config.match.patch)))

@@ -1,0 +1,117 @@
+"""The tracker's step as a pair of pure functions: how it composes, and what it does with frames that say
+nothing."""
+
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.methods.track import PLAN, PRESETS, AlignConfig, Track, TrackBatch, first_look
+from gsjax.methods.track.grow import empty_slots
+
+# Looks nowhere but where things were, which compiles fast.
+LITTLE = AlignConfig(iterations=2, reach=0.0, turns=(), pixels=32, centers=32)
+CONFIG = replace(PRESETS["fast"], align=LITTLE)
+
+
+@pytest.fixture(scope="module")
+def begun(table, started):
+    """The step, its jitted update, and the run at the first frame."""
+    _, frames, _ = table()
+    tracker = Track(CONFIG)
+    shape, run = tracker.start(started, frames[0])
+    step = tracker.step(shape)
+    return step, jax.jit(partial(step.update, step=0, key=jax.random.key(0))), run
+
+
+def assert_same(found, expected):
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CONFIG,
+        replace(CONFIG, cameras=(1,), shrink=2),
+        replace(CONFIG, coarseness=1, matching=True),
+        PRESETS["paper"],
+    ],
+)
+def test_a_blank_state_has_the_form_that_a_first_look_fills(table, started, config):
+    _, frames, _ = table()
+    tracker = Track(config)
+    shape, run = tracker.start(started, frames[0])
+    batch = TrackBatch(frames[0], run.plans[PLAN])
+    seen = jax.eval_shape(partial(first_look, config=config), run.params, batch)
+    blank = jax.eval_shape(tracker.step(shape).init, run.params)
+    assert jax.tree.structure(blank) == jax.tree.structure(seen)
+    for one, other in zip(jax.tree.leaves(blank), jax.tree.leaves(seen), strict=True):
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
+
+
+def test_an_update_of_a_blank_state_moves_nothing_and_remembers_what_it_saw(table, started, begun):
+    _, frames, _ = table()
+    step, update, run = begun
+    blank = step.init(run.params)
+    params, state, info = update(run.params, blank, TrackBatch(frames[0], run.plans[PLAN]))
+    assert not info["skipped"]
+    assert not info["lost"].any()
+    own = slice(started.num_moving)  # surfaces may join at once
+    np.testing.assert_allclose(params.pose.means[own], run.params.pose.means[own], atol=1e-6)
+    assert_same(state.shown.labels, run.state.shown.labels)
+    np.testing.assert_allclose(state.pixels.seen.sum(), run.state.pixels.seen.sum())
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((params, state)))
+
+
+def test_it_runs_in_a_scan_as_frame_by_frame_and_grows_there(table, begun):
+    _, frames, _ = table()
+    step, update, run = begun
+    plan = run.plans[PLAN]
+    params, state = run.params, run.state
+    for frame in frames[1:]:
+        params, state, _ = update(params, state, TrackBatch(frame, plan))
+
+    def body(carried, frame):
+        params, state, info = step.update(*carried, TrackBatch(frame, plan), step=0, key=jax.random.key(0))
+        return (params, state), info["joined"]
+
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames[1:])
+    (scanned, _), joined = jax.jit(partial(jax.lax.scan, body))((run.params, run.state), stacked)
+    np.testing.assert_allclose(scanned.pose.means, params.pose.means, atol=1e-4)
+    taken = CONFIG.grow.slots - empty_slots(scanned.scene).sum()
+    assert joined[-1] == taken > 0
+
+
+@pytest.mark.parametrize("what", ["images", "depths", "viewmat"])
+def test_a_frame_that_cannot_be_read_changes_nothing(table, begun, what):
+    _, frames, _ = table()
+    _, update, run = begun
+    where = {"viewmat": lambda f: f.cameras.viewmat}.get(what, lambda f: getattr(f, what))
+    broken = eqx.tree_at(where, frames[1], jnp.full_like(where(frames[1]), jnp.nan))
+    params, state, info = update(run.params, run.state, TrackBatch(broken, run.plans[PLAN]))
+    assert info["skipped"]
+    assert_same((params, state), (run.params, run.state))
+
+
+def test_bytes_are_seen_as_floats_are(table, begun):
+    _, frames, _ = table()
+    _, update, run = begun
+    images = np.asarray(255 * frames[1].images).round().astype(np.uint8)
+    as_bytes = replace(frames[1], images=images)
+    as_floats = replace(frames[1], images=jnp.asarray(images, jnp.float32) / 255)
+    plan = run.plans[PLAN]
+    found = [update(run.params, run.state, TrackBatch(f, plan))[0] for f in (as_bytes, as_floats)]
+    np.testing.assert_allclose(found[0].pose.means, found[1].pose.means, atol=1e-5)
+
+
+def test_what_draws_at_random_takes_its_key(table, begun):
+    """Nothing does where nothing is lost: another key gives the same bits."""
+    _, frames, _ = table()
+    step, update, run = begun
+    batch = TrackBatch(frames[1], run.plans[PLAN])
+    other = jax.jit(partial(step.update, step=5))(run.params, run.state, batch, key=jax.random.key(7))
+    assert_same(other[0], update(run.params, run.state, batch)[0])
