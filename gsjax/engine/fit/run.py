@@ -234,7 +234,7 @@ def _note_oddities(
 
 def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], model: Model) -> None:
     """Writes cameras.npz, where cameras or exposures were learned: names [V], viewmats [V,4,4] (world to
-    camera, OpenCV axes), exposures [V,3,4] (the affine maps of colours)."""
+    camera, OpenCV axes; those of the frames), exposures [V,3,4] (the affine maps of colours)."""
     if model.twists is None and model.exposures is None:
         return
     found = {
