@@ -1,16 +1,13 @@
 """What is each part of SurstSplat and GaussianClin worth, and what of a teacher that errs?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from deform_regions import CLASSES, meanings, region_map, with_errors
-from deforming import dataset, learned, scores, summary, track_errors
 
+from experiments.shared.deform_regions import CLASSES, meanings, region_map, with_errors
+from experiments.shared.deforming import dataset, learned, scores, summary, track_errors
 from gsjax.methods.deform import PRESETS, DeformConfig, Lesson
 
 SCALE, WARMUP, ITERATIONS, START_PIXELS = 0.4, 100, 300, 1.8

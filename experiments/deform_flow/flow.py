@@ -1,21 +1,18 @@
 """Does a deformation field find where each point of a shirt goes between two pictures with depth?"""
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from deforming import Reconstructed, drawn, one_frame
 from jaxtyping import Bool, Float, UInt8
-from recordings import recorded
 
+from experiments.shared.deforming import Reconstructed, drawn, one_frame
+from experiments.shared.recordings import recorded
 from gsjax.data.resizing import area_resized, nearest_resized
 from gsjax.engine.drive import drive
 from gsjax.methods.deform import Deform, DeformConfig
@@ -166,7 +163,8 @@ def carried(found: Reconstructed, data: Pair) -> Float[np.ndarray, "n 3"]:
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """Which share of the pixels is off by how much."""
     from matplotlib.figure import Figure
-    from plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
+
+    from experiments.shared.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
 
     drawing = Figure(figsize=(6.4, 4), dpi=100, layout="constrained")
     axes = drawing.subplots()

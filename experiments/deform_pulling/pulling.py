@@ -1,20 +1,17 @@
 """What can be had of a real clip without depth, masks, poses and calibration?"""
 
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import cv2
 import numpy as np
-from deforming import EVERY, Reconstructed, drawn, learned, one_frame, summary
 from jaxtyping import Bool, UInt8
-from recordings import recorded
 
 import gsjax
+from experiments.shared.deforming import EVERY, Reconstructed, drawn, learned, one_frame, summary
+from experiments.shared.recordings import recorded
 from gsjax.data import DataWarning, Sequence
 from gsjax.engine.deform.data import unit_times
 from gsjax.methods.deform import DeformConfig
@@ -101,7 +98,8 @@ def _copies(sequence: Sequence, t: int, frame: Frame) -> dict[str, float]:
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """PSNR of each held-out frame, beside copies of others."""
     from matplotlib.figure import Figure
-    from plots import BLUE, GREEN, GREY, ORANGE, PURPLE
+
+    from experiments.shared.plots import BLUE, GREEN, GREY, ORANGE, PURPLE
 
     kinds = list(dict.fromkeys(row["pixels"] for row in rows))
     drawing = Figure(figsize=(5.2 * len(kinds), 3.6), dpi=100, layout="constrained")

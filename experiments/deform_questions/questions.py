@@ -1,18 +1,15 @@
 """How often are ten types of question on a deforming scene answered as the simulation's truth has it?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax.numpy as jnp
 import numpy as np
-from deform_regions import with_errors
-from deform_truth import NAMES, Truth, built_in
-from deforming import Dataset, Reconstructed, dataset, learned, summary
 
+from experiments.shared.deform_regions import with_errors
+from experiments.shared.deform_truth import NAMES, Truth, built_in
+from experiments.shared.deforming import Dataset, Reconstructed, dataset, learned, summary
 from gsjax.engine.deform.data import unit_times
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (

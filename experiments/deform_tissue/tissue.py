@@ -1,15 +1,20 @@
 """How well is deforming tissue seen where it was not photographed, and followed?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
+from experiments.shared.deforming import (
+    copies,
+    dataset,
+    frames_per_second,
+    learned,
+    scores,
+    summary,
+    track_errors,
+)
 from gsjax.methods.deform import DeformConfig, GraphConfig, Lesson
 
 BASE = DeformConfig(warmup=200, iterations=800, start_pixels=1.8)

@@ -1,18 +1,16 @@
 """What do a coarser field, fewer nodes, a gate or fewer channels cost, and what do they save?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from deform_regions import CLASSES, meanings, region_map
-from deforming import (
+
+from experiments.shared.deform_regions import CLASSES, meanings, region_map
+from experiments.shared.deforming import (
     Dataset,
     Reconstructed,
     dataset,
@@ -22,7 +20,6 @@ from deforming import (
     summary,
     track_errors,
 )
-
 from gsjax.methods.deform import DeformConfig, GraphConfig, Lesson
 from gsjax.scene.deformation import DeformationConfig
 

@@ -1,18 +1,15 @@
 """Does a distillation stay finite where it should not be asked to work at all?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher, true_labels
 
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, true_labels
 from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.engine.drive import drive
 from gsjax.methods.distill import (

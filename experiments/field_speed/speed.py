@@ -1,17 +1,14 @@
 """How long does a distillation take, and how much memory, at the paper's number of iterations and beyond?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
-from timing import jitted, median_ms
 
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
+from experiments.shared.timing import jitted, median_ms
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.methods.distill import DistillConfig, Teacher, gaussian_cosines

@@ -1,21 +1,18 @@
 """The discovery of parts where data and settings are at the edge of sense."""
 
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from discoveries import FIT, Options, canonical_of
 from jaxtyping import Int
 
+from experiments.shared.discoveries import FIT, Options, canonical_of
 from gsjax.data import Sequence, open_sequence
 from gsjax.engine.drive import drive
 from gsjax.io.ply import read_ply

@@ -4,23 +4,20 @@ Parts are the true ones, and the update begins with their true poses at an earli
 the optimizers alone.
 """
 
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax.numpy as jnp
 import lineax
 import numpy as np
 import optimistix
-from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Array, Float
-from recordings import recorded
-from timing import jitted, median_ms, timed
 
+from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.recordings import recorded
+from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.engine.recording import open_recording
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import (

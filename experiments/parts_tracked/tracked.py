@@ -1,6 +1,5 @@
 """Do parts that are tracked in pictures and lifted stay parts? All methods begin with the same true masks."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -8,17 +7,15 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Bool, Float, Int
-from recordings import recorded
 from scipy.ndimage import map_coordinates
 from trimesh.registration import procrustes
 
+from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.recordings import recorded
 from gsjax.data import Sequence
 from gsjax.engine.drive import drive
 from gsjax.engine.recording import open_recording

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from gsjax.cli.program import USER_ERRORS
 from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_deformation, warn_of_partial
 from gsjax.engine.deform.query import DeformQuestion, answer_deformation
@@ -19,6 +18,7 @@ from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run, un
 from gsjax.engine.folder import expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
+from gsjax.engine.program import USER_ERRORS
 from gsjax.engine.records import read_config, read_record
 from gsjax.engine.selected import Changes
 from gsjax.engine.track.query import ObjectQuery, ask_for_object

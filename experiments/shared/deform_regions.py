@@ -6,10 +6,10 @@ wrong in a known share of blocks.
 
 import jax.numpy as jnp
 import numpy as np
-from deforming import Dataset, Reconstructed, seen_as
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
+from experiments.shared.deforming import Dataset, Reconstructed, seen_as
 from gsjax.engine.deform.scores import classes_of_pixels
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap

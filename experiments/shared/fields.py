@@ -10,15 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from recordings import recorded
 
-from gsjax.cli import fit as fit_command
-from gsjax.cli import track as track_command
+from experiments.shared.commands import succeeded
+from experiments.shared.recordings import recorded
 from gsjax.data.photographs import Photographs
 from gsjax.data.simulated.flawed_masks import Flaws, flawed_masks
 from gsjax.engine.distill.scene import FieldScene, scene_of_run
 from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
 from gsjax.engine.drive import drive
+from gsjax.engine.fit.run import Options as FitOptions
+from gsjax.engine.fit.run import run as run_fit
 from gsjax.geometry.cameras import project
 from gsjax.methods.distill import (
     Distill,
@@ -53,10 +54,7 @@ def fitted(
     path = folder.parents[1] / "field_scenes" / name
     if not (path / "report.html").is_file():
         options.setdefault("fit", PRESETS[preset])
-        told = fit_command.Options(
-            str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options
-        )
-        fit_command.run(told)
+        run_fit(FitOptions(str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options))
     return scene_of_run(path)
 
 
@@ -66,17 +64,9 @@ def first_tracked(
     """The scene that `gsjax track` begins with, for few cameras: a Gaussian a point of depth."""
     path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
     if not (path / "report.html").is_file():
-        track_command.run(
-            track_command.Options(
-                str(recorded(name)),
-                path,
-                frames="0:2",
-                cameras=cameras,
-                mask_camera=mask_camera,
-                eval_cameras=eval_cameras,
-                overwrite=True,
-            )
-        )
+        words = ["track", recorded(name), "--out", path, "--frames", "0:2", "--overwrite"]
+        words += ["--mask-camera", mask_camera, "--cameras", *cameras, "--eval-cameras", *eval_cameras]
+        succeeded(*words)
     return scene_of_run(path)
 
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from recordings import recorded
 
 import gsjax
+from experiments.shared.recordings import recorded
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.engine.deform.data import unit_times

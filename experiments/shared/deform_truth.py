@@ -8,12 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from deform_regions import REGIONS, region_map
-from deforming import TOOL, Dataset
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 import gsjax
+from experiments.shared.deform_regions import REGIONS, region_map
+from experiments.shared.deforming import TOOL, Dataset
 from gsjax.methods.deform import Question
 from gsjax.scene.frame import Frame
 
