@@ -1,7 +1,6 @@
 """A field learns what masks say, whichever way it is drawn, and answers in 3D what it is asked."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -180,6 +179,18 @@ def test_it_learns_and_each_gaussian_answers_for_what_it_is(two_balls, learned, 
     assert np.median(cosines[np.arange(160), labels]) > 0.7
 
 
+class Numerals:
+    """Reads "2" as row 2 of the book."""
+
+    min_score = 0.5
+
+    def embed_objects(self, image, labels, count):
+        raise NotImplementedError
+
+    def embed_text(self, text):
+        return BOOK[int(text)]
+
+
 def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     scene, *_ = two_balls
     vectors = BOOK[[2, 1]]
@@ -188,7 +199,7 @@ def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
     assert result.features().shape == (160, 12)
     some = replace(result, means=scene.means[::2])
     np.testing.assert_allclose(some.scores(vectors), want[::2], atol=1e-6)
-    reader = SimpleNamespace(embed_text=lambda text: BOOK[int(text)])
+    reader = Numerals()
     np.testing.assert_array_equal(result.query("2", negatives=("1",), encoder=reader), result.scores(vectors))
     np.testing.assert_array_equal(result.query("2", encoder=reader), result.scores(BOOK[2:]))
     with pytest.raises(ValueError, match="encoder: expected one that reads texts"):
@@ -285,58 +296,6 @@ def test_against_negatives_the_share_is_a_half_where_two_fit_alike():
     assert shares[1] > 0.99
     assert shares[2] < 0.01
     np.testing.assert_array_equal(relevancy(cosines[:, :1]), cosines[:, 0])
-
-
-def mask_of(*labels):
-    return np.array([labels])
-
-
-@pytest.mark.parametrize(
-    ("masks", "embeddings", "says"),
-    [
-        ([], [], "masks: expected those of at least one view, found none"),
-        ([mask_of(0, 1)], [], "embeddings: expected those of 1 views, found 0"),
-        ([mask_of(0.5, 1)], [BOOK], r"masks of view 0: expected integers \[H,W\], found float64 \[1, 2\]"),
-        ([mask_of(0, 3)], [BOOK], "expected a row for each of the labels 0 to 3, found 3 rows"),
-        (
-            [mask_of(0, 1)] * 2,
-            [BOOK, BOOK[:, :7]],
-            r"embeddings of view 1: expected \[labels, 24\] as of view 0",
-        ),
-        ([mask_of(0, 1)], [BOOK * np.nan], "found NaN or infinity in rows"),
-        ([mask_of(0, 0)], [BOOK * 0], "found none that has an embedding"),
-    ],
-)
-def test_teachers_that_cannot_be_are_refused(masks, embeddings, says):
-    with pytest.raises(ValueError, match=says):
-        teacher_of_objects(masks, embeddings)
-
-
-def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
-    rows = np.stack([np.zeros(4), np.eye(4)[0], np.eye(4)[1], np.eye(4)[0]]).astype(np.float32)
-    with pytest.warns(UserWarning, match="views without any mask teach nothing: 1 of 2"):
-        teacher = teacher_of_objects([mask_of(0, 1, 2, 3, -1), mask_of(0, 0, 0, 0, 0)], [rows, rows])
-    one, two = teacher.ids[0][0, 1], teacher.ids[0][0, 2]
-    np.testing.assert_array_equal(teacher.ids[0][0], [-1, one, two, one, -1])
-    np.testing.assert_array_equal(teacher.codebook[one], np.eye(4)[0])
-    assert len(teacher.codebook) == 2
-
-
-@pytest.mark.parametrize(
-    ("maps", "says"),
-    [
-        ([np.zeros((3, 4, 5))], "maps: expected those of 2 views, found 1"),
-        ([np.zeros((3, 4, 5)), np.zeros((3, 4, 6))], r"maps of view 1: expected \[h, w, 5\], found float64"),
-        ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected numbers"),
-        (
-            [np.zeros((30, 40, 5)), np.zeros((40, 30, 5))],
-            "expected a picture of the shape of its view, 48x36",
-        ),
-    ],
-)
-def test_maps_that_do_not_fit_are_refused(maps, says):
-    with pytest.raises(ValueError, match=says):
-        teacher_of_maps(maps, [(HEIGHT, WIDTH)] * 2)
 
 
 def test_a_teacher_of_other_views_is_refused(two_balls):

@@ -217,3 +217,58 @@ def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megaby
         loss(jax.tree.map(lambda a, d, step=step: a + step * d, field, along)) for step in (1e-6, -1e-6)
     )
     np.testing.assert_allclose((ahead - behind) / 2e-6, want, rtol=1e-4)
+
+
+THREE = BOOK[:3]
+
+
+def mask_of(*labels):
+    return np.array([labels])
+
+
+@pytest.mark.parametrize(
+    ("masks", "embeddings", "says"),
+    [
+        ([], [], "masks: expected those of at least one view, found none"),
+        ([mask_of(0, 1)], [], "embeddings: expected those of 1 views, found 0"),
+        ([mask_of(0.5, 1)], [THREE], r"masks of view 0: expected integers \[H,W\], found float64 \[1, 2\]"),
+        ([mask_of(0, 3)], [THREE], "expected a row for each of the labels 0 to 3, found 3 rows"),
+        (
+            [mask_of(0, 1)] * 2,
+            [THREE, THREE[:, :7]],
+            r"embeddings of view 1: expected \[labels, 24\] as of view 0",
+        ),
+        ([mask_of(0, 1)], [THREE * np.nan], "found NaN or infinity in rows"),
+        ([mask_of(0, 0)], [THREE * 0], "found none that has an embedding"),
+    ],
+)
+def test_teachers_that_cannot_be_are_refused(masks, embeddings, says):
+    with pytest.raises(ValueError, match=says):
+        teacher_of_objects(masks, embeddings)
+
+
+def test_objects_that_look_the_same_are_one_thing_and_a_silent_view_is_told():
+    rows = np.stack([np.zeros(4), np.eye(4)[0], np.eye(4)[1], np.eye(4)[0]]).astype(np.float32)
+    with pytest.warns(UserWarning, match="views without any mask teach nothing: 1 of 2"):
+        teacher = teacher_of_objects([mask_of(0, 1, 2, 3, -1), mask_of(0, 0, 0, 0, 0)], [rows, rows])
+    one, two = teacher.ids[0][0, 1], teacher.ids[0][0, 2]
+    np.testing.assert_array_equal(teacher.ids[0][0], [-1, one, two, one, -1])
+    np.testing.assert_array_equal(teacher.codebook[one], np.eye(4)[0])
+    assert len(teacher.codebook) == 2
+
+
+@pytest.mark.parametrize(
+    ("maps", "says"),
+    [
+        ([np.zeros((3, 4, 5))], "maps: expected those of 2 views, found 1"),
+        ([np.zeros((3, 4, 5)), np.zeros((3, 4, 6))], r"maps of view 1: expected \[h, w, 5\], found float64"),
+        ([np.zeros((3, 4, 5)), np.full((3, 4, 5), np.inf)], "maps of view 1: expected numbers"),
+        (
+            [np.zeros((30, 40, 5)), np.zeros((40, 30, 5))],
+            "expected a picture of the shape of its view, 48x36",
+        ),
+    ],
+)
+def test_maps_that_do_not_fit_are_refused(maps, says):
+    with pytest.raises(ValueError, match=says):
+        teacher_of_maps(maps, [(HEIGHT, WIDTH)] * 2)
