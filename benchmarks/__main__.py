@@ -2,6 +2,21 @@
 
 import sys
 
-from gsjax.cli import main
+from gsjax.engine.interrupts import heard_interrupts
+from gsjax.engine.messages import say_error
+from gsjax.engine.program import run_politely
 
-sys.exit(main(["bench", *sys.argv[1:]]))
+
+def main() -> int:
+    """Run the suite with the process's arguments; returns the exit code, as `gsjax bench` does."""
+    does = "measure the rasterizer and every method's step here"
+    try:
+        with heard_interrupts():
+            return run_politely("bench", sys.argv[1:], ("gsjax.engine.bench", does))
+    except KeyboardInterrupt:
+        say_error("by Ctrl-C; what is on disk stays", word="stopped")
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,11 +15,13 @@ from benchmarks.metrics import Metric
 from benchmarks.timing import compile_program, median_and_p95, sample
 from benchmarks.workloads import ball
 from gsjax.data import open_sequence
+from gsjax.engine.drive import drive
 from gsjax.engine.track.tracking import track
+from gsjax.engine.verbs import deform as deform_steps
 from gsjax.geometry.cameras import Camera
 from gsjax.losses.photometric import photometric_loss
-from gsjax.methods.deform import DeformConfig, GraphConfig, Look, begin_deform, reconstruct
-from gsjax.methods.distill import DistillConfig, begin_distill, distill, teacher_of_objects
+from gsjax.methods.deform import DeformConfig, GraphConfig
+from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
 from gsjax.methods.track import PRESETS, start_scene
 from gsjax.optim.compiler import host_options
 from gsjax.optim.step import gradient_step, per_field_adam
@@ -89,36 +91,24 @@ def field(repeats: int) -> StepTimes:
     camera = Camera(scene.viewmat, scene.K, width, height)
     thing = np.indices((height, width)).sum(axis=0) // 40 % 3  # stripes
     teacher = teacher_of_objects([thing], [np.eye(3, 512, dtype=np.float32)])
-    config = DistillConfig(iterations=repeats + 1, contrast_after=0.0)
-    updates = list(distill(*begin_distill(gaussians_from_activated(*scene[:5]), [camera], teacher, config)))
+    method = Distill(DistillConfig(iterations=repeats + 1, contrast_after=0.0))
+    problem, run = method.start(gaussians_from_activated(*scene[:5]), [camera], teacher)
+    updates = list(drive(method, problem, run))
     if any(bool(update.info["skipped"]) for update in updates):
         raise RuntimeError("a step of the distillation was skipped: a number was not finite")
-    what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {config.channels} channels"
+    what = f"{FIT_GAUSSIANS} Gaussians, 1 camera of {width}x{height}, {method.config.channels} channels"
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 
 def deform(repeats: int) -> StepTimes:
     """One step of a deforming scene, with the defaults: deformation, colours, features and graph."""
-    seen = open_sequence(TISSUE).select(cameras=(0,))
-    last = seen.num_frames - 1
-    looks = [
-        Look(
-            seen.image(t, 0),
-            None,
-            seen.depth(t, 0),
-            seen.viewmats[t, 0],
-            seen.Ks[t, 0],
-            t / last,
-            seen.mask(t, 0),
-        )
-        for t in range(seen.num_frames)
-    ]
+    seen = open_sequence(TISSUE)
     config = DeformConfig(warmup=0, iterations=repeats + 1, graph=GraphConfig(after=0.0))
-    problem, state = begin_deform(looks, config, np.eye(2, config.channels))
-    updates = list(reconstruct(problem, state))
+    ticks = deform_steps(seen, config, tools="draw")
+    updates = list(ticks)
     if any(bool(update.info["skipped"]) for update in updates):
         raise RuntimeError("a step of the deforming scene was skipped: a number was not finite")
-    what = f"{state.scene.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
+    what = f"{ticks.run.params.gaussians.num} Gaussians, 1 camera of {seen.width}x{seen.height}"
     return StepTimes(what, [u.seconds for u in updates[1:]], updates[0].compile_seconds)
 
 

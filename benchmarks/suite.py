@@ -16,6 +16,7 @@ from benchmarks.programs import BACKWARD, FORWARD, JVP
 from benchmarks.steps import STEPS, measure_step
 from benchmarks.workloads import QUICK, SUITE, Workload, choose
 from gsjax.engine import machine
+from gsjax.engine.bench import Options
 from gsjax.io.atomic import atomic_write, write_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -115,8 +116,8 @@ def read_baseline(path: Path) -> dict[str, Any] | None:
         ) from error
 
 
-def run(options: Any, suite: list[Workload] | None = None) -> int:
-    """Run the command with the options of `gsjax.cli.bench.Options`, and return the exit code.
+def run(options: Options, suite: list[Workload] | None = None) -> int:
+    """Run the suite, or the workloads of `suite` in its place, and return the exit code.
 
     Raises:
         ValueError: an option is invalid, or the baseline does not fit.

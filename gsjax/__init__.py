@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from gsjax.data import Photographs, Sequence, open_photographs, open_sequence
     from gsjax.engine.checkpoint import load, save
-    from gsjax.engine.verbs import fit, track
+    from gsjax.engine.verbs import deform, distill, fit, parts, track
     from gsjax.geometry.cameras import Camera
     from gsjax.io.ply import read_ply, write_ply
     from gsjax.methods.deform import DeformConfig
@@ -39,7 +39,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "gsjax.data": ("Photographs", "Sequence", "open_photographs", "open_sequence"),
     "gsjax.engine.checkpoint": ("load", "save"),
-    "gsjax.engine.verbs": ("fit", "track"),
+    "gsjax.engine.verbs": ("deform", "distill", "fit", "parts", "track"),
     "gsjax.geometry.cameras": ("Camera",),
     "gsjax.io.ply": ("read_ply", "write_ply"),
     "gsjax.methods.deform": ("DeformConfig",),
@@ -72,6 +72,8 @@ __all__ = [
     "Tags",
     "TrackConfig",
     "composite_tile",
+    "deform",
+    "distill",
     "fit",
     "host_options",
     "keep_freed_memory",
@@ -79,6 +81,7 @@ __all__ = [
     "load",
     "open_photographs",
     "open_sequence",
+    "parts",
     "plan",
     "plan_render",
     "rasterization",

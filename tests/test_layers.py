@@ -9,6 +9,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "gsjax"
 SHORT = ("gsjax", "tests", "benchmarks")
+BELOW_COMMANDS = ("experiments", "benchmarks")
+"""Folders whose files stand on the engine and what is below it, as commands do."""
 MAX_LINES = 400
 
 STACK = ("geometry", "rasterize", "scene", "losses", "optim", "methods")  # each may import those before it
@@ -61,6 +63,26 @@ def violations(root: Path) -> list[str]:
     return messages
 
 
+def leaning_on_commands(root: Path) -> list[str]:
+    """One message for each import of `gsjax.cli` and each use of `sys.path` in the files under `root`."""
+    messages = []
+    for file in sorted(root.rglob("*.py")):
+        where, tree = f"{root.name}/{file.relative_to(root)}", ast.parse(file.read_text(encoding="utf-8"))
+        imports = list(imported_modules(file, root))
+        messages += [
+            f"{where}:{line} imports {module}, but commands are run as processes or by gsjax.engine"
+            for line, module in imports
+            if module == "gsjax.cli" or module.startswith("gsjax.cli.")
+        ]
+        lines = [line for line, module in imports if module == "sys.path"]
+        lines += [node.lineno for node in ast.walk(tree) if ast.unparse(node) == "sys.path"]
+        messages += [
+            f"{where}:{line} uses sys.path, but modules are named from the repository root"
+            for line in sorted(set(lines))
+        ]
+    return messages
+
+
 def overlong(root: Path) -> list[str]:
     """One message for each file under `root` with more than `MAX_LINES` lines."""
     counts = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in sorted(root.rglob("*.py"))}
@@ -73,6 +95,11 @@ def overlong(root: Path) -> list[str]:
 
 def test_files_import_only_from_layers_above_their_own():
     assert not violations(PACKAGE), "\n" + "\n".join(violations(PACKAGE))
+
+
+@pytest.mark.parametrize("folder", BELOW_COMMANDS)
+def test_experiments_and_benchmarks_stand_on_the_engine(folder):
+    assert not leaning_on_commands(ROOT / folder), "\n" + "\n".join(leaning_on_commands(ROOT / folder))
 
 
 @pytest.mark.parametrize("folder", SHORT)
@@ -124,3 +151,22 @@ def test_what_is_allowed_passes(toy, path, source):
 def test_what_is_not_allowed_is_named(toy, path, source, says):
     (message,) = toy(path, source)
     assert says in message
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("from gsjax.engine.fit.run import run\nimport sys", []),
+        ("import sys\nprint(sys.argv, 'sys.path')", []),
+        ("def f():\n    from gsjax import cli", ["experiments/fit/fit.py:2 imports gsjax.cli"]),
+        ("from gsjax.cli.fit import run", ["experiments/fit/fit.py:1 imports gsjax.cli.fit.run"]),
+        ("import sys\nsys.path.insert(0, '..')", ["experiments/fit/fit.py:2 uses sys.path"]),
+        ("from sys import path", ["experiments/fit/fit.py:1 uses sys.path"]),
+    ],
+)
+def test_an_experiment_that_leans_on_commands_is_named(tmp_path, source, says):
+    file = tmp_path / "experiments/fit/fit.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(source)
+    found = leaning_on_commands(tmp_path / "experiments")
+    assert [message.split(", but")[0] for message in found] == says

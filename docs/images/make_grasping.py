@@ -1,20 +1,16 @@
 """Draws docs/images/grasping.jpg: five moments of one grasp, with the tracked Gaussians of the object.
 
-MUJOCO_GL=egl .venv/bin/python docs/images/make_grasping.py
+MUJOCO_GL=egl .venv/bin/python -m docs.images.make_grasping
 """
 
-import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments" / "grasping"))
 
 import cv2
 import numpy as np
-from conveyor import VIEWS
-from grasping import Attempt, begun, draw_trial, world
-from panda import Cameras
 
+from experiments.grasping.conveyor import VIEWS
+from experiments.grasping.grasping import Attempt, begun, draw_trial, world
+from experiments.shared.panda import Cameras
 from gsjax.viz.colors import PALETTE
 
 SEED, CAMERA = 2, 0

@@ -4,23 +4,19 @@ The scene is fitted to the first frame; the images are of the next one, whose tr
 objects start from their true places there, displaced alike: they are too far apart to meet.
 """
 
-import sys
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-sys.path.append(str(Path(__file__).resolve().parents[1] / "optimizers"))
-
 import jax
 import jax.numpy as jnp
 import jaxlie
-import methods
 import numpy as np
-from boxes import OBJECTS, PIXELS_PER_MM, boxes
 from jaxtyping import Array, Float
-from one_update import Update, scene_at, update_of
 
+from experiments.basin.boxes import OBJECTS, PIXELS_PER_MM, boxes
+from experiments.optimizers import methods
+from experiments.shared.one_update import Update, scene_at, update_of
 from gsjax.methods.track.align import compose
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
@@ -138,6 +134,6 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """Cosines and shares over the displacement, a row of panels for each motion."""
-    from plots import draw_basin
+    from experiments.shared.plots import draw_basin
 
     draw_basin(rows, path, PIXELS_PER_MM)

@@ -1,24 +1,21 @@
 """Object tracker, feature distillation and graph in one jitted step: what is the graph worth?"""
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from fields import codebook_of, true_labels
-from one_step import composed, empty_memory
-from recordings import recorded
-from timing import CALLS, jitted, timed
 
 import gsjax
+from experiments.composition.one_step import composed, empty_memory
+from experiments.shared.fields import codebook_of, true_labels
+from experiments.shared.recordings import recorded
+from experiments.shared.timing import CALLS, jitted, timed
 from gsjax.data.photographs import photographs_of
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import GraphConfig, nodes_of

@@ -1,17 +1,14 @@
 """What is each part of SurstSplat and GaussianClin worth, and what of a teacher that errs?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from deform_regions import CLASSES, meanings, region_map, with_errors
-from deforming import dataset, learned, scores, summary, track_errors
 
-from gsjax.methods.deform import PRESETS, DeformConfig
+from experiments.shared.deform_regions import CLASSES, meanings, region_map, with_errors
+from experiments.shared.deforming import dataset, learned, scores, summary, track_errors
+from gsjax.methods.deform import PRESETS, DeformConfig, Lesson
 
 SCALE, WARMUP, ITERATIONS, START_PIXELS = 0.4, 100, 300, 1.8
 HEAVY_NODES = 2048
@@ -29,11 +26,11 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         config = replace(config, graph=replace(config.graph, **heavy))
     codes = None if part == "features" else np.eye(CLASSES, config.channels)
     rng = np.random.default_rng(seed)
-    looks = []
-    for t in data.train:
-        taught = None if codes is None else with_errors(region_map(data, t), options["errors"], rng)
-        looks.append(data.look(t, ids=taught))
-    found = learned(looks, config, codes)
+    lesson = None
+    if codes is not None:
+        errors = options["errors"]
+        lesson = Lesson([with_errors(region_map(data, t), errors, rng) for t in data.train], codes)
+    found = learned([data.frame(t) for t in data.train], config, lesson)
     told = {**scores(found, data), **track_errors(found, data), **summary(found)}
     return told if codes is None else told | meanings(found, data, codes)
 

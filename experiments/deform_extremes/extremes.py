@@ -12,17 +12,20 @@ import numpy as np
 
 import gsjax
 from gsjax.engine.deform.scores import draw
+from gsjax.engine.drive import drive
+from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (
+    Deform,
     DeformConfig,
     DeformRatesConfig,
     DeformWeightsConfig,
     GraphConfig,
-    Look,
-    begin_deform,
-    reconstruct,
+    Lesson,
     start_gaussians,
 )
+from gsjax.methods.deform.method import PLAN
 from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 DATA = "simulated:tissue?width=64&height=52&frames=6"
@@ -42,9 +45,9 @@ FAR_TIMES = (-1e9, 0.0, 0.5, 1.0, 1e9)
 class Given(NamedTuple):
     """What a reconstruction is given."""
 
-    looks: list[Look]
+    frames: list[Frame]
     config: DeformConfig
-    codes: np.ndarray
+    lesson: Lesson
     gaussians: Gaussians | None = None
 
 
@@ -60,32 +63,41 @@ def _graph(**settings: Any) -> Callable[[Given], Given]:
     return _config(graph=replace(BASE.graph, **settings))
 
 
-def _looks(change: Callable[[Look], Look]) -> Callable[[Given], Given]:
-    return lambda given: given._replace(looks=[change(look) for look in given.looks])
+def _frames(change: Callable[[Frame], Frame]) -> Callable[[Given], Given]:
+    return lambda given: given._replace(frames=[change(frame) for frame in given.frames])
+
+
+def _codes(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Given], Given]:
+    return lambda given: given._replace(lesson=given.lesson._replace(codebook=change(given.lesson.codebook)))
+
+
+def _one_frame(given: Given) -> Given:
+    return given._replace(frames=given.frames[:1], lesson=given.lesson._replace(ids=given.lesson.ids[:1]))
 
 
 def _start(change: Callable[[Gaussians], Gaussians]) -> Callable[[Given], Given]:
     def changed(given: Given) -> Given:
-        return given._replace(gaussians=change(start_gaussians(given.looks, 0, given.config.start_pixels)))
+        return given._replace(gaussians=change(start_gaussians(given.frames, 0, given.config.start_pixels)))
 
     return changed
 
 
-def _larger(factor: float) -> Callable[[Look], Look]:
+def _larger(factor: float) -> Callable[[Frame], Frame]:
     """The same scene in another unit of length."""
 
-    def of(look: Look) -> Look:
-        viewmat = look.viewmat.copy()
-        viewmat[:3, 3] *= factor
-        return look._replace(viewmat=viewmat, depth=look.depth * factor, near=look.near * factor)
+    def of(frame: Frame) -> Frame:
+        viewmat = frame.cameras.viewmat.copy()
+        viewmat[:, :3, 3] *= factor
+        cameras = replace(frame.cameras, viewmat=viewmat, near=frame.cameras.near * factor)
+        return replace(frame, cameras=cameras, depths=frame.depths * factor)
 
     return of
 
 
-def _one_pixel(look: Look) -> Look:
-    counts = np.zeros_like(look.counts)
-    counts[20:22, 20:22] = True
-    return look._replace(counts=counts)
+def _one_pixel(frame: Frame) -> Frame:
+    masks = np.zeros_like(frame.masks)
+    masks[:, 20:22, 20:22] = True
+    return replace(frame, masks=masks)
 
 
 def _with(name: str, value: Callable[[Any], Any]) -> Callable[[Gaussians], Gaussians]:
@@ -110,14 +122,14 @@ CASES: dict[str, Callable[[Given], Given]] = {
     "two nodes in the graph": _graph(nodes=2),
     "a graph whose edges end at 1e-6 radii": _graph(tau_x=1e-6, tau_t=1e-6),
     "a graph of weight 1e9": _graph(node=1e9, structure=1e9),
-    "codes of length 1e6": lambda given: given._replace(codes=1e6 * CODES),
-    "codes of length 1e-6": lambda given: given._replace(codes=1e-6 * CODES),
-    "codes all alike": lambda given: given._replace(codes=np.ones_like(CODES)),
-    "four pixels count": _looks(_one_pixel),
-    "one look": lambda given: given._replace(looks=given.looks[:1]),
-    "all looks at one time": _looks(lambda look: look._replace(time=0.5)),
-    "in micrometres": _looks(_larger(1e6)),
-    "in kilometres": _looks(_larger(1e-3)),
+    "codes of length 1e6": _codes(lambda codes: 1e6 * codes),
+    "codes of length 1e-6": _codes(lambda codes: 1e-6 * codes),
+    "codes all alike": _codes(np.ones_like),
+    "four pixels count": _frames(_one_pixel),
+    "one look": _one_frame,
+    "all looks at one time": _frames(lambda frame: replace(frame, time=np.asarray(0.5))),
+    "in micrometres": _frames(_larger(1e6)),
+    "in kilometres": _frames(_larger(1e-3)),
     "a Gaussian 1000 km away": _start(_with("means", lambda a: a.at[0].set(jnp.array([1e6, 0.0, 0.0])))),
     "ten Gaussians without a place": _start(_with("means", lambda a: a.at[:10].set(jnp.nan))),
     "all scales 1e-12": _start(_with("log_scales", lambda a: jnp.full_like(a, np.log(1e-12)))),
@@ -128,17 +140,16 @@ CASES: dict[str, Callable[[Given], Given]] = {
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """Thirty steps of one case, and the scene long before, during and long after the recording."""
     given = CASES[options["case"]](_given(seed))
-    problem, state = begin_deform(given.looks, given.config, given.codes, gaussians=given.gaussians)
-    rows = []
-    for found in reconstruct(problem, state):
-        state = found.state
-        rows.append(jax.device_get(found.info))
+    method = Deform(given.config)
+    ticks = drive(method, *method.start(given.frames, given.lesson, gaussians=given.gaussians))
+    rows = [jax.device_get(now.info) for now in ticks]
+    scene, moving = ticks.run.params, ticks.run.kept.moving
     losses = np.array([float(row["loss"]) for row in rows])
-    pictures, plan = [], problem.plan_for(state)
+    pictures = []
     for time in FAR_TIMES:
-        seen = draw(state.scene, state.moving, given.looks[0]._replace(time=time), plan)
+        seen = draw(scene, moving, replace(given.frames[0], time=np.asarray(time)), ticks.run.plans[PLAN])
         pictures.append(np.isfinite(seen.colors).all() and np.isfinite(seen.depths).all())
-    leaves = jax.tree.leaves(state.scene.field)
+    leaves = jax.tree.leaves(scene.field)
     return {
         "finite_losses": float(np.isfinite(losses).mean()),
         "skipped": sum(bool(row["skipped"]) for row in rows),
@@ -152,10 +163,10 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 def _given(seed: int) -> Given:
     seen = gsjax.open_sequence(DATA)
     last = seen.num_frames - 1
-    looks = []
+    frames = []
     for t in range(seen.num_frames):
-        mask = seen.mask(t, 0)
-        cameras = (seen.viewmats[t, 0], seen.Ks[t, 0], t / last)
-        ids = (np.arange(seen.width) > seen.width // 2)[None].repeat(seen.height, 0).astype(np.int32)
-        looks.append(Look(seen.image(t, 0), mask == 0, seen.depth(t, 0), *cameras, ids, seen.near))
-    return Given(looks, replace(BASE, seed=seed), CODES)
+        camera = Camera(seen.viewmats[t, :1], seen.Ks[t, :1], seen.width, seen.height, seen.near)
+        mask, time = seen.mask(t, 0)[None] == 0, np.asarray(t / last)
+        frames.append(Frame(seen.image(t, 0)[None], seen.depth(t, 0)[None], camera, mask, time))
+    ids = (np.arange(seen.width) > seen.width // 2)[None].repeat(seen.height, 0).astype(np.int32)
+    return Given(frames, replace(BASE, seed=seed), Lesson([ids] * seen.num_frames, CODES))

@@ -1,26 +1,25 @@
 """Does a deformation field find where each point of a shirt goes between two pictures with depth?"""
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from deforming import Reconstructed, drawn
 from jaxtyping import Bool, Float, UInt8
-from recordings import recorded
 
-from gsjax.data.resizing import blended, picked
-from gsjax.methods.deform import DeformConfig, Look, begin_deform, reconstruct
+from experiments.shared.deforming import Reconstructed, drawn, one_frame
+from experiments.shared.recordings import recorded
+from gsjax.data.resizing import area_resized, nearest_resized
+from gsjax.engine.drive import drive
+from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.metrics.image import psnr
 from gsjax.metrics.tracking import carried_points
 from gsjax.perception.optical_flow import DisFlow
+from gsjax.scene.frame import Frame
 
 SCALE = 0.25  # of the pictures that are learned from
 CONFIG = DeformConfig(warmup=150, iterations=650, start_pixels=1.8, nodes=512)
@@ -52,7 +51,7 @@ class Pair:
         """The known pixels' points in the first picture."""
         return lifted(self.depths[0], self.K)[self.known]
 
-    def look(self, t: int, scale: float) -> Look:
+    def frame(self, t: int, scale: float) -> Frame:
         """A picture, smaller."""
         height, width = (round(side * scale) for side in self.depths[0].shape)
 
@@ -60,8 +59,8 @@ class Pair:
             return width, height
 
         K = self.K * np.array([[width / self.depths[0].shape[1]], [height / self.depths[0].shape[0]], [1]])
-        image = blended(lambda t: self.images[t], size)(t)
-        return Look(image, None, picked(lambda t: self.depths[t], size)(t), np.eye(4), K, float(t))
+        image = area_resized(lambda t: self.images[t], size)(t)
+        return one_frame(image, np.eye(4), K, float(t), nearest_resized(lambda t: self.depths[t], size)(t))
 
 
 def pair(name: str = "deepdeform") -> Pair:
@@ -100,9 +99,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     else:
         learned = by_field(data, seed, COARSE if "small" in variant else ())
         moved = carried(learned, data)
-        second = data.look(1, SCALE)
-        found["psnr_second"] = psnr(drawn(learned, second)[0], second.image / 255.0)
-        found["gaussians"] = learned.state.scene.gaussians.num
+        second = data.frame(1, SCALE)
+        found["psnr_second"] = psnr(drawn(learned, second)[0], second.images[0] / 255.0)
+        found["gaussians"] = learned.run.params.gaussians.num
     minutes = (perf_counter() - begun) / 60
     off = 1e3 * np.linalg.norm(moved - data.flow[data.known], axis=1)
     return found | {
@@ -135,36 +134,37 @@ def by_optical_flow(data: Pair, scale: float) -> Float[np.ndarray, "n 3"]:
 def by_field(data: Pair, seed: int, coarse: tuple[tuple[float, int], ...]) -> Reconstructed:
     """The first picture as it is, then both; smaller pictures of both before, if wanted."""
     config = replace(CONFIG, seed=seed)
-    total = config.warmup + config.iterations
-    problem, state = begin_deform([data.look(t, SCALE) for t in (0, 1)], config)
-    parts = [(problem, config.warmup)]
+    method, total = Deform(config), config.warmup + config.iterations
+    problem, run = method.start([data.frame(t, SCALE) for t in (0, 1)])
+    parts = [(problem, run.plans, config.warmup)]
     for scale, steps in coarse:
-        smaller, other = begin_deform([data.look(t, scale) for t in (0, 1)], config)
-        smaller = smaller._replace(plan=smaller.plan_for(other), radius=problem.radius, bounds=problem.bounds)
-        parts.append((smaller, parts[-1][1] + steps))
+        smaller, other = method.start([data.frame(t, scale) for t in (0, 1)])
+        smaller = smaller._replace(radius=problem.radius, bounds=problem.bounds)
+        parts.append((smaller, other.plans, parts[-1][2] + steps))
     seconds = compiling = skipped = 0.0
-    for part, last in [*parts, (problem, total)]:
-        for found in reconstruct(part, state):
-            state = found.state
-            seconds, compiling = seconds + found.seconds, compiling + found.compile_seconds
-            skipped += float(found.info["skipped"])
-            if state.step >= last:
+    for part, plans, last in [*parts, (problem, run.plans, total)]:
+        for now in drive(method, part, run.having(plans=plans)):
+            run = now.run
+            seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds
+            skipped += float(now.info["skipped"])
+            if now.step >= last:
                 break
     assert not skipped, f"{skipped:.0f} steps were skipped"
-    return Reconstructed(problem, state, seconds, compiling)
+    return Reconstructed(config, problem, run, seconds, compiling)
 
 
 def carried(found: Reconstructed, data: Pair) -> Float[np.ndarray, "n 3"]:
     """How far the Gaussians around each pixel's point move between the two times."""
     at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
-    means = [np.asarray(at(found.state.scene, found.state.moving, jnp.asarray(t))) for t in (0.0, 1.0)]
+    means = [np.asarray(at(found.run.params, found.run.kept.moving, jnp.asarray(t))) for t in (0.0, 1.0)]
     return carried_points(data.start, np.stack(means))[1] - data.start
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """Which share of the pixels is off by how much."""
     from matplotlib.figure import Figure
-    from plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
+
+    from experiments.shared.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
 
     drawing = Figure(figsize=(6.4, 4), dpi=100, layout="constrained")
     axes = drawing.subplots()

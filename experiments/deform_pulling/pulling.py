@@ -1,24 +1,22 @@
 """What can be had of a real clip without depth, masks, poses and calibration?"""
 
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import cv2
 import numpy as np
-from deforming import EVERY, Reconstructed, drawn, learned, summary
 from jaxtyping import Bool, UInt8
-from recordings import recorded
 
 import gsjax
+from experiments.shared.deforming import EVERY, Reconstructed, drawn, learned, one_frame, summary
+from experiments.shared.recordings import recorded
 from gsjax.data import DataWarning, Sequence
 from gsjax.engine.deform.data import unit_times
-from gsjax.methods.deform import DeformConfig, Look
+from gsjax.methods.deform import DeformConfig
 from gsjax.metrics.image import psnr, ssim
+from gsjax.scene.frame import Frame
 
 SCALE = 0.25  # of 640x512
 BASE = DeformConfig(warmup=100, iterations=500, start_pixels=1.5, nodes=1024)
@@ -61,45 +59,47 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     if options["variant"] == "static":
         config = replace(config, warmup=config.warmup + config.iterations, iterations=0, warmup_frames="all")
 
-    def look(t: int) -> Look:
+    def seen(t: int) -> Frame:
         image, view = sequence.image(t, 0), (sequence.viewmats[t, 0], sequence.Ks[t, 0])
-        counts = None if options["pixels"] == "all" else no_tool(image)
-        return Look(image, counts, None, *view, float(unit_times(sequence)[t]))
+        mask = None if options["pixels"] == "all" else no_tool(image)
+        return one_frame(image, *view, float(unit_times(sequence)[t]), mask=mask)
 
-    found = learned([look(t) for t in train], config)
-    rows = [_scores(found, look(t)) | _copies(sequence, t, look(t)) for t in test]
+    found = learned([seen(t) for t in train], config)
+    rows = [_scores(found, seen(t)) | _copies(sequence, t, seen(t)) for t in test]
     return {
         **{name: float(np.mean([row[name] for row in rows])) for name in rows[0]},
-        "psnr_learned": float(np.mean([_scores(found, look(t))["psnr"] for t in train[::8]])),
+        "psnr_learned": float(np.mean([_scores(found, seen(t))["psnr"] for t in train[::8]])),
         **summary(found),
         "frames": {str(t): row for t, row in zip(test, rows, strict=True)},
     }
 
 
-def _scores(found: Reconstructed, look: Look) -> dict[str, float]:
-    colors, true = drawn(found, look)[0], look.image / 255.0
-    counted = 1.0 if look.counts is None else float(look.counts.mean())
-    return {
-        "psnr": psnr(colors, true, look.counts),
-        "ssim": ssim(colors, true, look.counts),
-        "counted": counted,
-    }
+def _scores(found: Reconstructed, frame: Frame) -> dict[str, float]:
+    colors, true, mask = drawn(found, frame)[0], frame.images[0] / 255.0, _mask(frame)
+    counted = 1.0 if mask is None else float(mask.mean())
+    return {"psnr": psnr(colors, true, mask), "ssim": ssim(colors, true, mask), "counted": counted}
 
 
-def _copies(sequence: Sequence, t: int, look: Look) -> dict[str, float]:
+def _mask(frame: Frame) -> Bool[np.ndarray, "h w"] | None:
+    return None if frame.masks is None else frame.masks[0]
+
+
+def _copies(sequence: Sequence, t: int, frame: Frame) -> dict[str, float]:
     """PSNR of a frame as copies of others, over the same pixels."""
 
     def image(t):
         return sequence.image(min(max(t, 0), sequence.num_frames - 1), 0) / 255.0
 
     guesses = {"previous": image(t - 1), "neighbors": (image(t - 1) + image(t + 1)) / 2, "first": image(0)}
-    return {f"psnr_{name}": psnr(guess, look.image / 255.0, look.counts) for name, guess in guesses.items()}
+    true, mask = frame.images[0] / 255.0, _mask(frame)
+    return {f"psnr_{name}": psnr(guess, true, mask) for name, guess in guesses.items()}
 
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """PSNR of each held-out frame, beside copies of others."""
     from matplotlib.figure import Figure
-    from plots import BLUE, GREEN, GREY, ORANGE, PURPLE
+
+    from experiments.shared.plots import BLUE, GREEN, GREY, ORANGE, PURPLE
 
     kinds = list(dict.fromkeys(row["pixels"] for row in rows))
     drawing = Figure(figsize=(5.2 * len(kinds), 3.6), dpi=100, layout="constrained")

@@ -1,23 +1,22 @@
 """How often are ten types of question on a deforming scene answered as the simulation's truth has it?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax.numpy as jnp
 import numpy as np
-from deform_regions import with_errors
-from deform_truth import NAMES, Truth, built_in
-from deforming import Dataset, Reconstructed, dataset, learned, summary
 
+from experiments.shared.deform_regions import with_errors
+from experiments.shared.deform_truth import NAMES, Truth, built_in
+from experiments.shared.deforming import Dataset, Reconstructed, dataset, learned, summary
+from gsjax.engine.deform.data import unit_times
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (
     PRESETS,
     QUESTIONS,
     GraphConfig,
+    Lesson,
     Question,
     SceneFacts,
     TemplatedAnswerer,
@@ -110,24 +109,19 @@ def _learned(data: Dataset, truth: Truth, wrong: float, seed: int) -> Reconstruc
     rng, config = np.random.default_rng(seed), replace(CONFIG, seed=seed)
     codes, step = np.eye(len(NAMES), config.channels), truth.data.sequence.width // data.sequence.width
     labels = truth.labels[:, step // 2 :: step, step // 2 :: step]
-    taught = {t: with_errors(labels[t], wrong, rng, classes=len(NAMES)) for t in data.train}
-    looks = [data.look(t, ids=ids, tools=True) for t, ids in taught.items()]
-    return learned(looks, config, codes, first=round(FIRST * len(looks)))
+    ids = [with_errors(labels[t], wrong, rng, classes=len(NAMES)) for t in data.train]
+    frames = [data.frame(t, tools=True) for t in data.train]
+    return learned(frames, config, Lesson(ids, codes), first=round(FIRST * len(frames)))
 
 
 def _facts(data: Dataset, found: Reconstructed) -> SceneFacts:
     """Of all frames."""
-    frames = range(data.sequence.num_frames)
-    looks = [data.look(t) for t in frames]
-    height, width = looks[0].image.shape[:2]
-    viewmats, Ks = (
-        jnp.asarray(np.stack([getattr(look, name) for look in looks]), jnp.float32)
-        for name in ("viewmat", "K")
-    )
-    times = np.array([look.time for look in looks])
-    codes = np.eye(len(NAMES), found.problem.config.channels)
-    cameras = Camera(viewmats, Ks, width, height, looks[0].near)
-    return scene_facts(found.state.scene, found.state.moving, times, cameras, codes, NAMES, frames)
+    seen = data.sequence
+    viewmats, Ks = (jnp.asarray(a[:, 0], jnp.float32) for a in (seen.viewmats, seen.Ks))
+    cameras = Camera(viewmats, Ks, seen.width, seen.height)
+    codes, frames = np.eye(len(NAMES), found.config.channels), range(seen.num_frames)
+    scene, moving = found.run.params, found.run.kept.moving
+    return scene_facts(scene, moving, unit_times(seen), cameras, codes, NAMES, frames)
 
 
 def _right(kind: str, answer: Any, true: Any) -> bool:

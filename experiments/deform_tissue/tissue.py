@@ -1,16 +1,21 @@
 """How well is deforming tissue seen where it was not photographed, and followed?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from deforming import copies, dataset, frames_per_second, learned, scores, summary, track_errors
 
-from gsjax.methods.deform import DeformConfig, GraphConfig
+from experiments.shared.deforming import (
+    copies,
+    dataset,
+    frames_per_second,
+    learned,
+    scores,
+    summary,
+    track_errors,
+)
+from gsjax.methods.deform import DeformConfig, GraphConfig, Lesson
 
 BASE = DeformConfig(warmup=200, iterations=800, start_pixels=1.8)
 CHANNELS = BASE.channels
@@ -24,13 +29,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         config = replace(config, warmup=config.warmup + config.iterations, iterations=0, warmup_frames="all")
     elif variant == "no graph":
         config = replace(config, graph=GraphConfig(kind="none"))
-    codes = np.eye(2, CHANNELS) if semantic else None
-    looks = [data.look(t, ids=data.classes(t) if semantic else None) for t in data.train]
-    found = learned(looks, config, codes)
+    lesson = Lesson([data.classes(t) for t in data.train], np.eye(2, CHANNELS)) if semantic else None
+    found = learned([data.frame(t) for t in data.train], config, lesson)
     return {
         **scores(found, data),
         **copies(data),
         **track_errors(found, data),
         **summary(found),
-        "fps": frames_per_second(found, data.look(0)),
+        "fps": frames_per_second(found, data.frame(0)),
     }

@@ -1,18 +1,16 @@
 """What do a coarser field, fewer nodes, a gate or fewer channels cost, and what do they save?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from deform_regions import CLASSES, meanings, region_map
-from deforming import (
+
+from experiments.shared.deform_regions import CLASSES, meanings, region_map
+from experiments.shared.deforming import (
     Dataset,
     Reconstructed,
     dataset,
@@ -22,8 +20,7 @@ from deforming import (
     summary,
     track_errors,
 )
-
-from gsjax.methods.deform import DeformConfig, GraphConfig
+from gsjax.methods.deform import DeformConfig, GraphConfig, Lesson
 from gsjax.scene.deformation import DeformationConfig
 
 BASE = DeformConfig(warmup=100, iterations=300, start_pixels=1.8)
@@ -37,14 +34,14 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     data = dataset(scale=options.get("scale", SCALE))
     config = _config(options, seed)
     codes, reference = np.eye(CLASSES, config.channels), _reference_ms(seed)
-    found = learned(_looks(data), config, codes)
+    found = learned(*_taught(data, codes, config))
     told = {**scores(found, data), **track_errors(found, data), **summary(found)}
     return {
         **told,
         **meanings(found, data, codes),
         "pace": told["step_ms"] / reference,
         "deform_ms": _deform_ms(found),
-        "fps": frames_per_second(found, data.look(0)),
+        "fps": frames_per_second(found, data.frame(0)),
     }
 
 
@@ -55,20 +52,22 @@ def _config(options: dict[str, Any], seed: int) -> DeformConfig:
     return replace(config, graph=GraphConfig(kind="none")) if options.get("graph") == "none" else config
 
 
-def _looks(data: Dataset) -> list:
-    return [data.look(t, ids=region_map(data, t)) for t in data.train]
+def _taught(data: Dataset, codes: np.ndarray, config: DeformConfig) -> tuple[list, DeformConfig, Lesson]:
+    """What `learned` is given: frames, settings, and what each pixel shows."""
+    lesson = Lesson([region_map(data, t) for t in data.train], codes)
+    return [data.frame(t) for t in data.train], config, lesson
 
 
 def _reference_ms(seed: int) -> float:
     """A step of the first row's, as fast as this machine is now: the mean of a few, in the same shares."""
     config = replace(BASE, seed=seed, warmup=_TIMED // 4, iterations=3 * _TIMED // 4)
     codes = np.eye(CLASSES, config.channels)
-    return summary(learned(_looks(dataset(scale=SCALE)), config, codes))["step_ms"]
+    return summary(learned(*_taught(dataset(scale=SCALE), codes, config)))["step_ms"]
 
 
 def _deform_ms(found: Reconstructed) -> float:
     """To deform all Gaussians and bring a slope back through that; the median."""
-    scene, moving = found.state.scene, found.state.moving
+    scene, moving = found.run.params, found.run.kept.moving
 
     def squares(scene, moving, time):
         return sum(jnp.square(leaf).sum() for leaf in jax.tree.leaves(scene.at(time, moving)))

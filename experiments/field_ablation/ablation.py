@@ -1,20 +1,17 @@
 """What is each part of the distillation worth? One is left out, or made otherwise, at a time."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from autoencoder import trained
-from fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
 
+from experiments.field_ablation.autoencoder import trained
+from experiments.shared.fields import Learned, codebook_of, fitted, flawed_teacher, learned, of_field, scored
 from gsjax.engine.distill.scene import FieldScene, scaled
 from gsjax.methods.distill import DistillConfig, DistillWeightsConfig, Teacher, features_of
 from gsjax.methods.distill.field import FeatureField
@@ -90,7 +87,8 @@ PANELS = (
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A panel for each score, a bar for each variant: the mean over seeds, each of which is a dot."""
     from matplotlib.figure import Figure
-    from plots import draw_variants
+
+    from experiments.shared.plots import draw_variants
 
     names = list(dict.fromkeys(row["variant"] for row in rows))
     drawing = Figure(figsize=(14, 1.0 + 0.4 * len(names)), dpi=100, layout="constrained")

@@ -1,15 +1,12 @@
 """What is foreground in a dome of real cameras, asked of a field that four of them had no part in?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from fields import by_majority, codebook_of, fitted, learned, of_field, scored
 
+from experiments.shared.fields import by_majority, codebook_of, fitted, learned, of_field, scored
 from gsjax.data import ReadOptions
 from gsjax.methods.distill import DistillConfig, teacher_of_objects
 from gsjax.methods.fit import FitConfig, StartConfig

@@ -1,31 +1,26 @@
 """Does a distillation stay finite where it should not be asked to work at all?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher, true_labels
 
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, true_labels
 from gsjax.engine.distill.scene import FieldScene, scaled
+from gsjax.engine.drive import drive
 from gsjax.methods.distill import (
+    Distill,
     DistillConfig,
     DistillRatesConfig,
     DistillWeightsConfig,
     Teacher,
-    begin_distill,
-    distill,
-    finished,
-    gaussian_cosines,
     teacher_of_objects,
 )
-from gsjax.scene.feature_grid import FeatureGridConfig, locate
+from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.gaussians import take
 
 SCALE = 0.25
@@ -109,15 +104,13 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     assert isinstance(teacher, Teacher)
     scene, teacher, config = CASES[options["case"]](scene, teacher, BASE)
     cameras = [scene.photographs.camera(i) for i in scene.taught]
-    problem, state = begin_distill(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
+    method = Distill(config)
+    ticks = drive(method, *method.start(scene.gaussians, cameras, teacher, scene.rasterize_mode))
     losses, skipped = [], 0
-    for found in distill(problem, state):
-        state = found.state
-        losses.append(float(found.info["loss"]))
-        skipped += bool(found.info["skipped"])
-    field = finished(problem, state)
-    located = locate(field.encoding, jnp.asarray(scene.gaussians.means))
-    cosines = np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)))
+    for now in ticks:
+        losses.append(float(now.info["loss"]))
+        skipped += bool(now.info["skipped"])
+    field, cosines = ticks.result.field, np.asarray(ticks.result.cosines(codes))
     labels = true_labels(scene.gaussians, scene.photographs)
     right = (cosines.argmax(1) == labels)[labels > 0]
     placed = np.isfinite(np.asarray(scene.gaussians.means)).all(axis=1)

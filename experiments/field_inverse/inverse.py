@@ -1,18 +1,15 @@
 """Three ways to ask a field in 3D: exactly, by the pseudo-inverse of its convolution, by a learned one."""
 
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher, learned, scored
-from timing import jitted, median_ms, timed
 
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, scored
+from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import (
     DistillConfig,

@@ -1,12 +1,9 @@
 """How well does a field say, of views and of Gaussians, what flawed masks say, against a plain vote?"""
 
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from fields import (
+from experiments.shared.fields import (
     NO_FLAWS,
     by_majority,
     codebook_of,
@@ -17,7 +14,6 @@ from fields import (
     of_field,
     scored,
 )
-
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.methods.distill import DistillConfig
 

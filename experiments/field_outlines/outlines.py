@@ -1,13 +1,19 @@
 """What is it worth to put outlines of flawed masks on edges of the picture, before any field learns them?"""
 
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import numpy as np
-from fields import NO_FLAWS, by_majority, codebook_of, fitted, flawed_teacher, labels_of, scored
+
+from experiments.shared.fields import (
+    NO_FLAWS,
+    by_majority,
+    codebook_of,
+    fitted,
+    flawed_teacher,
+    labels_of,
+    scored,
+)
 
 FEWEST = 40  # pixels of a thing in a photograph, for its mask to be judged
 

@@ -1,17 +1,14 @@
 """How long does a distillation take, and how much memory, at the paper's number of iterations and beyond?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax.numpy as jnp
 import numpy as np
-from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
-from timing import jitted, median_ms
 
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
+from experiments.shared.timing import jitted, median_ms
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.methods.distill import DistillConfig, Teacher, gaussian_cosines
@@ -31,7 +28,7 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
         scene, teacher, iterations = _doubled(scene), _enlarged(teacher), FEW
     found = learned(scene, scene.taught, teacher, DistillConfig(iterations=iterations, seed=seed))
     asked = scored(scene, of_field(found, codes), names, (found.field, found.located, codes))
-    step_s = found.seconds / (iterations - 1)
+    step_s = found.seconds / iterations
     return {
         "gaussians": scene.gaussians.num,
         "step_ms": 1e3 * step_s,

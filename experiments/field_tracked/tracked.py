@@ -1,18 +1,15 @@
 """Do features that were distilled once stay where they belong while the tracker moves the Gaussians?"""
 
-import sys
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 import equinox as eqx
 import jax
 import numpy as np
-from fields import NO_FLAWS, codebook_of, flawed_teacher, learned, of_field
-from recordings import recorded
 
-from gsjax.cli import track as track_command
+from experiments.shared.commands import succeeded
+from experiments.shared.fields import NO_FLAWS, codebook_of, flawed_teacher, learned, of_field
+from experiments.shared.recordings import recorded
 from gsjax.data.simulated.flawed_masks import Flaws
 from gsjax.engine.distill.scene import scene_of_run
 from gsjax.engine.distill.scores import ClassScores, class_maps
@@ -29,16 +26,9 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     of the camera that nothing learned from; beside it, the same had the Gaussians stayed where they were."""
     path = folder.parents[1] / "field_scenes" / f"{options['recording']}_all"
     if not (path / "report.html").is_file():
-        track_command.run(
-            track_command.Options(
-                str(recorded(options["recording"])),
-                path,
-                cameras=CAMERAS,
-                mask_camera=MASK_CAMERA,
-                eval_cameras=HELD_OUT,
-                overwrite=True,
-            )
-        )
+        words = ["track", recorded(options["recording"]), "--out", path, "--overwrite"]
+        words += ["--mask-camera", MASK_CAMERA, "--cameras", *CAMERAS, "--eval-cameras", *HELD_OUT]
+        succeeded(*words)
     first, saved = scene_of_run(path), open_run(path)
     names, codes = codebook_of(first.photographs)
     teacher, _ = flawed_teacher(first, codes, seed, NO_FLAWS if options["masks"] == "true" else Flaws())

@@ -1,13 +1,9 @@
 """What does speed cost? Channels, levels, table, resolution and steps, one after the other."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
-
+from experiments.shared.fields import codebook_of, fitted, flawed_teacher, learned, of_field, scored
 from gsjax.engine.distill.scene import scaled
 from gsjax.methods.distill import DistillConfig
 from gsjax.scene.feature_grid import FeatureGridConfig

@@ -1,15 +1,13 @@
 """`gsjax fit` where data is at the edge of sense."""
 
 import json
-import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from experiments.shared.commands import ended
 from gsjax.data.simulated import tabletop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.io.ply import read_ply
@@ -21,15 +19,12 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     """One fit in a process of its own."""
     data, out = folder / "data", folder / "run"
     more = CASES[options["case"]](data)
-    words = [sys.executable, str(Path(__file__).resolve()), str(data), "--out", str(out), "--overwrite"]
-    done = subprocess.run([*words, *SMALL, *more], capture_output=True, text=True, check=False)
-    told = done.stdout + done.stderr
-    if "Traceback" in told:
-        raise RuntimeError(told)
-    memory = float(re.search(r"memory_mb (\S+)", told).group(1))
-    row = {"code": done.returncode, "memory_mb": memory}
-    if done.returncode:
-        return row | {"said": next(line for line in told.splitlines() if line.startswith("error"))}
+    ran = ended("fit", data, "--out", out, "--overwrite", *SMALL, *more)
+    if "Traceback" in ran.output:
+        raise RuntimeError(ran.output)
+    row = {"code": ran.code, "memory_mb": ran.memory_mb}
+    if ran.code:
+        return row | {"said": next(line for line in ran.output.splitlines() if line.startswith("error"))}
     found = json.loads((out / "metrics.json").read_text())
     gaussians, _ = read_ply(out / "scene.ply")
     leaves = (
@@ -116,18 +111,3 @@ CASES = {
     ),
     "everything masked": lambda at: photographs(at, masked=True) or ALL,
 }
-
-
-def main() -> None:
-    """`gsjax fit`, and the most memory that it took."""
-    import resource
-
-    from gsjax.cli import main as gsjax
-
-    code = gsjax(["fit", *sys.argv[1:]])
-    print("memory_mb", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
-    sys.exit(code)
-
-
-if __name__ == "__main__":
-    main()

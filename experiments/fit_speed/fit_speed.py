@@ -1,6 +1,5 @@
 """What a step of the static fit takes, part by part."""
 
-import sys
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
@@ -10,17 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the benchmarks' scenes
-
 from benchmarks.workloads import ball
 from gsjax.geometry.cameras import Camera
-from gsjax.methods.fit import Batch, FitConfig, Observation, fit_loss, fit_step, grow
+from gsjax.methods.fit import Batch, FitConfig, fit_loss, grow
+from gsjax.methods.fit import step as fit_step
 from gsjax.methods.fit.model import model_of, with_degree
 from gsjax.optim.compiler import host_options
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import gaussians_from_activated
 from gsjax.scene.render import plan_render, render
 
 WIDTH, HEIGHT, REPEATS = 480, 270, 9
+HALFWAY, RADIUS = 0.5, 1.0  # of the fit, 0 to 1, and of the scene
 PARTS = ("draw", "loss", "backward", "adam", "grow")
 
 
@@ -33,21 +33,21 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     model = with_degree(model_of(gaussians, config, 1), 1)
     target = jnp.round(255 * jnp.clip(render(goal, camera).colors, 0, 1)).astype(jnp.uint8)
     plan = plan_render(model.gaussians, camera, headroom=1.3)
-    batch = Batch(Observation(target, None, None, camera, jnp.int32(0)), jnp.zeros((1, 3)), plan)
-    step, loss = fit_step(config, 1.0), fit_loss(config, 1.0)
+    batch = Batch(Frame(target, None, camera), jnp.int32(0), jnp.zeros((1, 3)), HALFWAY, RADIUS, plan)
+    step, loss = fit_step(config), fit_loss(config)
     state, key = step.init(model), jax.random.key(seed)
 
     def drawn(model, state, batch, key):
-        return render(model.gaussians, batch.seen.camera, batch.plan, backgrounds=batch.background)
+        return render(model.gaussians, batch.frame.cameras, batch.plan, backgrounds=batch.background)
 
     def compared(model, state, batch, key):
-        return loss(model, batch, step=0.5, key=key)
+        return loss(model, batch, step=0, key=key)
 
     def differentiated(model, state, batch, key):
-        return jax.value_and_grad(loss, has_aux=True)(model, batch, step=0.5, key=key)
+        return jax.value_and_grad(loss, has_aux=True)(model, batch, step=0, key=key)
 
     def stepped(model, state, batch, key):
-        return step.update(model, state, batch, step=0.5, key=key)
+        return step.update(model, state, batch, step=0, key=key)
 
     def grown(model, state, batch, key):
         return grow(model, state, key, config.cap, config.growth.factor, True)

@@ -1,6 +1,5 @@
 """What does each part of a fit buy in a given time?"""
 
-import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -8,30 +7,19 @@ from time import perf_counter
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from recordings import recorded
-from static_fit.static_fit import SCENES
-
+from experiments.shared.recordings import recorded
+from experiments.static_fit.static_fit import SCENES
 from gsjax.data import open_photographs
-from gsjax.engine.fit.loop import Budget
-from gsjax.engine.fit.results import Curve, judge, living, look
+from gsjax.engine.drive import drive
+from gsjax.engine.fit.judge import Judge
+from gsjax.engine.fit.schedule import Budget
 from gsjax.engine.photographs import split
-from gsjax.geometry.cameras import Camera
-from gsjax.methods.fit import (
-    FitConfig,
-    SplitConfig,
-    StartConfig,
-    View,
-    begin,
-    fit,
-    light_of,
-    needed,
-)
-from gsjax.metrics.image import ssim
+from gsjax.engine.progress import Progress
+from gsjax.geometry.cameras import on_device
+from gsjax.methods.fit import Fit, FitConfig, SplitConfig, StartConfig, light_of, needed
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
@@ -52,57 +40,51 @@ SETTINGS = {
 
 
 @lru_cache(maxsize=2)
-def views_at(scene: str, size: float = 1.0) -> tuple[list[View], list[View]]:
+def frames_at(scene: str, size: float = 1.0) -> tuple[list[Frame], list[Frame]]:
     """Fitted and held-out photographs; `size` 1 is that of static_fit."""
     how = SCENES[scene]
     photographs = open_photographs(str(recorded(scene)), how.get("read")).scaled(size * how["scale"])
     chosen, held_out = split(photographs, 8)
-
-    def view(i: int) -> View:
-        depth, viewmat, K = photographs.depth(i), photographs.viewmats[i], photographs.Ks[i]
-        return View(photographs.image(i), None, depth, viewmat, K)
-
-    return [view(i) for i in chosen], [view(i) for i in held_out]
+    return [photographs.frame(i) for i in chosen], [photographs.frame(i) for i in held_out]
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
-    """A fit of so many minutes, and where it stands now and then."""
+    """A fit of a few minutes, and its score now and then."""
     jax.clear_caches()
     scene, setting = options["scene"], options["setting"]
-    shown, held_out = views_at(scene)
-    views = views_at(scene, 0.5)[0] if setting == "half the size" else shown
-    depth_weight = 0.0 if shown[0].depth is None else 0.5
+    shown, held_out = frames_at(scene)
+    frames = frames_at(scene, 0.5)[0] if setting == "half the size" else shown
+    depth_weight = 0.0 if shown[0].depths is None else 0.5
     config = replace(SETTINGS[setting], seed=seed, depth_weight=depth_weight)
-    problem, state = begin(views, config)
-    curve, rows = Curve(), []
-    budget = Budget(config.steps, MINUTES, curve)
-    judged = [(str(i), view) for i, view in enumerate(held_out)]
+    method, spent, rows = Fit(config), Progress(), []
+    problem, run = method.start(frames)
+    budget, judge = Budget(config.steps, MINUTES, spent), Judge(config, problem.background)
+    judged = [(str(i), frame) for i, frame in enumerate(held_out)]
     recent: list[float] = []
-    for fitted in fit(problem, state, share=budget):
-        recent = [*recent[-49:], fitted.seconds]
-        curve.took(fitted.seconds, 0.0)
-        state, last = fitted.state, budget(fitted.state.step) >= 1
-        if last or curve.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
-            rows.append((curve.seconds / 60, judge(problem, state.gaussians, judged).mean()["psnr"]))
-    gaussians = living(state.gaussians)[0]
+    ticks = drive(method, problem, run, progress=budget)
+    for now in ticks:
+        recent = [*recent[-49:], now.seconds]
+        spent.seconds += now.seconds  # compiling is not on the budget
+        if budget(now.step) >= 1 or spent.seconds > (len(rows) + 1) * JUDGED_EVERY_S:
+            rows.append((spent.seconds / 60, judge(now.run.params.gaussians, judged).mean()["psnr"]))
+    gaussians, steps = ticks.result, ticks.run.step
     kept = take(gaussians, needed(light_of(gaussians, shown), config.prune))
-    seen = [look(kept, view, problem.background, config.antialiased)[0] for view in held_out]
+    seen = [judge.compare(kept, frame) for frame in held_out]
     return {
         "psnr": float(np.mean([one.psnr() for one in seen])),
-        "ssim": float(np.mean([ssim(one.image, one.truth) for one in seen])),
+        "ssim": float(np.mean([one.ssim() for one in seen])),
         "gaussians": kept.num,
         "unneeded": gaussians.num - kept.num,
-        "steps": state.step,
-        "steps_a_second": state.step / curve.seconds,
+        "steps": steps,
+        "steps_a_second": steps / spent.seconds,
         "step_over_draw": float(np.median(recent)) / _draw_seconds(gaussians, shown[0]),
         "curve": rows,
     }
 
 
-def _draw_seconds(gaussians: Gaussians, view: View) -> float:
+def _draw_seconds(gaussians: Gaussians, frame: Frame) -> float:
     """Median time of drawing a photograph's view, which a step is compared with."""
-    height, width = view.image.shape[:2]
-    camera = Camera(*(jnp.asarray(a, jnp.float32)[None] for a in (view.viewmat, view.K)), width, height)
+    camera = on_device(frame.cameras)
     plan, times = plan_render(gaussians, camera), []
     for _ in range(6):
         begun = perf_counter()

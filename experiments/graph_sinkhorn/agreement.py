@@ -4,13 +4,10 @@ Affinities of nodes of two frames: layer-normalised features of 32 channels, cha
 one to the other, in 20 iterations of rows and columns each.
 """
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +16,8 @@ from ott.geometry.geometry import Geometry
 from ott.problems.linear.linear_problem import LinearProblem
 from ott.solvers.linear.implicit_differentiation import ImplicitDiff
 from ott.solvers.linear.sinkhorn import Sinkhorn
-from timing import jitted, timed
 
+from experiments.shared.timing import jitted, timed
 from gsjax.losses.sinkhorn import sinkhorn
 
 CHANNELS, ITERATIONS, MANY, PAIRS = 32, 20, 100, 15

@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from panda import Arm, Cameras, body_pose, set_body
 from robosuite.models.arenas import TableArena
 from robosuite.models.bases import robot_base_factory
 from robosuite.models.grippers import gripper_factory
 from robosuite.models.objects import BreadObject, CanObject, CerealObject, MilkObject
 from robosuite.models.robots import Panda
 from robosuite.models.tasks import ManipulationTask
+
+from experiments.shared.panda import Arm, Cameras, body_pose, set_body
 
 OBJECTS = {"can": CanObject, "milk": MilkObject, "bread": BreadObject, "cereal": CerealObject}
 VIEWS = [

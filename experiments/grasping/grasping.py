@@ -5,22 +5,19 @@ and the name for a language query. From then on the arm knows what three RGB-D c
 frame led to after the next one is taken, so each command is one control period old.
 """
 
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with a robot share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conveyor import HOME, PERIOD, Conveyor, Trial, draw_trial
-from panda import CLOSED, LAG, OPEN, fed, motion_between, start
 from scipy.spatial.transform import Rotation
 
 import gsjax
+from experiments.grasping.conveyor import HOME, PERIOD, Conveyor, Trial, draw_trial
+from experiments.shared.panda import CLOSED, LAG, OPEN, fed, motion_between, start
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.grasping import Grasp, Gripper, best_grasp, score_grasp
 from gsjax.methods.planning import straight_line
@@ -252,6 +249,6 @@ class Attempt:
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """How often each method lifts, and how far off the tracker is."""
-    from plots import draw_grasping
+    from experiments.shared.plots import draw_grasping
 
     draw_grasping(rows, path)

@@ -1,20 +1,17 @@
 """The tracker where it may lose an object: does it, does it say so, and does it find it again?"""
 
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
-
 import jax
 import numpy as np
-from faults import noisy_depth, without_cameras, without_frames
-from recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
 from scipy.spatial.transform import Rotation
-from stages import HEIGHT, STAGES, WIDTH, gripper, stage
 
+from experiments.hard_cases.faults import noisy_depth, without_cameras, without_frames
+from experiments.hard_cases.stages import HEIGHT, STAGES, WIDTH, gripper, stage
+from experiments.shared.recordings import MASK_CAMERA, QUIET, Start, recorded, tracked
 from gsjax.data import Sequence, Truth, open_sequence
 from gsjax.data.simulated import tabletop
 from gsjax.engine.recording import Recording, draw_ahead, first_mask, remembered

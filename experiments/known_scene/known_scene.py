@@ -1,6 +1,5 @@
 """Is a scene of known Gaussians found again from its photographs?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from recordings import recorded
-
+from experiments.shared.recordings import recorded
+from gsjax.engine.drive import drive
 from gsjax.geometry.cameras import Camera, intrinsics, look_at
-from gsjax.methods.fit import FitConfig, GrowthConfig, View, begin, fit
+from gsjax.methods.fit import Fit, FitConfig, GrowthConfig
 from gsjax.metrics.image import psnr, ssim
-from gsjax.optim.densification import is_alive
-from gsjax.scene.gaussians import Gaussians, gaussians_from_activated, take
+from gsjax.scene.frame import Frame
+from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.initialize import spacing_scales
 from gsjax.scene.render import plan_render, render
 
@@ -60,8 +57,8 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     K = intrinsics(0.75 * WIDTH, WIDTH, HEIGHT)
     photographs = [np.round(255 * picture(truth, v, K)).astype(np.uint8) for v in viewmats]
     apart = np.arange(len(viewmats)) % 4 == 3
-    views = [
-        View(image, None, None, viewmat, K)
+    frames = [
+        Frame(image[None], None, Camera(viewmat[None], K[None], WIDTH, HEIGHT))
         for image, viewmat, away in zip(photographs, viewmats, apart, strict=True)
         if not away
     ]
@@ -73,15 +70,16 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
     if options["growth"] == "none":  # the number is known: nothing is to move elsewhere, or to cost anything
         still = GrowthConfig(begin=config.steps, noise=0.0, opacity_cost=0.0, scale_cost=0.0)
         config = replace(config, growth=still, cap=options["count"])
-    problem, state = begin(views, config, (off, colors))
+    method = Fit(config)
+    problem, run = method.start(frames, (off, colors))
     unseen = [
         (viewmat, image) for viewmat, image, away in zip(viewmats, photographs, apart, strict=True) if away
     ]
     curve, seconds = [], 0.0
-    for fitted in fit(problem, state):
-        seconds += fitted.seconds + fitted.compile_seconds
-        if fitted.state.step % JUDGED_EVERY == 0 or fitted.state.step == config.steps:
-            found = take(fitted.state.gaussians, np.asarray(is_alive(fitted.state.gaussians)))
+    for now in drive(method, problem, run):
+        seconds += now.seconds + now.compile_seconds
+        if now.step % JUDGED_EVERY == 0 or now.step == config.steps:
+            found = now.result
             drawn = [picture(found, viewmat, K) for viewmat, _ in unseen]
             scores = [psnr(image, truth / 255) for image, (_, truth) in zip(drawn, unseen, strict=True)]
             curve.append((seconds / 60, float(np.mean(scores))))

@@ -1,6 +1,6 @@
 """What splitting a step over devices costs: the same work on 1, 2 and 4 virtual devices of one machine.
 
-    python experiments/many_devices/scaling.py
+    python -m experiments.many_devices.scaling
 
 A step draws all cameras, differentiates and applies Adam. The devices share the machine's cores, so the best
 that can come out is the same time; what is more is the price of splitting. All programs live in one process

@@ -1,6 +1,6 @@
 """The tracker on real input without depth: a Franka pushes a T-block (the push_t recording).
 
-    python experiments/object_tracker/push_t.py RECORDING --stride 4
+    python -m experiments.object_tracker.push_t RECORDING --stride 4
 
 Tracks the first seven seconds with the first two cameras, starting from the recording's own shapes, and
 compares the rendered silhouette of the block with the pixels of its colour in all three. The robot hides

@@ -3,19 +3,16 @@
 The update begins with a scene fitted to frame t, and ends at frame t + gap, whose true motion is known.
 """
 
-import sys
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-import methods
 import numpy as np
-from one_update import Update, scene_at, update_of
-from recordings import MASK_CAMERA, recorded
-from timing import median_ms
 
+from experiments.optimizers import methods
+from experiments.shared.one_update import Update, scene_at, update_of
+from experiments.shared.recordings import MASK_CAMERA, recorded
+from experiments.shared.timing import median_ms
 from gsjax.engine.recording import open_recording
 
 RECORDINGS = {  # with the frames that updates begin at
@@ -99,6 +96,6 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A panel for each kind of update, a curve for each method."""
-    from plots import draw_optimizers
+    from experiments.shared.plots import draw_optimizers
 
     draw_optimizers(rows, path)

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optax
-from one_update import Update
 from scipy.spatial import cKDTree
-from timing import jitted, median_ms, timed
 from trimesh.registration import procrustes
 
+from experiments.shared.one_update import Update
+from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.geometry.cameras import pixel_grid, unproject
 from gsjax.methods.track.align import align, widened
 from gsjax.methods.track.config import AlignConfig, RefineConfig

@@ -1,14 +1,11 @@
 """What is each part of the discovery of parts worth? One is switched off, or made otherwise, at a time."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import Options, canonical_of, discovered, steadiness, with_parts
-from recordings import recorded
+from experiments.shared.discoveries import Options, canonical_of, discovered, steadiness, with_parts
+from experiments.shared.recordings import recorded
 
 HELD_OUT, ANCHOR = (3, 8), 0
 NO_SPLITS = {"every": 0, "least_gain": 0.0}
@@ -59,7 +56,8 @@ PANELS = (
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A panel for each score, a bar for each variant."""
     from matplotlib.figure import Figure
-    from plots import draw_variants
+
+    from experiments.shared.plots import draw_variants
 
     drawing = Figure(figsize=(16, 1.0 + 0.32 * len(rows)), dpi=100, layout="constrained")
     panels = drawing.subplots(1, len(PANELS), sharey=True)

@@ -1,14 +1,11 @@
 """Does the discovery of parts survive every anchor? All frames of a recording, each as the canonical one."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import FIT, Options, discovered, with_parts
-from recordings import recorded
+from experiments.shared.discoveries import FIT, Options, discovered, with_parts
+from experiments.shared.recordings import recorded
 
 
 def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:

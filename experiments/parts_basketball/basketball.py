@@ -1,16 +1,12 @@
 """Parts of two people and a ball in a dome of real cameras: how are views seen that were held out?"""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import FIT, Options, discovered, steadiness
-from recordings import recorded
-
+from experiments.shared.discoveries import FIT, Options, discovered, steadiness
+from experiments.shared.recordings import recorded
 from gsjax.data import ReadOptions
 
 HELD_OUT = (0, 10, 15, 30)  # the test cameras of Dynamic3DGaussians

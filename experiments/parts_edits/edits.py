@@ -1,19 +1,16 @@
 """Does each edit move what it should, leave the rest to the pixel, and how many frames a second are drawn?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from discoveries import Options, canonical_of, run_parts
-from recordings import recorded
 
+from experiments.shared.discoveries import Options, canonical_of, run_parts
+from experiments.shared.recordings import recorded
 from gsjax.engine.parts.saved import PartsRun, open_parts_run, read_parts
 from gsjax.geometry.cameras import Camera
 from gsjax.io.video import VideoWriter

@@ -1,37 +1,28 @@
 """The discovery of parts where data and settings are at the edge of sense."""
 
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from discoveries import FIT, Options, canonical_of
 from jaxtyping import Int
 
+from experiments.shared.discoveries import FIT, Options, canonical_of
 from gsjax.data import Sequence, open_sequence
+from gsjax.engine.drive import drive
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import (
-    PartScene,
+    Parts,
     PartsConfig,
-    Trajectory,
+    PartsResult,
     begin,
     choose_anchor,
-    first_parts,
-    follow,
-    gaussians_at,
-    moment,
     moved_pixels,
-    outcome,
-    refine,
-    without_needless,
 )
 from gsjax.metrics.tracking import relative_motion, true_labels
 from gsjax.perception.segmenters import PieceSegmenter
@@ -75,36 +66,36 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 def discovered(case: Case) -> dict[str, Any]:
     """As `gsjax parts` does it, from a scene that is there."""
-    views, config = case.sequence, case.config
-    anchor = choose_anchor(views.image, views.num_frames, views.num_cameras, 0)
-    moved = moved_pixels(views.image, anchor, views.num_cameras)
-    start = begin(views, case.gaussians, anchor, moved, config, PieceSegmenter(), jax.random.key(0))
-    parts, skipped, seconds = first_parts(start, views.num_frames, config), 0, []
-    for update in follow(views, start, parts, config):
-        parts, skipped = update.parts, skipped + update.skipped
-        seconds.append(update.seconds)
-    parts, _ = without_needless(views, parts, config)
-    for refined in refine(views, parts, config):
-        parts, skipped = refined.parts, skipped + int(refined.skipped)
-    scene, trajectory = outcome(start, parts, jnp.asarray(views.times, jnp.float32))
-    everything = jax.tree.leaves(eqx.filter((scene, trajectory), eqx.is_inexact_array))
-    block, box = (_error_mm(case, scene, trajectory, label) for label in (BLOCK, BOX))
+    sequence, config = case.sequence, case.config
+    anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras, 0)
+    moved = moved_pixels(sequence.image, anchor, sequence.num_cameras)
+    start = begin(sequence, case.gaussians, anchor, moved, config, PieceSegmenter(), jax.random.key(0))
+    method = Parts(config)
+    problem, run = method.start(sequence, start)
+    ticks, skipped, seconds = drive(method, problem, run, headroom=config.headroom), 0, []
+    for now in ticks:
+        skipped += int(now.info["skipped"])
+        seconds.append(now.seconds)
+    result, steps = ticks.result, config.stream.iterations
+    frames = np.reshape(seconds[: method.steps_of_frames(problem)], (-1, steps)).sum(1)
+    everything = jax.tree.leaves(eqx.filter((result.scene, result.trajectory), eqx.is_inexact_array))
+    block, box = (_error_mm(case, result, label) for label in (BLOCK, BOX))
     return {
         "finite": all(bool(jnp.isfinite(leaf).all()) for leaf in everything),
         "skipped": skipped,
-        "parts": len(np.unique(np.asarray(scene.labels))) - 1,
+        "parts": len(np.unique(np.asarray(result.scene.labels))) - 1,
         "block_mm": block,
         "box_mm": box,
-        "update_s": float(np.median(seconds)),
+        "update_s": float(np.median(frames)),
     }
 
 
-def _error_mm(case: Case, scene: PartScene, trajectory: Trajectory, label: int) -> float:
+def _error_mm(case: Case, result: PartsResult, label: int) -> float:
     """How far half of the Gaussians of an object are from where they truly are, at most, in the mean over the
     frames."""
     mine, truth = case.labels == label, case.sequence.truth
     frames = range(case.sequence.num_frames)
-    means = np.stack([np.asarray(gaussians_at(scene, moment(trajectory, t)).means)[mine] for t in frames])
+    means = np.stack([np.asarray(result.at(t).means)[mine] for t in frames])
     motions = relative_motion(truth.poses[:, list(truth.label_ids).index(label)])
     true = np.einsum("tij,nj->tni", motions[:, :3, :3], means[0]) + motions[:, None, :3, 3]
     off = np.linalg.norm(means - true, axis=-1).mean(0)

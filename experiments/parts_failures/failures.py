@@ -1,14 +1,11 @@
 """Where is a part no longer found? Four ways to be hard, from easy to hopeless."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import FIT, Options, run_parts
+from experiments.shared.discoveries import FIT, Options, run_parts
 
 CASES = {
     **{f"wheel, {n} spokes": ("wheel", n) for n in (3, 6, 12)},

@@ -4,24 +4,20 @@ Parts are the true ones, and the update begins with their true poses at an earli
 the optimizers alone.
 """
 
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-import jax
 import jax.numpy as jnp
 import lineax
 import numpy as np
 import optimistix
-from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Array, Float
-from recordings import recorded
-from timing import jitted, median_ms, timed
 
+from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.recordings import recorded
+from experiments.shared.timing import jitted, median_ms, timed
 from gsjax.engine.recording import open_recording
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import (
@@ -32,12 +28,12 @@ from gsjax.methods.parts import (
     StreamParams,
     stream_step,
 )
-from gsjax.methods.parts.follow import seen_at
+from gsjax.methods.parts.pictures import where_parts_are
 from gsjax.methods.parts.residual import pose_residual
 from gsjax.methods.parts.screws import motions_of, pose_of
 from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.least_squares import LEVENBERG_MARQUARDT, least_squares_step
-from gsjax.scene.frame import Frame, part_of
+from gsjax.scene.frame import Frame, of_cameras, part_of
 from gsjax.scene.handles import HandlePose, rigid_motions
 from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
@@ -88,10 +84,10 @@ class Update(NamedTuple):
         """For one iteration that looks through some of the cameras."""
         frame = self.frames[size]
         at = self.canonical, self.weights, self.start
-        seen = seen_at(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
+        seen = where_parts_are(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
         plan = plan_render(posed(self.canonical, self.weights, self.start), frame.cameras, headroom=1.6)
-        seen = jax.tree.map(lambda a: a[np.array(cameras)], seen)
-        return StreamBatch(self.canonical, seen, replace(plan, derivative=derivative), self.weights)
+        seen = of_cameras(seen, np.array(cameras))
+        return StreamBatch(self.canonical, seen, 1.0, replace(plan, derivative=derivative), self.weights)
 
     @property
     def cameras(self) -> tuple[int, ...]:
@@ -136,14 +132,13 @@ def adam(update: Update, coarse: float | None = None) -> Trace:
     config = replace(PartsConfig().stream, past=0, field_rate=0.0)
     config = config if coarse is None else replace(config, coarse=coarse)
     step = stream_step(config)
-    advance = jitted(
-        lambda params, state, batch, share: step.update(params, state, batch, step=share, key=None)
-    )
+    advance = jitted(lambda params, state, batch: step.update(params, state, batch, step=0, key=None))
     batches = {size: [update.batch(size, (c,), "reverse") for c in update.cameras] for size in (HALF, WHOLE)}
-    params = StreamParams(update.start, jnp.log(jnp.maximum(update.weights, 1e-9)))
-    state = step.init(params, len(update.weights))
+    field, nudges = jnp.log(jnp.maximum(update.weights, 1e-9)), jnp.zeros((len(update.weights), 3))
+    params = StreamParams(update.start, field, nudges)
+    state = step.init(params)
     each = {
-        size: float(np.median([median_ms(advance, params, state, batch, 0.5) for batch in of]))
+        size: float(np.median([median_ms(advance, params, state, batch) for batch in of]))
         for size, of in batches.items()
     }
     poses, ms = [], []
@@ -152,7 +147,8 @@ def adam(update: Update, coarse: float | None = None) -> Trace:
         turns = np.concatenate([rng.permutation(len(update.cameras)) for _ in range(count)])
         for i in range(count):
             size = HALF if i < config.coarse * count else WHOLE
-            at, known, _ = advance(at, known, batches[size][turns[i]], i / count)
+            batch = batches[size][turns[i]]._replace(progress=i / count)
+            at, known, _ = advance(at, known, batch)
             spent += each[size]
         poses.append(at.pose)
         ms.append(spent)
@@ -174,7 +170,7 @@ def least_squares(
 
     @jitted
     def advance(motions, state, batch):
-        return step.update(motions, state, batch, step=1.0, key=None)
+        return step.update(motions, state, batch, step=0, key=None)
 
     groups = np.random.default_rng(0).permutation(update.cameras).reshape(-1, most or len(update.cameras))
     motions, poses, ms = motions_of(update.start), [], []
@@ -201,7 +197,7 @@ METHODS = {
 @jitted
 def draw(batch: StreamBatch, pose: HandlePose):
     """The reference for times: the scene in all cameras at half the size."""
-    return render(posed(batch.canonical, batch.weights, pose), batch.now.frame.cameras, batch.plan).colors
+    return render(posed(batch.canonical, batch.weights, pose), batch.now.cameras, batch.plan).colors
 
 
 @cache

@@ -1,14 +1,11 @@
 """How much does the discovery of parts depend on cameras, the anchor frame, room for parts, and the seed?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import Options, canonical_of, discovered, with_parts
-from recordings import recorded
+from experiments.shared.discoveries import Options, canonical_of, discovered, with_parts
+from experiments.shared.recordings import recorded
 
 HELD_OUT = (3, 8)
 CAMERAS = {  # around the scene as evenly as may be

@@ -1,6 +1,5 @@
 """Do parts that are tracked in pictures and lifted stay parts? All methods begin with the same true masks."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -8,23 +7,23 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from discoveries import Options, canonical_of, pose_from, told_the_truth
 from jaxtyping import Bool, Float, Int
-from recordings import recorded
 from scipy.ndimage import map_coordinates
 from trimesh.registration import procrustes
 
+from experiments.shared.discoveries import Options, canonical_of, pose_from, told_the_truth
+from experiments.shared.recordings import recorded
 from gsjax.data import Sequence
+from gsjax.engine.drive import drive
 from gsjax.engine.recording import open_recording
 from gsjax.geometry.cameras import project
 from gsjax.geometry.flow import seen_in_both
 from gsjax.io.ply import read_ply
-from gsjax.methods.parts import PartsConfig, Start, first_parts, follow
+from gsjax.methods.parts import Parts, PartsConfig, Start
+from gsjax.methods.parts.discovery import closed, weights_of_run
 from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.compiler import host_options
 from gsjax.perception.optical_flow import DisFlow
@@ -101,16 +100,20 @@ def points_lifted(given: Problem) -> Tracked:
 
 def followed(given: Problem) -> Tracked:
     """As `gsjax parts` does, but for the masks; the parts stay those that masks tell of."""
-    config = replace(PartsConfig(), unify=replace(PartsConfig().unify, every=0))
-    parts = first_parts(given.start, given.sequence.num_frames, config)
-    for update in follow(given.sequence, given.start, parts, config):
-        parts = update.parts
+    usual = PartsConfig()
+    unify, refine = replace(usual.unify, every=0), replace(usual.refine, iterations=0)
+    config = replace(usual, unify=unify, refine=refine)
+    method = Parts(config)
+    problem, run = method.start(given.sequence, given.start)
+    *_, now = drive(method, problem, run, headroom=config.headroom)
+    run = closed(now.run, config)
+    parts = run.kept
     rotations, offsets = jax.vmap(partial(rigid_motions, parts.canonical.centers))(
         HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))
     )
     motions = np.broadcast_to(np.eye(4), given.motions.shape).copy()
     motions[..., :3, :3], motions[..., :3, 3] = rotations, offsets
-    return Tracked(_masks(given, motions, parts.weights), motions)
+    return Tracked(_masks(given, motions, weights_of_run(run)), motions)
 
 
 def _tracks(

@@ -1,14 +1,11 @@
 """What does the streaming step buy for its time: steps, size of pictures, Gaussians, cameras?"""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from discoveries import FIT, Options, canonical_of, discovered, with_parts
-from recordings import recorded
+from experiments.shared.discoveries import FIT, Options, canonical_of, discovered, with_parts
+from experiments.shared.recordings import recorded
 
 HELD_OUT = (3, 8)
 SETTINGS: dict[str, dict[str, Any]] = {

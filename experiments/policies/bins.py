@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import robosuite
-from panda import CLOSED, OPEN, Arm, Cameras, body_pose, set_body
+
+from experiments.shared.panda import CLOSED, OPEN, Arm, Cameras, body_pose, set_body
 
 VIEWS = [((0.8, -0.45, 1.4), (0.1, -0.12, 0.86)), ((0.8, 0.45, 1.4), (0.1, 0.16, 0.88))]
 WIDTH, HEIGHT, FOVY = 320, 240, 34.0

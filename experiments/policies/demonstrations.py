@@ -1,4 +1,4 @@
-"""Records demonstrations into runs/policies: `MUJOCO_GL=egl python experiments/policies/demonstrations.py`.
+"""Records demonstrations into runs/policies: `MUJOCO_GL=egl python -m experiments.policies.demonstrations`.
 
 Only those that succeed are kept. Each file holds what any of the policies may see, so that all learn from the
 same: images, the can's true poses, what the tracker makes of the depth images, proprioception and actions.
@@ -7,12 +7,10 @@ same: images, the can's true poses, what the tracker makes of the depth images, 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with a robot share
-
 import numpy as np
-from bins import HORIZON, NOISE, STEP, Bins, Script
-from sight import Tracking, small
 
+from experiments.policies.bins import HORIZON, NOISE, STEP, Bins, Script
+from experiments.policies.sight import Tracking, small
 from gsjax.io.atomic import write_json
 
 HOME = Path(__file__).resolve().parents[2] / "runs" / "policies"

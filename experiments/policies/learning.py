@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Key
-from sight import described
+
+from experiments.policies.sight import described
 
 Seen = Literal["tracked Gaussians", "images", "true poses"]
 CHUNK = 4  # actions predicted at a time, and carried out before the next look

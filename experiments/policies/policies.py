@@ -1,18 +1,16 @@
 """Behaviour cloning on what the tracker says of an object, beside images and the truth."""
 
 import json
-import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with a robot share
-
 import numpy as np
-from bins import HORIZON, Bins
-from demonstrations import HOME
-from learning import CHUNK, act, trained, vector_of
-from sight import Tracking, small
+
+from experiments.policies.bins import HORIZON, Bins
+from experiments.policies.demonstrations import HOME
+from experiments.policies.learning import CHUNK, act, trained, vector_of
+from experiments.policies.sight import Tracking, small
 
 
 @cache
@@ -55,6 +53,6 @@ def run(options: dict[str, Any], seed: int, folder: Path) -> dict[str, Any]:
 
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """How often each policy succeeds."""
-    from plots import draw_policies
+    from experiments.shared.plots import draw_policies
 
     draw_policies(rows, path)

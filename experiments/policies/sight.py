@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from bins import CAN, Bins
-from panda import as_frame, fed, motion_between, start
 
 import gsjax
+from experiments.policies.bins import CAN, Bins
+from experiments.shared.panda import as_frame, fed, motion_between, start
 from gsjax.methods.track import PRESETS
 from gsjax.scene.frame import Frame
 

@@ -1,18 +1,14 @@
 """The scenes that the knobs are tried on: one simulated, two real."""
 
-import sys
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.geometry.spherical_harmonics import SH_C0
-
-sys.path.append(str(Path(__file__).resolve().parents[3]))  # the checkout, which a console script does not see
 from benchmarks import workloads
+from gsjax.geometry.spherical_harmonics import SH_C0
 
 
 class Scene(NamedTuple):

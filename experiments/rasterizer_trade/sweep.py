@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from knobs import Variant, middle, variant_of
-from pareto import SAME
-from pareto import figure as figure  # beside this file; the runner looks for it here
-from scenes import Scene, load
 
 import gsjax
+from experiments.rasterizer_trade.knobs import Variant, middle, variant_of
+from experiments.rasterizer_trade.pareto import SAME
+from experiments.rasterizer_trade.pareto import figure as figure  # the runner looks for it here
+from experiments.rasterizer_trade.scenes import Scene, load
 from gsjax.metrics.image import psnr
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import Plan

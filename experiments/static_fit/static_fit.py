@@ -1,17 +1,13 @@
 """How well are held-out views of a static scene seen, minute by minute?"""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments share
-
-from recordings import recorded
-
-from gsjax.cli.fit import Options
-from gsjax.cli.fit import run as run_fit
+from experiments.shared.recordings import recorded
 from gsjax.data import ReadOptions
+from gsjax.engine.fit.run import Options
+from gsjax.engine.fit.run import run as run_fit
 from gsjax.engine.machine import resident_mb
 from gsjax.methods.fit import FitConfig
 

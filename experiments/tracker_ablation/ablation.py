@@ -4,16 +4,13 @@
 of which every third frame is taken, so that objects move far from one to the next.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
-
 import numpy as np
-from recordings import recorded, scored, started, tracked
 
+from experiments.shared.recordings import recorded, scored, started, tracked
 from gsjax.methods.track import PRESETS, TrackConfig
 
 RECORDINGS = {  # with the frames that are taken
@@ -65,7 +62,8 @@ PANELS = (
 def figure(rows: list[dict[str, Any]], path: Path) -> None:
     """A row of panels for each recording, a bar for each variant."""
     from matplotlib.figure import Figure
-    from plots import draw_variants
+
+    from experiments.shared.plots import draw_variants
 
     recordings = list(dict.fromkeys(row["recording"] for row in rows))
     drawing = Figure(figsize=(16, 0.8 + 3.2 * len(recordings)), dpi=100, layout="constrained")

@@ -1,18 +1,15 @@
 """Update rate against accuracy, one knob of the tracker at a time around the preset `fast`."""
 
-import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what experiments with the tracker share
-
 import equinox as eqx
 import jax
 import numpy as np
-from recordings import Start, recorded, scored, started, tracked
 
+from experiments.shared.recordings import Start, recorded, scored, started, tracked
 from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track import PRESETS, TrackConfig
 

@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         with heard_interrupts():
-            from gsjax.cli.program import run_politely
+            from gsjax.engine.program import run_politely
 
             return run_politely(command, rest, COMMANDS[command])
     except KeyboardInterrupt:

@@ -10,12 +10,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation, warn_of_partial
+from gsjax.engine.deform.file import NAME, read_deformation, warn_of_partial
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import Common
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.deform import (
     QUESTIONS,
+    DeformResult,
     Question,
     SceneFacts,
     TemplatedAnswerer,
@@ -32,7 +33,7 @@ HELP = (
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax ask` is told."""
+    """Options of `gsjax ask`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax deform`."""
@@ -49,54 +50,54 @@ def run(options: Options) -> int:
         ValueError, OSError: there is no such run, it has no meaning, or the question cannot be answered.
     """
     path = options.run / NAME
-    stored = read_deformation(path)
-    if stored.meaning is None:
+    result = read_deformation(path)
+    if result.meaning is None:
         raise ValueError(
             f"{path}: expected a scene that knows what is what, found none; reconstruct it with two classes "
             "or more among the pixels that count (gsjax deform DATASET --tools draw), or with --features"
         )
-    if len(stored.names) < 2:
-        found = ", ".join(stored.names)
+    if len(result.names) < 2:
+        found = ", ".join(result.names)
         raise ValueError(f"{path}: expected two things or more to ask about, found {found} alone")
     console = Console(stderr=True, highlight=False)
     warn_of_partial(options.run, Notes(console))
     if options.question is None:
-        _list(stored)
+        _list(result)
         return 0
-    asked = parse_question(options.question, stored.names)
-    rows = rows_of(asked, stored.frame_ids.tolist())
-    with stage(console, f"looking at {_in_words(stored, rows)}"):
-        facts = facts_of_run(stored, rows)
+    asked = parse_question(options.question, result.names)
+    rows = rows_of(asked, result.timeline.frame_ids.tolist())
+    with stage(console, f"looking at {_in_words(result, rows)}"):
+        facts = facts_of_run(result, rows)
     answer = TemplatedAnswerer()(options.question, facts)
     if options.json:
-        told = {
+        found = {
             "question": options.question,
             "type": asked.kind,
             **answer._asdict(),
             "facts": _used(asked, facts),
         }
-        print(json.dumps(told, indent=1))
+        print(json.dumps(found, indent=1))
     else:
         print(answer.text)
     return 0
 
 
-def facts_of_run(stored: StoredDeformation, rows: list[int]) -> SceneFacts:
+def facts_of_run(result: DeformResult, rows: list[int]) -> SceneFacts:
     """Facts of some of a run's frames; of the first too, where its depth is the unit of lengths.
 
     Args:
-        stored: a scene with a meaning.
+        result: a scene with a meaning.
         rows: of its frames, 0 to T - 1.
     """
-    assert stored.meaning is not None
-    if not stored.metric and 0 not in rows:
+    assert result.meaning is not None
+    if not result.timeline.metric and 0 not in rows:
         rows = [0, *rows]
-    viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (stored.viewmats, stored.Ks))
-    cameras = Camera(viewmats, Ks, *stored.size, stored.near)
-    frames = stored.frame_ids[rows].tolist()
-    times = stored.times[rows]
-    told = (times, cameras, stored.meaning.codebook, stored.names, frames)
-    return scene_facts(stored.scene, stored.moving, *told, metric=stored.metric)
+    viewmats, Ks = (jnp.asarray(a[rows], jnp.float32) for a in (result.viewmats, result.timeline.Ks))
+    cameras = Camera(viewmats, Ks, *result.timeline.size, result.timeline.near)
+    frames = result.timeline.frame_ids[rows].tolist()
+    times = result.timeline.times[rows]
+    seen = (times, cameras, result.meaning.codebook, result.names, frames)
+    return scene_facts(result.scene, result.moving, *seen, metric=result.timeline.metric)
 
 
 def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
@@ -110,19 +111,19 @@ def _used(asked: Question, facts: SceneFacts) -> dict[str, Any]:
     }
 
 
-def _in_words(stored: StoredDeformation, rows: list[int]) -> str:
+def _in_words(result: DeformResult, rows: list[int]) -> str:
     """Which frames are looked at."""
-    frames = [str(stored.frame_ids[row]) for row in rows]
+    frames = [str(result.timeline.frame_ids[row]) for row in rows]
     if len(rows) == 1:
         return f"frame {frames[0]}"
     return "frames " + (f"{frames[0]} to {frames[-1]}" if len(rows) > 2 else " and ".join(frames))
 
 
-def _list(stored: StoredDeformation) -> None:
+def _list(result: DeformResult) -> None:
     """Prints what can be asked."""
     console = Console(highlight=False)
-    frames = stored.frame_ids
-    console.print(f"X and Y are of: [bold]{', '.join(stored.names)}[/]", soft_wrap=True)
+    frames = result.timeline.frame_ids
+    console.print(f"X and Y are of: [bold]{', '.join(result.names)}[/]", soft_wrap=True)
     console.print(f"F and G are frames: [bold]{frames.min()} to {frames.max()}[/]\n", soft_wrap=True)
     table = Table("type", "question", "answer", box=None, padding=(0, 3, 0, 0))
     for kind in QUESTIONS:

@@ -26,7 +26,7 @@ _UNNAMED = "ops"
 
 @dataclass(frozen=True)
 class Options(Common, Overwriting):
-    """What `gsjax edit` is told."""
+    """Options of `gsjax edit`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax parts`."""

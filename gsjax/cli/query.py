@@ -1,5 +1,5 @@
-"""`gsjax query`: what of a run a text means: an object of a tracked one, in every frame; where there is a
-field (`gsjax distill`), Gaussians; and of a deforming scene (`gsjax deform`), these over time."""
+"""`gsjax query`: find what a text means in a run: an object of a tracked run, in every frame; Gaussians where
+there is a field (`gsjax distill`); or Gaussians over time in a deforming scene (`gsjax deform`)."""
 
 import math
 from dataclasses import dataclass, fields
@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from gsjax.cli.program import USER_ERRORS
 from gsjax.engine.deform.file import NAME as DEFORMATION
 from gsjax.engine.deform.file import read_deformation, warn_of_partial
 from gsjax.engine.deform.query import DeformQuestion, answer_deformation
@@ -19,93 +18,93 @@ from gsjax.engine.distill.saved import Whereabouts, field_of, open_field_run, un
 from gsjax.engine.folder import expect_folder, is_run
 from gsjax.engine.messages import Notes, describe, stage
 from gsjax.engine.options import Common, ObjectText
+from gsjax.engine.program import USER_ERRORS
 from gsjax.engine.records import read_config, read_record
 from gsjax.engine.selected import Changes
 from gsjax.engine.track.query import ObjectQuery, ask_for_object
 
 HELP = (
-    ' Of a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; of whatever has '
-    "a field (`gsjax distill`) Gaussians, as in `gsjax query RUN/field can`; of a run of `gsjax deform` with "
-    "names Gaussians over time, as in `gsjax query RUN tool`, and without any text it says what everything "
-    "is. Where a tracked run has a field too, RUN/field asks that by text."
+    ' In a run of `gsjax track` a text means an object, as in `gsjax query RUN "red can"`; where there is a '
+    "field (`gsjax distill`) Gaussians, as in `gsjax query RUN/field can`; in a run of `gsjax deform` with "
+    "names Gaussians over time, as in `gsjax query RUN tool`, and without a text it labels everything. "
+    "Where a tracked run has a field too, RUN/field queries the field."
 )
 _COLOR = (1.0, 0.25, 0.6)
-_HIGHEST = 1.0  # of a score: a cosine is within -1 and 1, a share against negatives within 0 and 1
+_HIGHEST = 1.0  # highest score: a cosine is from -1 to 1, a share against negatives from 0 to 1
 _LISTED = 6  # photographs, at most
 
 
 @dataclass(frozen=True)
 class GaussianOptions:
-    """What only that has a use for which means Gaussians: a field, or a run of `gsjax deform`."""
+    """Options of queries for Gaussians: of a field, or of a run of `gsjax deform`."""
 
     point: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
-    """A pixel that shows what is looked for: of --camera, or of --frame."""
+    """A pixel of --camera, or of --frame, that shows what is looked for."""
     threshold: float | None = None
-    """Score above which a Gaussian is meant: a cosine (-1 to 1), or against negatives or other names a share
-    (0 to 1). Unless given, 1/2 against these; of a text of the closed vocabulary its own; else where the
-    scores part best into two kinds (Otsu)."""
+    """Score above which a Gaussian is selected: a cosine (-1 to 1), or against negatives or names a share
+    (0 to 1). Default: 1/2 against these; for a text of the closed vocabulary its own; else the threshold
+    that divides the scores best into two classes (Otsu)."""
     color: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B")] = None
-    """RGB, 0 to 1, of what was found in recolored.ply; pink unless given."""
+    """RGB, 0 to 1, of what was found in recolored.ply (default: pink)."""
     negatives: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TEXT [TEXT ...]")] = None
-    """What it is held against. A text is, of classes, against all others, of CLIP against "object", "things",
-    "stuff", "texture", unless given."""
+    """Negatives to compare with. Default for a text: all other classes; with CLIP "object", "things",
+    "stuff", "texture"."""
     move: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """By how much along each axis, in the scene's unit, what was found is moved in moved.ply; not written
-    unless given."""
+    """Shift along each axis, in the scene's unit, of what was found, for moved.ply (default: not written)."""
 
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """What only a field has a use for."""
+    """Options of queries of a field."""
 
     image: Path | None = None
-    """A picture of what is looked for; of one with an alpha channel what is opaque."""
+    """A picture of what is looked for; with an alpha channel, only its opaque part."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="PLY")] = None
-    """The file of its scene, where it is now. Found where it was, or beside the field, unless given."""
+    """The scene's file, where it is now (default: where it was, or beside the field)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The photographs, where they are now."""
 
 
 @dataclass(frozen=True)
 class DeformOptions:
-    """What only a run of `gsjax deform` has a use for."""
+    """Options of queries of a run of `gsjax deform`."""
 
     box: Annotated[str | None, tyro.conf.arg(metavar="X0,Y0,X1,Y1")] = None
     """A box, in pixels of --frame, that shows what is looked for."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """The frame in which --point or --box lies, and whose Gaussians are written; the first unless given."""
+    """The frame of --point or --box, whose Gaussians are written (default: the first)."""
     frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP[:STEP]")] = None
-    """Of which frames pictures are made, as Python slices them; the held-out ones unless given."""
+    """Frames to draw, as Python slices them (default: the held-out ones)."""
 
 
 @dataclass(frozen=True)
 class TrackOptions(ObjectText):
-    """What only a run of `gsjax track` has a use for."""
+    """Options of queries of a run of `gsjax track`."""
 
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax query` is told."""
+    """Options of `gsjax query`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax track` or `gsjax deform`; of any run with a field (`gsjax distill`); or that
     holds field.npz. The answer is written to query/ in it, in place of an earlier one."""
     text: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TEXT]")] = None
-    """What is looked for: "red can". Or say it by --image, --point or --box. Unless told any, a run of
-    `gsjax deform` says what everything is."""
+    """What is looked for: "red can". Or use --image, --point or --box. Without any of them, everything in a
+    run of `gsjax deform` is labelled."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """Camera (or photograph) to show it from, and in which a --point is. Of a tracked run the first held out
-    one, else the first; of a field all, unless given."""
+    """Camera (or photograph) to show it from, and of a --point. Default: for a tracked run the first held-out
+    one, else the first; for a field all."""
     weights: Path | None = None
-    """Folder of CLIP's weights, in the layout of Hugging Face; of what CLIP taught, where they are now."""
+    """Folder of CLIP's weights, in the layout of Hugging Face; for features of CLIP, where they are now."""
     gaussians: Annotated[GaussianOptions, tyro.conf.OmitArgPrefixes] = GaussianOptions()
-    """Of a field, or a run of `gsjax deform`."""
+    """For a field, or a run of `gsjax deform`."""
     field: Annotated[FieldOptions, tyro.conf.OmitArgPrefixes] = FieldOptions()
-    """Of a field alone."""
+    """For a field alone."""
     deform: Annotated[DeformOptions, tyro.conf.OmitArgPrefixes] = DeformOptions()
-    """Of a run of `gsjax deform` alone."""
+    """For a run of `gsjax deform` alone."""
     track: Annotated[TrackOptions, tyro.conf.OmitArgPrefixes] = TrackOptions()
-    """Of a run of `gsjax track` alone, where its objects are asked for and not its field."""
+    """For a run of `gsjax track` alone, when its objects are looked for and not its field."""
 
 
 def run(options: Options) -> int:
@@ -116,17 +115,15 @@ def run(options: Options) -> int:
     """
     expect_folder(options.run)
     console, field = Console(stderr=True, highlight=False), field_of(options.run)
-    # A tracked run answers over time, but not to what only fields can.
-    tracked, of_field = (
-        (options.run / "trajectory.npz").is_file(),
-        _first_given(options.gaussians, options.distill),
-    )
+    # A tracked run answers over time, but not the queries that need a field.
+    tracked = (options.run / "trajectory.npz").is_file()
+    needs_field = _first_given(options.gaussians, options.field) is not None
     try:
         if (options.run / DEFORMATION).is_file():
             return _ask_deformation(options, console)
         if (name := _first_given(options.deform)) is not None:
             raise ValueError(f"--{name}: is for a run of `gsjax deform`, which {options.run} is not")
-        if field is not None and not (tracked and of_field is None):
+        if field is not None and not (tracked and not needs_field):
             return _ask_field(options, field, console)
         if field is None and not tracked:
             _expect_track(options.run)
@@ -146,7 +143,7 @@ def _first_given(*groups: Any) -> str | None:
 
 
 def _expect_track(path: Path) -> None:
-    """Raises a ValueError where a run has no field (yet), and is none of `gsjax track` either."""
+    """Raises a ValueError where a run has no field (yet), and is not a run of `gsjax track` either."""
     unfinished = unfinished_field_of(path)
     if unfinished is not None:
         raise ValueError(
@@ -169,13 +166,13 @@ def _expect_track(path: Path) -> None:
 
 
 def _ask_field(options: Options, field: Path, console: Console) -> int:
-    """Answer by a field."""
+    """Query a field."""
     begun = perf_counter()
     question, changes = _question(options), _changes(options)
     folder = options.run / "query"
     with Notes(console) as notes:
         with stage(console, "reading the field"):
-            now = Whereabouts(options.distill.scene, options.distill.images, options.weights)
+            now = Whereabouts(options.field.scene, options.field.images, options.weights)
             found = open_field_run(field, notes, now)
         told = answer(found, question, changes, folder, notes, console)
     _print(question.words, found.unit, "photographs", told, perf_counter() - begun)
@@ -190,14 +187,14 @@ def _ask_deformation(options: Options, console: Console) -> int:
     question, changes = _question_of_deformation(options), _changes(options)
     with Notes(console) as notes:
         with stage(console, "reading the scene"):
-            stored = read_deformation(options.run / DEFORMATION)
+            result = read_deformation(options.run / DEFORMATION)
         warn_of_partial(options.run, notes)
-        told = answer_deformation(options.run, stored, question, changes, folder, notes, console)
+        told = answer_deformation(options.run, result, question, changes, folder, notes, console)
     if "classes" in told:
         found = ", ".join(f"{name}: {count:,}" for name, count in told["classes"].items())
         print(f"{'found':<10}{found} of {told['of']:,} Gaussians, in frame {told['frame']}")
     else:
-        _print(question.words, "m" if stored.metric else "", "frames", told, perf_counter() - begun)
+        _print(question.words, "m" if result.timeline.metric else "", "frames", told, perf_counter() - begun)
     print(f"query     {folder}: selection.npz, recolored.ply, frames/, masks/, video.mp4")
     return 0
 
@@ -225,7 +222,7 @@ def _print(words: str, unit: str, seen_in: str, told: dict[str, Any], seconds: f
 
 
 def _changes(options: Options) -> Changes:
-    """What is done with what was found, checked."""
+    """The changes to what was found, checked."""
     color, move = options.gaussians.color, options.gaussians.move
     if color is not None and any(not 0 <= value <= 1 for value in color):
         raise ValueError(f"--color: expected three numbers of 0 to 1, found {_spaced(color)}")
@@ -256,7 +253,7 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
         ValueError: more than one of text, point and box, or options that such a scene has no use for.
     """
     asked, deform = options.gaussians, options.deform
-    others = {"camera": options.camera, **vars(options.distill)}
+    others = {"camera": options.camera, **vars(options.field)}
     others |= {n: v for n, v in vars(options.track).items() if v != getattr(TrackOptions(), n)}
     if unused := [name for name, value in others.items() if value is not None]:
         name = unused[0].replace("_", "-")
@@ -273,13 +270,13 @@ def _question_of_deformation(options: Options) -> DeformQuestion:
 
 
 def _question(options: Options) -> Question:
-    """What is asked of a field, checked.
+    """The query of a field, checked.
 
     Raises:
-        ValueError: not one of text, --image and --point, or options that a field has no use for.
+        ValueError: not one of text, --image and --point, or options that do not apply to a field.
     """
-    asked, of_field = options.gaussians, options.distill
-    ways = [options.text is not None, of_field.image is not None, asked.point is not None]
+    asked, image = options.gaussians, options.field.image
+    ways = [options.text is not None, image is not None, asked.point is not None]
     if sum(ways) != 1:
         raise ValueError(
             f"expected one of TEXT, --image and --point, found {sum(ways) or 'none'}; "
@@ -297,8 +294,7 @@ def _question(options: Options) -> Question:
             f"--threshold: expected a finite number below {_HIGHEST:g}, which no score is above, found "
             f"{asked.threshold:g}"
         )
-    told = (of_field.image, point, options.camera, asked.negatives, asked.threshold)
-    return Question(options.text, *told)
+    return Question(options.text, image, point, options.camera, asked.negatives, asked.threshold)
 
 
 def _spaced(numbers: tuple[float, ...]) -> str:
@@ -311,7 +307,7 @@ def _asked(options: Options) -> ObjectQuery:
     Raises:
         ValueError: it cannot be asked of one.
     """
-    if (name := _first_given(options.gaussians, options.distill)) is not None:
+    if (name := _first_given(options.gaussians, options.field)) is not None:
         raise ValueError(
             f"--{name}: {options.run} has no field that could be asked so; gsjax distill {options.run} "
             "makes one"

@@ -83,6 +83,11 @@ class Notes:
             self._console.print(line, soft_wrap=not self._console.is_terminal)
 
     @property
+    def warnings(self) -> list[str]:
+        """The warnings, of each kind the first."""
+        return list(self._first.values())
+
+    @property
     def all(self) -> list[str]:
         """The notes, then the warnings; of many of one kind the first, with their number."""
         more = {kind: count - 1 for kind, count in self._counts.items()}

@@ -205,7 +205,13 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
 
 
 def save_run(folder: Path, run: Run, progress: Progress) -> None:
-    """Writes a checkpoint; the newest few are kept."""
+    """Writes a checkpoint; the newest few are kept.
+
+    Args:
+        folder: RUN/resume.
+        run: the newest run.
+        progress: how it has gone.
+    """
     save_checkpoint(_path(folder, run.step), run, progress.metadata())
     for old in _saved(folder)[:-KEPT]:
         old.unlink()
@@ -224,7 +230,8 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
         ValueError: it is made from something else.
     """
     wrong, damaged = None, []
-    for path in reversed(_saved(folder)):
+    # A version before saved to state.npz, which is refused rather than overlooked.
+    for path in reversed(_saved(folder) or sorted(folder.glob("state.npz"))):
         try:
             found, stored = load_checkpoint(path)
         except CheckpointError as error:
@@ -282,7 +289,8 @@ class _Display:
         self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, minutes: float | None
     ):
         self._console, self._schedule, self._progress = console, schedule, progress
-        self._ticks, self._minutes, self._at, self._line = ticks, minutes, 0.0, int(_LINES * self._share())
+        self._ticks, self._minutes, self._at = ticks, minutes, 0.0
+        self._line = int(_LINES * self._share())
         columns = (
             TextColumn(schedule.doing),
             BarColumn(),

@@ -8,11 +8,28 @@ is its `result`:
     now.result
 """
 
-from gsjax.data.photographs import Photographs
+from collections.abc import Sequence as Indices
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+
+from gsjax.data.photographs import Photographs, photographs_of
+from gsjax.data.sequence import Sequence
 from gsjax.engine.drive import Drive, Tick, drive
 from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
+from gsjax.methods.deform import Deform, DeformConfig
+from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig
+from gsjax.methods.parts import Parts, PartsConfig, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts.pictures import problem_of
+from gsjax.methods.protocols import Segmenter
+from gsjax.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsjax.engine.distill.choice import TeacherChoice
+else:
+    TeacherChoice = Any  # slow to import, as all that finds a teacher is
 
 
 def fit(
@@ -44,3 +61,149 @@ def fit(
     method = Fit(config, extra_losses)
     problem, run = method.start(frames, cloud, photographs.background)
     return drive(method, problem, run if after is None else after.run)
+
+
+def deform(
+    sequence: Sequence,
+    config: DeformConfig | None = None,
+    *,
+    teacher: "TeacherChoice | str | None" = None,
+    tools: Literal["leave-out", "draw"] = "leave-out",
+    tool_values: tuple[int, ...] = (),
+    first: int | None = None,
+    gaussians: Gaussians | None = None,
+    after: Tick | None = None,
+    extra_losses: ExtraLosses = (),
+) -> Drive:
+    """Reconstruct a scene that deforms, seen by one camera (SurstSplat, GaussianClin).
+
+    Args:
+        sequence: from `gsjax.open_sequence`; all frames of its first camera are learned from (`select`
+            chooses). Depth is the camera's own, else matched with the second camera's pictures, else the
+            scene begins on a plane.
+        config: how it is learned; the default settings unless given.
+        teacher: whose features are learned beside colours: "classes" of masks, "closed", a folder of feature
+            files, "none", or a `TeacherChoice` with weights and masks. By default classes, where there are
+            two or more among the pixels that count.
+        tools: whether tools, by the names of mask values, are left out ("leave-out") or drawn ("draw").
+        tool_values: mask values that are tools, whatever their names are.
+        first: index of the frame that the canonical scene is like (default: with classes the earliest that
+            shows most of them, else the first in which a pixel counts).
+        gaussians: canonical scene to begin with (default: made of depth).
+        after: a tick of an earlier reconstruction of the same sequence, to go on from.
+        extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
+
+    Returns:
+        ticks, whose `result` is a `DeformResult`: `at(time)` are the `Gaussians` at a time, 0 to 1, and
+        `query(text)` scores them.
+
+    Raises:
+        ValueError: as `gsjax.methods.deform.Deform.start`; the teacher does not fit the recording; or `first`
+            is not learned from.
+        DataError: a picture, depth or mask cannot be read.
+        FileNotFoundError: weights or feature files are not there.
+    """
+    from gsjax.engine.deform.start import start_from  # teachers are slow to import
+
+    method = Deform(DeformConfig() if config is None else config, extra_losses)
+    problem, run = start_from(method, sequence, teacher, tools, tool_values, first, gaussians)
+    return drive(method, problem, run if after is None else after.run)
+
+
+def distill(
+    scene: Gaussians,
+    photographs: Photographs,
+    teacher: Teacher | TeacherChoice | str = "auto",
+    config: DistillConfig | None = None,
+    *,
+    rasterize_mode: str = "classic",
+    after: Tick | None = None,
+) -> Drive:
+    """Distil a semantic field for a static scene, which answers queries in 3D (FD-3DGS).
+
+    Args:
+        scene: the Gaussians, from any fit; they do not change.
+        photographs: views of the scene, posed in its world; all of them teach (`select` chooses).
+        teacher: features of the photographs' pixels: "classes" of their masks, "closed" for colours and
+            outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
+            a `TeacherChoice` with weights of CLIP or SAM, or your own `Teacher` of the same photographs.
+            Outputs of encoders and segmenters are kept in the user's cache folder.
+        config: settings (default: the paper's).
+        rasterize_mode: "antialiased" for a scene that was fitted with it.
+        after: a tick of an earlier distillation of the same scene and photographs, to go on from.
+
+    Returns:
+        ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, `write(path)` makes a
+        field.npz for `gsjax query` and `gsjax view`.
+
+    Raises:
+        ValueError: the teacher does not fit the photographs, or as `gsjax.methods.distill.Distill.start`.
+        DataError: a photograph or its masks cannot be read.
+        FileNotFoundError: weights or feature files are not there.
+    """
+    from gsjax.engine.distill.teacher import teacher_for
+
+    method = Distill(DistillConfig() if config is None else config)
+    teacher, source = teacher_for(photographs, teacher)
+    cameras = [photographs.camera(i) for i in range(photographs.num)]
+    problem, run = method.start(scene, cameras, teacher, rasterize_mode, source=source)
+    return drive(method, problem, run if after is None else after.run)
+
+
+def parts(
+    sequence: Sequence,
+    config: PartsConfig | None = None,
+    *,
+    eval_cameras: Indices[int] = (),
+    anchor: int | None = None,
+    gaussians: Gaussians | None = None,
+    segmenter: Segmenter | None = None,
+    after: Tick | None = None,
+    extra_losses: ExtraLosses = (),
+) -> Drive:
+    """Find the parts of a moving scene by their motion, without annotation (MotionSplicer).
+
+    Args:
+        sequence: from `gsjax.open_sequence`, of synchronised cameras.
+        config: how; the default settings unless given.
+        eval_cameras: ids of cameras that are held out.
+        anchor: the canonical frame; by default the one that differs most from the others.
+        gaussians: the scene at `anchor`, which must then be given; by default it is fitted here, which takes
+            minutes.
+        segmenter: finds what belongs together in a picture; by default one that needs no weights.
+        after: a tick of an earlier discovery in the same sequence, to go on from.
+        extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
+
+    Returns:
+        ticks, whose `result` is a `PartsResult`: the scene with its parts, `weights`, `poses(t)`, `joints()`.
+
+    Raises:
+        ValueError: there are fewer than two cameras or frames, Gaussians are given without an anchor, or
+            nothing is found that moves.
+        DataError: a picture cannot be read.
+    """
+    from gsjax.engine.parts.start import FIT, without_needless
+    from gsjax.perception.segmenters import PieceSegmenter  # slow to import
+
+    method = Parts(PartsConfig() if config is None else config, extra_losses)
+    config, eval_cameras = method.config, tuple(eval_cameras)
+    tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
+    if after is not None:
+        return drive(method, problem_of(tracked), after.run, headroom=config.headroom)
+    if gaussians is not None and anchor is None:
+        raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
+    chosen = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, anchor)
+    discover = config.discover
+    moved = moved_pixels(
+        tracked.image, chosen, tracked.num_cameras, frames=discover.frames, threshold=discover.threshold
+    )
+    if gaussians is None:
+        photographs = photographs_of(tracked.select(frames=[chosen.frame]))
+        fitting = fit(photographs, FIT)
+        for _ in fitting:
+            pass
+        gaussians = without_needless(photographs, fitting.result, FIT)
+    segmenter, key = segmenter or PieceSegmenter(), jax.random.key(config.seed)
+    start = begin(tracked, gaussians, chosen, moved, config, segmenter, key)
+    problem, run = method.start(tracked, start)
+    return drive(method, problem, run, headroom=config.headroom)

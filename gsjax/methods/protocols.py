@@ -10,8 +10,38 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int, Num
 
+from gsjax.scene.frame import Frame
+
 if TYPE_CHECKING:
     from gsjax.methods.deform import Answer, SceneFacts
+
+
+@runtime_checkable
+class SequenceLike(Protocol):
+    """Synchronised cameras over time; `gsjax.data.Sequence` is one."""
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        ...
+
+    @property
+    def num_cameras(self) -> int:
+        """C."""
+        ...
+
+    @property
+    def times(self) -> Float[np.ndarray, "T"]:
+        """Seconds, increasing."""
+        ...
+
+    def image(self, t: int, c: int) -> np.ndarray:
+        """RGB of camera `c` in frame `t`, [H,W,3] uint8."""
+        ...
+
+    def frame(self, t: int) -> Frame:
+        """All cameras of frame `t` as arrays on the device."""
+        ...
 
 
 @runtime_checkable

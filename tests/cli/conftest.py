@@ -13,7 +13,6 @@ import pytest
 from gsjax.cli import main, track
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
-from gsjax.engine.distill.file import StoredField, write_field
 from gsjax.engine.distill.scene import SceneOptions
 from gsjax.engine.distill.source import Source
 from gsjax.engine.drive import Tick
@@ -21,7 +20,7 @@ from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.records import digest
 from gsjax.engine.track import loop
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
-from gsjax.methods.distill import FeatureField
+from gsjax.methods.distill import DistillResult, FeatureField
 from gsjax.methods.track import PLAN, Kept, Track, Tracked, first_pose, start_scene
 from gsjax.optim.method import Run
 from gsjax.scene.gaussians import Gaussians
@@ -149,5 +148,5 @@ def write_made_field(
     about = {"file": str(scene), "sha256": digest(scene), "num_gaussians": len(labels)}
     about["photographs"] = photographs
     folder.mkdir(parents=True, exist_ok=True)
-    write_field(folder / "field.npz", StoredField(field, None, source, about))
+    DistillResult(field, None, source, about).write(folder / "field.npz")
     return folder

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gsjax.cli import COMMANDS
-from gsjax.cli.program import parse_options
 from gsjax.engine.experiments.sweep import experiment_names
+from gsjax.engine.program import parse_options
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/**/*.md"))

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gsjax.cli import COMMANDS
-from gsjax.cli.program import parse_options
+from gsjax.engine.program import parse_options
 from tests.docs.blocks import (
     PAGES,
     ROOT,

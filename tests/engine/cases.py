@@ -6,9 +6,14 @@ from functools import cache
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsjax.data.simulated import tabletop
+from gsjax.methods.deform import Deform
+from gsjax.methods.distill import Distill, DistillConfig, teacher_of_objects
 from gsjax.methods.fit import Fit, FitConfig, StartConfig
+from gsjax.methods.parts import PartsConfig, RefineBatch, RefineParams
+from gsjax.methods.parts import step as parts_step
 from gsjax.methods.track import (
     PLAN,
     PRESETS,
@@ -21,12 +26,23 @@ from gsjax.methods.track import (
     start_scene,
 )
 from gsjax.methods.track import StartConfig as TrackStart
+from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.handles import at_rest
+from gsjax.scene.initialize import gaussians_from_points
 from gsjax.scene.render import plan_render
+from tests.methods.around import cameras_around
 from tests.methods.photographed_blobs import photographed_blobs
+from tests.methods.tissue import CONFIG, tissue
+from tests.methods.two_boxes import PARTS, batch_of, params_of, shifted, soft, two_boxes
 
 FIT = FitConfig(
     steps=40, cap=120, sh_degree=1, sh_every=20, coarse_until=0.3, start=StartConfig(count=100), seed=1
 )
+
+GRID = FeatureGridConfig(
+    levels=2, least_resolution=4, most_resolution=8, log2_entries=9, features=2, hidden=8
+)
+
 
 TRACK = replace(
     PRESETS["fast"],
@@ -61,6 +77,52 @@ def fit_step_case():
     return step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
 
 
+def deform_step_case():
+    """With deformation, features and a graph."""
+    frames, lesson = tissue()
+    method = Deform(replace(CONFIG, warmup=0, graph=replace(CONFIG.graph, after=0)))
+    problem, run = method.start(frames, lesson)
+    run = method.between(problem, run, 0.0)
+    batch, _ = method.batch(problem, run, 0.0)
+    sick = batch._replace(codebook=batch.codebook * jnp.nan)
+    return method.step, run.params, batch, sick, batch._replace(plan=replace(batch.plan, capacity=16))
+
+
+def distill_step_case():
+    """A distillation draws frozen views, so there is no plan that is too small."""
+    random = np.random.default_rng(0)
+    means, colors = random.uniform(-0.5, 0.5, (40, 3)), random.uniform(size=(40, 3))
+    scene = jax.tree.map(jnp.asarray, gaussians_from_points(means, colors))
+    thing = np.indices((24, 32)).sum(axis=0) // 8 % 3
+    teacher = teacher_of_objects([thing], [np.eye(3, 5, dtype=np.float32)])
+    method = Distill(
+        DistillConfig(iterations=20, channels=4, grid=GRID, contrast_after=0.1, contrast_patch=4)
+    )
+    _, run, batch = started(lambda: (method, *method.start(scene, cameras_around([0.3], 32, 24), teacher)))
+    sick = batch._replace(codebook=batch.codebook.at[0, 0].set(jnp.nan))
+    return method.step, run.params, batch, sick
+
+
+def stream_step_case():
+    """A frame of parts, with a picture of the past."""
+    batch, bodies = batch_of(two_boxes())
+    params = params_of(shifted(0.01), soft(bodies), bodies)
+    small = replace(batch.plan, capacity=16)
+    tight = batch._replace(plan=small, past_plan=small)
+    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan), tight
+
+
+def refine_step_case():
+    """All frames of parts together."""
+    given, _ = batch_of(two_boxes())
+    scene, rest = given.canonical, at_rest(PARTS)
+    poses = jax.tree.map(lambda a: jnp.stack([a, a]), rest)
+    params = RefineParams(scene.movable, scene.fixed, poses)
+    batch = RefineBatch(scene, given.weights, given.now, jnp.int32(1), jnp.int32(0), 0.0, given.plan)
+    tight = batch._replace(plan=replace(batch.plan, capacity=16))
+    return parts_step(PartsConfig()), params, batch, batch._replace(progress=jnp.nan), tight
+
+
 @cache
 def little_table():
     """Two frames of one camera, and the scene at the first."""
@@ -91,4 +153,12 @@ def features_case():
     return feature_distiller(), prior, batch, sick, batch._replace(plan=replace(plan, capacity=16))
 
 
-STEPS = {"fit": fit_step_case, "track": track_step_case, "features": features_case}
+STEPS = {
+    "fit": fit_step_case,
+    "distill": distill_step_case,
+    "deform": deform_step_case,
+    "parts, a frame": stream_step_case,
+    "parts, all frames": refine_step_case,
+    "track": track_step_case,
+    "features": features_case,
+}

@@ -1,4 +1,4 @@
-"""Boxes of Gaussians that move over a floor as told, seen by cameras around: a scene with nothing unknown."""
+"""Boxes of Gaussians that move over a floor in given ways, seen by cameras around: nothing is unknown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class Box:
 
 
 class MovingBoxes:
-    """What cameras see of boxes; as `gsjax.methods.parts.Views` wants it.
+    """What cameras see of boxes, 15 frames a second; a `gsjax.methods.protocols.SequenceLike`.
 
     Attributes:
         gaussians: at the canonical frame, the floor's first.
@@ -68,6 +68,7 @@ class MovingBoxes:
     def __init__(self, boxes: Sequence[Box], cameras: int = 3, seed: int = 0):
         self.boxes, self.num_cameras = tuple(boxes), cameras
         self.num_frames = len(boxes[0].turns)
+        self.times = np.arange(self.num_frames) / 15
         rng = np.random.default_rng(seed)
         side = np.arange(-0.3, 0.3, 1.5 * _SPACING)
         floor = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), -1).reshape(-1, 3)

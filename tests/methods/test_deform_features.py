@@ -1,4 +1,4 @@
-"""Features of a deforming scene: what a teacher and a graph ask of them, and what prompts find by them."""
+"""Features of a deforming scene: losses of a teacher and of a graph, and what prompts find by them."""
 
 from dataclasses import replace
 
@@ -20,12 +20,17 @@ from gsjax.methods.deform import (
 )
 from gsjax.scene.deformation import DeformationConfig, init_deformation
 from gsjax.scene.initialize import gaussians_from_points
-from tests.methods.tissue import CODES, CONFIG, tissue_looks
+from tests.methods.tissue import CODES, CONFIG, tissue
 
 
 @pytest.fixture(scope="module")
-def looks():
-    return tissue_looks()
+def frames():
+    return tissue()[0]
+
+
+@pytest.fixture(scope="module")
+def ids():
+    return tissue()[1].ids
 
 
 class TestFeatureLoss:
@@ -60,24 +65,24 @@ class TestFeatureLoss:
 
 
 @pytest.fixture(scope="module")
-def graphs(looks):
-    gaussians = start_gaussians(looks[:1], 0, 1.0)
+def graphs(frames, ids):
+    gaussians = start_gaussians(frames[:1], 0, 1.0)
     nodes = graph_nodes(gaussians.means, CONFIG.graph.nodes)
-    places = np.stack([np.asarray(gaussians.means)[nodes]] * len(looks))
+    places = np.stack([np.asarray(gaussians.means)[nodes]] * len(frames))
     return nodes, {
-        kind: frame_graphs(places, nodes, looks, CODES, replace(CONFIG.graph, kind=kind), 0.05)
+        kind: frame_graphs(places, nodes, frames, ids, CODES, replace(CONFIG.graph, kind=kind), 0.05)
         for kind in ("matching", "similarity")
     }
 
 
 class TestGraph:
-    def test_nodes_that_a_tool_hides_are_absent(self, graphs, looks):
+    def test_nodes_that_a_tool_hides_are_absent(self, graphs, frames, ids):
         nodes, found = graphs
         there = np.asarray(found["matching"][0].valid)
         assert there.any()
-        covered = [look._replace(counts=np.zeros_like(look.counts)) for look in looks]
-        places = np.zeros((len(looks), len(nodes), 3))
-        none = frame_graphs(places, nodes, covered, CODES, CONFIG.graph, 0.05)
+        covered = [replace(frame, masks=np.zeros_like(frame.masks)) for frame in frames]
+        places = np.zeros((len(frames), len(nodes), 3))
+        none = frame_graphs(places, nodes, covered, ids, CODES, CONFIG.graph, 0.05)
         assert not np.asarray(none[0].valid).any()
         features = jnp.ones((nodes.max() + 1, 4))
         assert all(value == 0 for value in graph_loss(features, none[0], CONFIG.graph).values())

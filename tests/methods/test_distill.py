@@ -1,26 +1,25 @@
 """A field learns what masks say, whichever way it is drawn, and answers in 3D what it is asked."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.engine.drive import drive
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill import (
+    Distill,
     DistillConfig,
-    DistillState,
     DistillWeightsConfig,
+    active_table,
     back_projected_cosines,
-    begin_distill,
-    carried,
-    compiled_step,
-    distill,
     distill_loss,
     features_of,
-    finished,
     frozen_views,
+    full_table,
     gaussian_cosines,
     init_field,
     label_votes,
@@ -31,12 +30,11 @@ from gsjax.methods.distill import (
     pixel_mask,
     pseudo_inverse,
     relevancy,
+    rendered_features,
     selection_mask,
     teacher_of_maps,
     teacher_of_objects,
     threshold_for,
-    used_part,
-    whole,
 )
 from gsjax.rasterize.frozen import paint, paint_shown
 from gsjax.scene.feature_grid import FeatureGridConfig, locate
@@ -81,14 +79,19 @@ def two_balls():
 @pytest.fixture(scope="module")
 def problem(two_balls):
     scene, _, masks = two_balls
-    return begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), QUICK)
+    return Distill(QUICK).start(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8))
 
 
 @pytest.fixture(scope="module")
-def learned(problem):
-    told, state = problem
-    *_, last = distill(told, jax.tree.map(copied, state))
-    return last.state.field
+def result(problem):
+    told, run = problem
+    *_, last = drive(Distill(QUICK), told, jax.tree.map(copied, run))
+    return last.result
+
+
+@pytest.fixture(scope="module")
+def learned(result):
+    return result.field
 
 
 def copied(leaf):
@@ -97,14 +100,14 @@ def copied(leaf):
 
 
 def test_what_is_rendered_of_the_hidden_layer_is_what_features_render_as(problem):
-    told, state = problem
+    told, run = problem
     batch = told.views[0]
-    parts = carried(state.field, batch.located)
+    parts = rendered_features(run.params, batch.located)
     image, alphas = paint(batch.view, parts.values, batch.plan)
-    some = carried(state.field, batch.located, batch.view.rows)
+    some = rendered_features(run.params, batch.located, batch.view.rows)
     np.testing.assert_array_equal(paint_shown(batch.view, some.values, batch.plan)[0], image)
     of_hidden = parts.channels_of(parts.joined(image, alphas))
-    of_features, _ = paint(batch.view, features_of(state.field, batch.located), batch.plan)
+    of_features, _ = paint(batch.view, features_of(run.params, batch.located), batch.plan)
     assert parts.values.shape[1] == 16 != of_features.shape[-1]
     np.testing.assert_allclose(of_hidden, of_features, atol=1e-5)
 
@@ -119,11 +122,11 @@ def test_strips_change_neither_the_loss_nor_its_slope(two_balls, teacher):
     found = []
     for megabytes in (256.0, 0.1):
         config = replace(QUICK, strip_megabytes=megabytes, contrast_after=0.0)
-        told, state = begin_distill(scene, cameras(8), said, config)
+        told, run = Distill(config).start(scene, cameras(8), said)
         rows = told.views[0].plan.tiles_y
         value = jax.value_and_grad(distill_loss(config), has_aux=True)
         found.append(
-            jax.jit(value, static_argnames="step")(state.field, told.views[0], step=0, key=jax.random.key(0))
+            jax.jit(value, static_argnames="step")(run.params, told.views[0], step=0, key=jax.random.key(0))
         )
     assert rows == 5  # which 0.1 MiB do not hold: 28 numbers and more of 384 pixels a row
     ((one, aux), slope), ((other, other_aux), other_slope) = found
@@ -139,9 +142,9 @@ def test_the_slope_of_the_whole_loss_is_that_of_central_differences(two_balls):
     scene, _, masks = two_balls
     scene = jax.tree.map(lambda a: a.astype(jnp.float64), scene)
     config = replace(QUICK, contrast_after=0.0)
-    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
+    told, run = Distill(config).start(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8))
     batch = jax.tree.map(lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, told.views[0])
-    field = jax.tree.map(lambda a: a.astype(jnp.float64), state.field)
+    field = jax.tree.map(lambda a: a.astype(jnp.float64), run.params)
     field = jax.tree.map(
         lambda a: a + 0.1 * jnp.asarray(np.random.default_rng(1).normal(size=a.shape)), field
     )
@@ -161,10 +164,10 @@ def test_the_slope_of_the_whole_loss_is_that_of_central_differences(two_balls):
 def test_only_the_entries_that_are_used_train_and_the_whole_grid_says_the_same(two_balls):
     scene, *_ = two_balls
     field, located = init_field(jax.random.key(0), QUICK, scene.means, DIMENSION)
-    small, near, rows = used_part(field, located)
+    small, near, rows = active_table(field, located)
     assert small.encoding.table.shape[0] < field.encoding.table.shape[0]
     np.testing.assert_array_equal(features_of(small, near), features_of(field, located))
-    again = whole(small, rows)
+    again = full_table(small, rows)
     np.testing.assert_array_equal(
         features_of(again, locate(again.encoding, scene.means)), features_of(field, located)
     )
@@ -175,6 +178,27 @@ def test_it_learns_and_each_gaussian_answers_for_what_it_is(two_balls, learned, 
     cosines = np.asarray(gaussian_cosines(learned, problem[0].views[0].located, jnp.asarray(BOOK)))
     assert (cosines[:, 1:].argmax(1) + 1 == labels).mean() > 0.97
     assert np.median(cosines[np.arange(160), labels]) > 0.7
+
+
+def test_the_result_scores_its_gaussians_and_others(two_balls, result, problem):
+    scene, *_ = two_balls
+    vectors = BOOK[[2, 1]]
+    want = relevancy(gaussian_cosines(result.field, problem[0].views[0].located, jnp.asarray(vectors)))
+    np.testing.assert_allclose(result.scores(vectors), want, atol=1e-6)
+    assert result.features().shape == (160, 12)
+    some = replace(result, means=scene.means[::2])
+    np.testing.assert_allclose(some.scores(vectors), want[::2], atol=1e-6)
+    reader = SimpleNamespace(embed_text=lambda text: BOOK[int(text)])
+    np.testing.assert_array_equal(result.query("2", negatives=("1",), encoder=reader), result.scores(vectors))
+    np.testing.assert_array_equal(result.query("2", encoder=reader), result.scores(BOOK[2:]))
+    with pytest.raises(ValueError, match="encoder: expected one that reads texts"):
+        result.query("can")
+    with pytest.raises(
+        ValueError, match="expected a query of 24 numbers like this field's features, found 7"
+    ):
+        result.scores(BOOK[:, :7])
+    with pytest.raises(ValueError, match="means: expected the centres"):
+        replace(result, means=None).features()
 
 
 def test_2d_and_3d_agree_and_what_is_hidden_is_selected_whole(two_balls, learned, problem):
@@ -197,47 +221,25 @@ def test_2d_and_3d_agree_and_what_is_hidden_is_selected_whole(two_balls, learned
         assert (solid & ~true).sum() < 0.1 * true.sum() + 20
 
 
-def test_a_resumed_distillation_is_equal_to_the_bit(two_balls):
-    scene, _, masks = two_balls
-    config = replace(QUICK, iterations=8, contrast_after=0.5)
-    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
-    for now in distill(told, state):
-        if now.state.step == 3:
-            halfway = jax.tree.map(np.asarray, (now.state.field, now.state.optimizer))
-    again = DistillState(*jax.tree.map(jnp.asarray, halfway), 3)
-    *_, last = distill(told, again)
-    jax.tree.map(np.testing.assert_array_equal, last.state.field, now.state.field)
-
-
-def test_views_of_one_size_share_one_program(two_balls):
-    scene, _, masks = two_balls
-    config = replace(QUICK, iterations=9, contrast_after=0.5, seed=3)
-    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
-    assert sum(now.compile_seconds > 0 for now in distill(told, state)) == 1
-    assert compiled_step(config)._cache_size() == 1
-
-
 def test_poison_skips_the_step(problem):
-    told, state = problem
-    state = jax.tree.map(copied, state)
-    sick = DistillState(
-        jax.tree.map(lambda a: a.at[(0,) * a.ndim].set(jnp.nan), state.field), state.optimizer, 0
-    )
-    first = next(distill(told, sick))
+    told, run = problem
+    run = jax.tree.map(copied, run)
+    sick = run.having(params=jax.tree.map(lambda a: a.at[(0,) * a.ndim].set(jnp.nan), run.params))
+    first = next(drive(Distill(QUICK), told, sick))
     assert bool(first.info["skipped"])
-    assert np.isfinite(np.asarray(first.state.field.lift)[1:]).all()
+    assert np.isfinite(np.asarray(first.run.params.lift)[1:]).all()
 
 
 def test_a_vector_for_each_gaussian_learns_too_and_weights_of_zero_cost_nothing(two_balls):
     scene, labels, masks = two_balls
     config = replace(QUICK, encoding="table", weights=DistillWeightsConfig(contrast=0.0, tv=0.0))
-    told, state = begin_distill(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8), config)
-    *_, last = distill(told, state)
-    assert set(last.info) == {"rec", "cos", "loss", "skipped"}
-    cosines = np.asarray(gaussian_cosines(last.state.field, None, jnp.asarray(BOOK)))
+    told, run = Distill(config).start(scene, cameras(8), teacher_of_objects(masks, [BOOK] * 8))
+    *_, last = drive(Distill(config), told, run)
+    assert set(last.info) == {"rec", "cos", "loss", "skipped", "overflow", "needed"}
+    cosines = np.asarray(last.result.cosines(BOOK))
     seen = np.abs(cosines[np.arange(160), labels]) > 0.5
     assert seen.mean() > 0.5
-    assert finished(told, last.state) is last.state.field
+    assert full_table(last.result.field, last.result.rows) is last.run.params
 
 
 def test_ways_back_rank_gaussians_as_the_exact_one_does(learned, problem):
@@ -341,10 +343,10 @@ def test_a_teacher_of_other_views_is_refused(two_balls):
     scene, _, masks = two_balls
     teacher = teacher_of_objects(masks, [BOOK] * 8)
     with pytest.raises(ValueError, match="expected that of 3 views, found 8"):
-        begin_distill(scene, cameras(3), teacher, QUICK)
+        Distill(QUICK).start(scene, cameras(3), teacher)
     small = teacher_of_objects([mask[:-1] for mask in masks], [BOOK] * 8)
     with pytest.raises(ValueError, match="expected 48x36 pixels of view 0 like its camera, found 48x35"):
-        begin_distill(scene, cameras(8), small, QUICK)
+        Distill(QUICK).start(scene, cameras(8), small)
 
 
 @pytest.mark.parametrize(

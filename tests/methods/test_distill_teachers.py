@@ -8,15 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.engine.drive import drive
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill import (
+    Distill,
     DistillConfig,
     DistillWeightsConfig,
-    begin_distill,
-    distill,
     distill_loss,
     frozen_views,
-    gaussian_cosines,
     init_field,
     teacher_of_maps,
     teacher_of_objects,
@@ -69,8 +68,8 @@ def maps(seed: int = 0):
     return teacher_of_maps([random.normal(size=(9, 12, DIMENSION)) for _ in range(3)], [(HEIGHT, WIDTH)] * 3)
 
 
-def loss_of(config, state, batch, step=0):
-    return distill_loss(config)(state.field, batch, step=step, key=jax.random.key(0))
+def loss_of(config, run, batch, step=0):
+    return distill_loss(config)(run.params, batch, step=step, key=jax.random.key(0))
 
 
 def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
@@ -81,11 +80,12 @@ def test_a_view_keeps_what_it_shows_of_the_codebook_and_that_is_as_good(scene):
         assert book.shape == (4, DIMENSION)
         np.testing.assert_array_equal(ids < 0, teacher.ids[v] < 0)
         np.testing.assert_array_equal(book[ids[ids >= 0]], teacher.codebook[teacher.ids[v][ids >= 0]])
-    told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, contrast_after=0.0))
+    config = replace(QUICK, contrast_after=0.0)
+    told, run = Distill(config).start(scene, cameras(3), teacher)
     whole = told.views[1]._replace(ids=jnp.asarray(teacher.ids[1]), codebook=jnp.asarray(teacher.codebook))
     assert len(whole.codebook) == 6 > len(told.views[1].codebook) == 2
-    for name, value in loss_of(told.config, state, told.views[1])[1].items():
-        np.testing.assert_allclose(value, loss_of(told.config, state, whole)[1][name], rtol=1e-5)
+    for name, value in loss_of(config, run, told.views[1])[1].items():
+        np.testing.assert_allclose(value, loss_of(config, run, whole)[1][name], rtol=1e-5)
 
 
 def test_views_that_show_all_or_nothing_of_the_codebook_are_told_apart():
@@ -103,8 +103,8 @@ def test_two_teachers_are_the_mean_of_both_by_weight(scene, weight):
     weights = DistillWeightsConfig(map=weight, contrast=0.0, tv=0.0)
     config, both, found = replace(QUICK, weights=weights), with_maps(objects(), maps()), []
     for teacher in (objects(), maps(), both):
-        told, state = begin_distill(scene, cameras(3), teacher, config)
-        found.append(loss_of(config, state, told.views[0])[1])
+        told, run = Distill(config).start(scene, cameras(3), teacher)
+        found.append(loss_of(config, run, told.views[0])[1])
     of_objects, of_maps, of_both = found
     known = (HEIGHT - 4) * WIDTH
     share = weight * HEIGHT * WIDTH / (known + weight * HEIGHT * WIDTH)
@@ -125,13 +125,14 @@ def test_teachers_that_do_not_go_together_are_refused():
 
 
 def test_a_teacher_with_maps_of_other_views_is_refused(scene):
+    few = with_maps(objects(), maps())._replace(maps=maps().maps[:2])
     with pytest.raises(ValueError, match="teacher: expected maps of 3 views, found 2"):
-        begin_distill(scene, cameras(3), with_maps(objects(), maps())._replace(maps=maps().maps[:2]), QUICK)
+        Distill(QUICK).start(scene, cameras(3), few)
 
 
 @pytest.mark.parametrize("size", [(9, 12), (5, 7), (36, 48), (50, 70)])
 def test_maps_are_stretched_as_opencv_does(scene, size):
-    told, _ = begin_distill(scene, cameras(3), objects(), QUICK)
+    told, _ = Distill(QUICK).start(scene, cameras(3), objects())
     plan, said = told.views[0].plan, np.random.default_rng(2).normal(size=(*size, 3)).astype(np.float32)
     want = cv2.resize(said, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
     np.testing.assert_allclose(_stretched(jnp.asarray(said), 0, HEIGHT, plan), want, atol=1e-4)
@@ -143,8 +144,8 @@ def test_how_long_an_encoders_vectors_are_does_not_matter(scene):
     for factor in (1.0, 1e6, 1e-6):
         teacher = teacher_of_objects(objects().ids, [np.float32(factor) * BOOK] * 3)
         np.testing.assert_allclose(np.linalg.norm(teacher.codebook, axis=1).mean(), 1, rtol=1e-5)
-        told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, iterations=4))
-        *_, last = distill(told, state)
+        method = Distill(replace(QUICK, iterations=4))
+        *_, last = drive(method, *method.start(scene, cameras(3), teacher))
         found.append(float(last.info["loss"]))
     np.testing.assert_allclose(found, found[0], rtol=1e-3)
     long = teacher_of_maps([1e4 * one for one in maps().maps], [(HEIGHT, WIDTH)] * 3)
@@ -159,24 +160,25 @@ def test_maps_teach(scene):
         shares = np.asarray(paint(view, jax.nn.one_hot(labels, 3), plan)[0])
         said.append(BOOK[shares.argmax(-1)] + 0.0)
     teacher = teacher_of_maps(said, [(HEIGHT, WIDTH)] * 3)
-    told, state = begin_distill(scene, cameras(3), teacher, replace(QUICK, iterations=150))
-    *_, last = distill(told, state)
-    cosines = np.asarray(gaussian_cosines(last.state.field, told.views[0].located, jnp.asarray(BOOK[:3])))
+    method = Distill(replace(QUICK, iterations=150))
+    told, run = method.start(scene, cameras(3), teacher)
+    *_, last = drive(method, told, run)
+    cosines = np.asarray(last.result.cosines(BOOK[:3]))
     shown = np.unique(np.concatenate([view.view.rows for view in told.views]))
     assert (cosines.argmax(1) == labels)[shown].mean() > 0.85
 
 
 def test_the_contrast_counts_from_its_step_on(scene):
     config = replace(QUICK, iterations=10, contrast_after=0.5)
-    told, state = begin_distill(scene, cameras(3), objects(), config)
-    values = [float(loss_of(config, state, told.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
+    told, run = Distill(config).start(scene, cameras(3), objects())
+    values = [float(loss_of(config, run, told.views[0], step)[1]["contrast"]) for step in (0, 4, 5, 9)]
     assert values[:2] == [0, 0]
     assert values[2] == values[3] > 0
 
 
 def test_memory_of_what_a_view_says_is_counted(scene):
     config = replace(QUICK, strip_megabytes=0.4)
-    few, _ = begin_distill(scene, cameras(3), objects(), config)
+    few, _ = Distill(config).start(scene, cameras(3), objects())
     many = few.views[0]._replace(codebook=jnp.zeros((500, DIMENSION)))
     wide = few.views[0]._replace(map=np.zeros((9, 12, 512), np.float32))
     assert strip_rows(config, 16, few.views[0]) == few.views[0].plan.tiles_y
@@ -202,9 +204,9 @@ def test_slopes_by_either_teacher_are_those_of_central_differences(scene, megaby
         return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
 
     config = replace(QUICK, contrast_after=0.0, strip_megabytes=megabytes)
-    told, state = begin_distill(wide(scene), cameras(3), with_maps(objects(), maps()), config)
+    told, run = Distill(config).start(wide(scene), cameras(3), with_maps(objects(), maps()))
     batch, random = wide(told.views[0]), np.random.default_rng(1)
-    field = jax.tree.map(lambda a: a + 0.1 * jnp.asarray(random.normal(size=a.shape)), wide(state.field))
+    field = jax.tree.map(lambda a: a + 0.1 * jnp.asarray(random.normal(size=a.shape)), wide(run.params))
     along = jax.tree.map(lambda a: jnp.asarray(random.normal(size=a.shape)), field)
     loss = jax.jit(lambda f: distill_loss(config)(f, batch, step=0, key=jax.random.key(0))[0])
     want = sum(

@@ -1,5 +1,5 @@
-"""A loss of one's own beside a method's: it pulls where it should, by the right gradient, and costs nothing
-where there is none."""
+"""A custom loss beside a method's: it pulls where it should, by the right gradient, and costs nothing where
+there is none."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,32 +10,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.engine.drive import drive
 from gsjax.engine.track.tracking import track
 from gsjax.losses.extra import extra_terms
-from gsjax.methods.deform import (
-    DeformConfig,
-    Look,
-    begin_deform,
-    deform_loss,
-    reconstruct,
-    with_field,
-)
-from gsjax.methods.fit import Batch, FitConfig, StartConfig, begin, fit, fit_loss
-from gsjax.methods.fit.method import _observe
+from gsjax.methods.deform import Deform, DeformConfig, deform_loss, with_field
+from gsjax.methods.deform import batch_of as deform_batch_of
+from gsjax.methods.fit import Fit, FitConfig, StartConfig, fit_loss
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.refine import RefineBatch as PartsBatch
 from gsjax.methods.parts.refine import RefineParams, refine_step
-from gsjax.methods.parts.stream import StreamParams, skinning_weights, stream_loss
+from gsjax.methods.parts.stream import skinning_weights, stream_loss
 from gsjax.methods.track import AlignConfig
 from gsjax.methods.track.config import RefineConfig
 from gsjax.methods.track.motion import Motion
 from gsjax.methods.track.refine import refine, refine_loss
 from gsjax.scene.deformation import DeformationConfig
 from gsjax.scene.handles import at_rest
-from gsjax.scene.render import plan_render
 from tests.methods.ball_before_wall import batch_after
 from tests.methods.photographed_blobs import photographed_blobs
-from tests.methods.two_boxes import batch_of, shifted, soft, two_boxes
+from tests.methods.two_boxes import batch_of, params_of, shifted, soft, two_boxes
 
 FIT = FitConfig(steps=4, cap=60, sh_degree=0, coarse_until=0.0, start=StartConfig(count=50))
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
@@ -188,21 +181,26 @@ def test_the_tracker_is_pulled_and_compiles_once(table, started, config):
     assert heights[-1] < heights[0]
 
 
+def over_time(photographs):
+    """Photographs as if they had been taken one after the other."""
+    return [replace(frame, time=np.asarray(i / 7)) for i, frame in enumerate(photographs)]
+
+
 class TestOtherMethods:
     """The same function of three arguments beside the losses of a fit, of parts and of a deforming scene."""
 
     def test_of_a_fit(self, photographs):
-        _, state = begin(photographs, FIT)
-        seen = _observe(photographs[0], 0, 1, (False, True))
-        batch = Batch(seen, jnp.zeros((1, 3)), plan_render(state.gaussians, seen.camera))
-        added = slope_added(lambda extra: fit_loss(FIT, 1.0, extra), state.model, batch)
-        np.testing.assert_allclose(added.gaussians.means, uphill(state.gaussians.means), atol=1e-4)
+        method = Fit(FIT)
+        problem, run = method.start(photographs)
+        batch, _ = method.batch(problem, method.between(problem, run, 0.0), 0.0)
+        added = slope_added(lambda extra: fit_loss(FIT, extra), run.params, batch)
+        np.testing.assert_allclose(added.gaussians.means, uphill(run.params.gaussians.means), atol=1e-4)
         assert not np.any(added.gaussians.sh0)
 
     @pytest.mark.slow
     def test_of_parts(self, pictures):
         batch, bodies = batch_of(pictures)
-        params = StreamParams(shifted(0.01), soft(bodies))
+        params = params_of(shifted(0.01), soft(bodies), bodies)
         added = slope_added(lambda extra: stream_loss(StreamConfig(), extra), params, batch)
         share = np.asarray(skinning_weights(params.field, batch.canonical)).sum(0)
         share = share / (batch.canonical.movable.num + batch.canonical.fixed.num)
@@ -215,12 +213,12 @@ class TestOtherMethods:
         scene, config = batch.canonical, PartsConfig()
         poses = jax.tree.map(lambda a: jnp.stack([a, a]), at_rest(len(scene.alive)))
         params = RefineParams(scene.movable, scene.fixed, poses)
-        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), batch.plan)
+        given = PartsBatch(scene, batch.weights, batch.now, jnp.int32(1), jnp.int32(0), 0.0, batch.plan)
 
         @partial(jax.jit, static_argnums=0)
         def after(extra):
             step = refine_step(config, extra)
-            return step.update(params, step.init(params), given, step=0.0, key=None)
+            return step.update(params, step.init(params), given, step=0, key=None)
 
         (plain, _, _), (pulled, _, info) = after(()), after((height,))
         assert np.all(pulled.movable.means[:, 2] <= plain.movable.means[:, 2])
@@ -229,31 +227,28 @@ class TestOtherMethods:
 
     @pytest.mark.slow
     def test_of_a_deforming_scene(self, photographs):
-        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
         config = DeformConfig(start_pixels=2.0, deformation=TINY)
-        problem, state = begin_deform(looks, config)
-        batch = problem.batches[0]._replace(plan=problem.plan)
-        scene, *_ = with_field(problem, state.scene)
-        added = slope_added(lambda extra: deform_loss(config, problem.radius, extra), scene, batch)
+        problem, run = Deform(config).start(over_time(photographs))
+        scene, _ = with_field(config, problem, run.params)
+        added = slope_added(lambda extra: deform_loss(config, extra), scene, deform_batch_of(problem, run, 0))
         np.testing.assert_allclose(added.gaussians.means, uphill(scene.gaussians.means), atol=1e-4)
         assert np.any(added.field.layers[-1].weight)  # through the deformation
 
     def test_loops_hand_them_on_and_compile_once(self, photographs):
-        problem, state = begin(photographs, FIT)
-        calls = []
+        method, calls = Fit(FIT, (height,)), []
         CALLS.clear()
-        for fitted in fit(problem, state, share=lambda i: 0.5 + i / 8, extra_losses=(height,)):
+        for now in drive(method, *method.start(photographs), progress=lambda i: 0.5 + i / 8):
             calls.append(len(CALLS))
-            assert np.isfinite(fitted.info["extra"]["height"])
+            assert np.isfinite(now.info["extra"]["height"])
         assert len(calls) == 4
         assert calls[0] > 0
         assert calls == calls[:1] * 4
 
-        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
         config = DeformConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
-        for advanced in reconstruct(*begin_deform(looks, config), extra_losses=(height,)):
-            assert np.isfinite(advanced.info["extra"]["height"])
-        assert advanced.state.step == 2
+        method = Deform(config, (height,))
+        for now in drive(method, *method.start(over_time(photographs))):
+            assert np.isfinite(now.info["extra"]["height"])
+        assert now.step == 2
 
 
 class TestMistakes:
@@ -273,20 +268,16 @@ class TestMistakes:
             extra_terms(losses, None, None, None)
 
     @pytest.mark.usefixtures("as_users_run")
-    def test_a_list_is_refused_by_loops(self, table, started, config, photographs):
+    def test_a_list_is_refused_by_methods(self, table, started, config):
         _, frames, _ = table()
-        problem, state = begin(photographs, FIT)
-        surgical = DeformConfig(start_pixels=2.0, warmup=2, iterations=0, deformation=TINY)
-        looks = [Look(v.image, None, v.depth, v.viewmat, v.K, i / 7) for i, v in enumerate(photographs)]
         given = {"extra_losses": [nothing]}
-        loops = (
-            track(started, frames[0], frames[1:], config, **given),
-            fit(problem, state, **given),
-            reconstruct(*begin_deform(looks, surgical), **given),
-        )
-        for loop in loops:
+        for refuse in (
+            lambda: next(track(started, frames[0], frames[1:], config, **given)),
+            lambda: Fit(FIT, **given),
+            lambda: Deform(DeformConfig(), **given),
+        ):
             with pytest.raises(ValueError, match="extra_losses: expected a tuple of functions"):
-                next(loop)
+                refuse()
 
     def test_a_tracker_that_refines_nothing_has_no_use_for_one(self, table, started, config):
         _, frames, _ = table()

@@ -9,17 +9,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gsjax.engine.drive import drive
 from gsjax.methods.parts import (
     DiscoverConfig,
+    Parts,
     PartsConfig,
     RefineConfig,
+    RefineParams,
     begin,
     choose_anchor,
-    first_parts,
     moved_pixels,
-    refine,
+    refine_step,
 )
+from gsjax.methods.parts.pictures import problem_of
+from gsjax.optim.method import Run
 from gsjax.scene.feature_grid import FeatureGridConfig
+from gsjax.scene.handles import HandlePose
 from tests.methods.moving_boxes import Box, MovingBoxes, linear
 
 FRAMES = 3
@@ -44,55 +49,70 @@ def astray(boxes):
     moved = moved_pixels(boxes.image, found, boxes.num_cameras)
     masks = boxes.masks(boxes.bodies)
     start = begin(boxes, boxes.gaussians, found, moved, CONFIG, None, jax.random.key(0), masks)
-    parts = first_parts(start, FRAMES, CONFIG)
+    _, run = Parts(CONFIG).start(boxes, start)
     motions, center = boxes.boxes[0].motions(), np.asarray(start.canonical.centers)[1]
-    quats, translations = parts.quats.copy(), parts.translations.copy()
+    quats, translations = run.kept.quats.copy(), run.kept.translations.copy()
     quats[:, 1] = Rotation.from_matrix(motions[:, :3, :3]).as_quat(scalar_first=True)
     translations[:, 1] = motions[:, :3, :3] @ center + motions[:, :3, 3] - center
     translations[1:, 1, 0] += float(start.canonical.pixel)
     bright = eqx.tree_at(lambda g: g.sh0, start.canonical.fixed, start.canonical.fixed.sh0 + _BRIGHTER)
-    canonical = parts.canonical._replace(fixed=bright)
-    found = np.arange(FRAMES)
-    return parts._replace(canonical=canonical, quats=quats, translations=translations, found=found)
+    canonical = run.kept.canonical._replace(fixed=bright)
+    kept = run.kept._replace(
+        canonical=canonical, quats=quats, translations=translations, found=np.arange(FRAMES), frame=2
+    )
+    return run.having(kept=kept)
 
 
-def off_mm(boxes, parts):
+def refined(boxes, astray, config):
+    """Info and parameters of each step that refines the scene."""
+    method, problem, kept = Parts(config), problem_of(boxes), astray.kept
+    poses = HandlePose(jnp.asarray(kept.quats), jnp.asarray(kept.translations))
+    params = jax.tree.map(jnp.copy, RefineParams(kept.canonical.movable, kept.canonical.fixed, poses))
+    run = Run(params, refine_step(config).init(params), method.steps_of_frames(problem), kept=kept)
+    infos, after = [], []
+    for now in drive(method, problem, run):
+        infos.append(jax.device_get(now.info))
+        after.append(jax.device_get(now.run.params))
+    return infos, after
+
+
+def off_mm(boxes, astray, translations):
     """Of the box in each frame."""
-    center = np.asarray(parts.canonical.centers)[1]
+    center = np.asarray(astray.kept.canonical.centers)[1]
     motions = boxes.boxes[0].motions()
     true = motions[:, :3, :3] @ center + motions[:, :3, 3] - center
-    return 1000 * np.linalg.norm(parts.translations[:, 1] - true, axis=1)
+    return 1000 * np.linalg.norm(translations[:, 1] - true, axis=1)
 
 
 @pytest.mark.slow
 def test_colours_and_poses_come_back(boxes, astray):
-    steps = list(refine(boxes, astray, CONFIG))
-    losses = np.array([float(step.loss) for step in steps])
+    infos, after = refined(boxes, astray, CONFIG)
+    losses = np.array([info["loss"] for info in infos])
     assert len(losses) == 60
     assert losses[-9:].mean() < 0.6 * losses[:9].mean()
-    assert not any(bool(step.skipped) for step in steps)
-    parts = steps[-1].parts
-    assert off_mm(boxes, astray)[1:].min() > 14  # a pixel
-    assert off_mm(boxes, parts).max() < 6
-    np.testing.assert_array_equal(parts.quats[0], astray.quats[0])  # canonical is canonical
-    np.testing.assert_array_equal(parts.translations[0], 0)
-    np.testing.assert_array_equal(parts.translations[:, 0], 0)  # the background stands still
-    brighter = np.asarray(parts.canonical.fixed.sh0 - astray.canonical.fixed.sh0) + _BRIGHTER
+    assert not any(info["skipped"] for info in infos)
+    poses = after[-1].poses
+    assert off_mm(boxes, astray, astray.kept.translations)[1:].min() > 14  # a pixel
+    assert off_mm(boxes, astray, poses.translations).max() < 6
+    np.testing.assert_array_equal(poses.quats[0], astray.kept.quats[0])  # canonical is canonical
+    np.testing.assert_array_equal(poses.translations[0], 0)
+    np.testing.assert_array_equal(poses.translations[:, 0], 0)  # the background stands still
+    brighter = after[-1].fixed.sh0 - np.asarray(astray.kept.canonical.fixed.sh0) + _BRIGHTER
     assert abs(np.median(brighter)) < 0.8 * _BRIGHTER  # it falls by 0.0025 a step at most
 
 
-def test_the_same_again_to_the_bit_and_one_may_stop_after_any_step(boxes, astray):
-    config = replace(CONFIG, refine=RefineConfig(iterations=4))
-    once, again = ([step.parts for step in refine(boxes, astray, config)] for _ in range(2))
-    for step in (0, 3):
-        for a, b in zip(jax.tree.leaves(once[step]), jax.tree.leaves(again[step]), strict=True):
-            np.testing.assert_array_equal(a, b)
-    first = next(refine(boxes, astray, config)).parts
-    np.testing.assert_array_equal(first.canonical.fixed.sh0, once[0].canonical.fixed.sh0)
-
-
 def test_the_papers_scene_stays(boxes, astray):
-    assert list(refine(boxes, astray, replace(CONFIG, refine=RefineConfig(iterations=0)))) == []
+    assert refined(boxes, astray, replace(CONFIG, refine=RefineConfig(iterations=0))) == ([], [])
+
+
+def test_the_result_is_what_was_refined(boxes, astray):
+    config = replace(CONFIG, refine=RefineConfig(iterations=2))
+    run = astray.having(step=Parts(config).steps_of_frames(problem_of(boxes)))
+    *_, now = drive(Parts(config), problem_of(boxes), run)
+    moved = now.result.scene.gaussians.sh0[astray.kept.order]
+    movable, fixed, _ = now.run.params
+    np.testing.assert_array_equal(moved, jnp.concatenate([movable.sh0, fixed.sh0]))
+    assert now.result.done.all()
 
 
 def test_a_frame_of_nan_changes_nothing(boxes, astray):
@@ -101,12 +121,11 @@ def test_a_frame_of_nan_changes_nothing(boxes, astray):
             frame = super().frame(t)
             return frame if t != 1 else eqx.tree_at(lambda f: f.images, frame, frame.images * jnp.nan)
 
-    steps = list(refine(Broken(boxes.boxes), astray, replace(CONFIG, refine=RefineConfig(iterations=12))))
-    skipped = [bool(step.skipped) for step in steps]
-    assert 0 < sum(skipped) < 12
-    after = steps[-1].parts
-    np.testing.assert_array_equal(after.translations[1], astray.translations[1])
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+    config = replace(CONFIG, refine=RefineConfig(iterations=12))
+    infos, after = refined(Broken(boxes.boxes), astray, config)
+    assert 0 < sum(bool(info["skipped"]) for info in infos) < 12
+    np.testing.assert_array_equal(after[-1].poses.translations[1], astray.kept.translations[1])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after[-1]))
 
 
 def test_settings_without_meaning_are_refused():

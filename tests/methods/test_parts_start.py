@@ -16,7 +16,7 @@ from gsjax.methods.parts.masks import (
     propagated_masks,
 )
 from gsjax.methods.parts.stream import skinning_weights
-from gsjax.methods.parts.weights import new_field, saying, weights_of
+from gsjax.methods.parts.weights import fit_field_to_weights, new_field, weights_of
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.render import plan_render
 from tests.methods.moving_boxes import Box, MovingBoxes, linear
@@ -177,20 +177,20 @@ def test_votes_are_shares_of_pixels(boxes):
 
 
 @pytest.mark.parametrize("kind", ["grid", "table", "simplex"])
-def test_a_field_says_weights_of_living_parts_only(kind):
+def test_a_field_has_weights_of_living_parts_only(kind):
     rng = np.random.default_rng(0)
     means = jnp.asarray(rng.uniform(-1, 1, (200, 3)), jnp.float32)
     wanted = jax.nn.one_hot((means[:, 0] > 0).astype(int), 4)
     alive = jnp.array([True, True, False, False])
     config = PartsConfig(weights=kind, grid=FeatureGridConfig(4, 4, 16, 10, 2, 16))
     field, located = new_field(jax.random.key(0), config, means, 4)
-    field, losses = saying(field, located, wanted, alive, 60)
+    field, losses = fit_field_to_weights(field, located, wanted, alive, 60)
     if kind == "grid":
         assert losses[-1] < 0.1 * losses[0]
-    said = np.asarray(weights_of(field, located, alive))
-    np.testing.assert_allclose(said.sum(-1), 1, rtol=1e-5)
-    assert (said[:, 2:] == 0).all()
-    assert (said.argmax(-1) == np.asarray(wanted).argmax(-1)).mean() > 0.97
+    found = np.asarray(weights_of(field, located, alive))
+    np.testing.assert_allclose(found.sum(-1), 1, rtol=1e-5)
+    assert (found[:, 2:] == 0).all()
+    assert (found.argmax(-1) == np.asarray(wanted).argmax(-1)).mean() > 0.97
 
 
 def test_a_pixel_is_as_wide_as_depth_over_focal_length(boxes):

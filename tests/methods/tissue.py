@@ -1,12 +1,14 @@
-"""Looks at the built-in tissue, codes for what they show, and a scene that learns them within seconds."""
+"""Frames of the built-in tissue, codes for what they show, and a scene that learns them within seconds."""
 
 from functools import cache
 
 import numpy as np
 
 import gsjax
-from gsjax.methods.deform import DeformConfig, DeformRatesConfig, GraphConfig, Look
+from gsjax.geometry.cameras import Camera
+from gsjax.methods.deform import DeformConfig, DeformRatesConfig, GraphConfig, Lesson
 from gsjax.scene.deformation import DeformationConfig
+from gsjax.scene.frame import Frame
 
 CODES = np.eye(2, 4)
 TINY = DeformationConfig(resolution=16, time_resolution=6, levels=1, channels=4, hidden=16)
@@ -23,22 +25,35 @@ CONFIG = DeformConfig(
 
 
 @cache
-def tissue_looks():
+def tissue():
     """Every other frame of built-in tissue, tools left out, and what each pixel shows."""
     seen = gsjax.open_sequence("simulated:tissue?width=64&height=52&frames=10").select(range(0, 10, 2), (0,))
-    return [look._replace(ids=seen.mask(t, 0)) for t, look in enumerate(looks_of(seen))]
+    return frames_of(seen), Lesson([seen.mask(t, 0) for t in range(seen.num_frames)], CODES)
 
 
-def looks_of(seen):
+def frames_of(seen):
     """The first camera's, tools left out."""
+    last = seen.num_frames - 1
     return [
-        Look(
+        one_frame(
             seen.image(t, 0),
-            seen.mask(t, 0) == 0,
-            seen.depth(t, 0),
             seen.viewmats[t, 0],
             seen.Ks[t, 0],
-            t / (seen.num_frames - 1),
+            t / last,
+            seen.depth(t, 0),
+            seen.mask(t, 0) == 0,
         )
         for t in range(seen.num_frames)
     ]
+
+
+def one_frame(image, viewmat, K, time, depth=None, mask=None):
+    """What one camera saw, on the host."""
+    height, width = image.shape[:2]
+    return Frame(
+        image[None],
+        None if depth is None else depth[None],
+        Camera(viewmat[None], K[None], width, height),
+        None if mask is None else mask[None],
+        np.asarray(float(time)),
+    )

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.methods.parts.stream import Canonical, Seen, StreamBatch
+from gsjax.methods.parts.stream import Canonical, StreamBatch, StreamParams
 from gsjax.scene.feature_grid import locate
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose, at_rest
 from gsjax.scene.render import plan_render
@@ -52,11 +53,16 @@ def batch_of(boxes, dtype=jnp.float32, past=True):
     canonical, bodies = canonical_of(boxes, dtype=dtype)
     weights = jax.nn.one_hot(bodies, PARTS, dtype=dtype)
     frame = jax.tree.map(lambda a: jnp.asarray(a, dtype)[:1], boxes.frame(0))
-    seen = Seen(frame, jnp.ones(frame.images.shape[:3], bool))
+    seen = Frame(frame.images, frame.depths, frame.cameras, jnp.ones(frame.images.shape[:3], bool))
     plan = plan_render(boxes.gaussians, frame.cameras, headroom=3)
     rest = jax.tree.map(lambda a: a.astype(dtype), at_rest(PARTS))
     then = ((seen, rest),) if past else ()
-    return StreamBatch(canonical, seen, plan, weights, then, plan if past else None), bodies
+    return StreamBatch(canonical, seen, 0.0, plan, weights, then, plan if past else None), bodies
+
+
+def params_of(pose, field, bodies):
+    """What a step changes, for boxes whose movable Gaussians are of these bodies."""
+    return StreamParams(pose, field, jnp.zeros((len(bodies), 3)))
 
 
 def soft(bodies, sureness=2.0, dtype=jnp.float32):

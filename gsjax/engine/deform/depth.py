@@ -1,6 +1,6 @@
 """Where the depth comes from that `gsjax deform` begins with: the data, two eyes, or nowhere."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -10,43 +10,21 @@ from gsjax.engine.messages import Notes
 from gsjax.perception.stereo import stereo_depth
 
 Depth = Literal["auto", "data", "stereo", "plane"]
+DepthSource = Literal["data", "stereo", "plane"]
 
 
-@dataclass(frozen=True, eq=False)
-class Deep:
-    """A recording and its depth.
-
-    Attributes:
-        sequence: camera 0 has depth, unless `source` is "plane".
-        source: where it comes from.
-    """
-
-    sequence: Sequence
-    source: Literal["data", "stereo", "plane"]
-
-    @property
-    def metric(self) -> bool:
-        """Whether lengths are metres, as far as the data's are."""
-        return self.source != "plane"
-
-    @property
-    def found(self) -> dict[str, object]:
-        """What metrics.json says of it."""
-        return {"source": self.source, "metric": self.metric}
-
-
-def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> Deep:
-    """The recording with depth of camera 0: its own, else by matching it with camera 1, else none, and then
-    the scene begins on a plane, `plane` before the first camera.
+def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
+    """The recording with depth of camera 0, and where that is from: its own, else matched with camera 1, else
+    none, and then the scene begins on a plane. Lengths are metres, as far as the data's are, unless it does.
 
     Args:
         sequence: camera 0 is learned from.
-        wanted: what is told; "auto" takes the first of the three that there is.
-        plane: in the unit of the poses.
-        notes: told which it is.
+        wanted: which of them; "auto" takes the first of the three that there is.
+        plane: how far before the first camera the plane lies, in the unit of the poses.
+        notes: receives which it is.
 
     Raises:
-        ValueError: what is told is not there.
+        ValueError: depth of the kind that is wanted is not there.
     """
     two = sequence.num_cameras > 1
     if wanted == "data" and not sequence.has_depth:
@@ -60,13 +38,13 @@ def with_depth(sequence: Sequence, wanted: Depth, plane: float, notes: Notes) ->
             "one beside it, as EndoNeRF's folders have in right/ (docs/data.md)"
         )
     if wanted == "data" or (wanted == "auto" and sequence.has_depth):
-        return Deep(sequence, "data")
+        return sequence, "data"
     if wanted == "stereo" or (wanted == "auto" and two):
         return _of_two_eyes(sequence, notes)
     return _of_a_plane(sequence, plane, notes)
 
 
-def _of_two_eyes(sequence: Sequence, notes: Notes) -> Deep:
+def _of_two_eyes(sequence: Sequence, notes: Notes) -> tuple[Sequence, DepthSource]:
     def load(t: int, c: int) -> np.ndarray | None:
         if c != 0:
             return None
@@ -92,11 +70,11 @@ def _of_two_eyes(sequence: Sequence, notes: Notes) -> Deep:
         f"{covered:.0%} of the first frame's pixels): what is judged as depth is how far the scene is from "
         "what was matched, and the other camera has been seen in the frames that were learned from."
     )
-    return Deep(replace(sequence, load_depth=load), "stereo")
+    return replace(sequence, load_depth=load), "stereo"
 
 
-def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> Deep:
-    """Nothing that is known in metres is kept, as the scene's unit is another."""
+def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> tuple[Sequence, DepthSource]:
+    """Nothing that is known in metres is kept, as the scene has another unit."""
     notes.add(
         f"There is no depth: the scene began on a plane {plane:g} before the first camera. Its depth is of "
         "no metric unit, nothing but pictures teaches it, and it is not judged."
@@ -115,5 +93,5 @@ def _of_a_plane(sequence: Sequence, plane: float, notes: Notes) -> Deep:
             f"about how far with --deform.plane-depth (now {plane:g}), in the unit of the poses"
         )
     alone = sequence.select(cameras=[sequence.camera_ids[0]])
-    names = alone.names_of_labels  # some of which truth may have told
-    return Deep(replace(alone, load_depth=None, truth=None, label_names=names), "plane")
+    names = alone.names_of_labels  # some of which may be truth's
+    return replace(alone, load_depth=None, truth=None, label_names=names), "plane"

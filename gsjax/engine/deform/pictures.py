@@ -1,4 +1,4 @@
-"""Pictures of what a query means of a deforming scene: masks, the scene beside its edits, and a film."""
+"""Pictures of a query of a deforming scene: masks, the scene beside its edits, and a film."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,13 +11,12 @@ from jaxtyping import Array, Bool, Float
 from rich.console import Console
 from rich.progress import track
 
-from gsjax.engine.deform.file import StoredDeformation
-from gsjax.engine.deform.prompts import Wanted
 from gsjax.engine.pictures import frame_rate
 from gsjax.engine.selected import Changes
 from gsjax.geometry.cameras import Camera
 from gsjax.io.pictures import write_png
 from gsjax.io.video import VideoWriter
+from gsjax.methods.deform import DeformResult, Wanted
 from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
@@ -27,7 +26,7 @@ from gsjax.viz.colors import in_rows, overlay_labels, to_uint8
 
 _PANEL_HEIGHT = 240  # pixels, at least
 _OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
-_SAID = {"recolored": "recoloured", "moved": "moved"}
+_WORDS = {"recolored": "recoloured", "moved": "moved"}
 
 probabilities_of = jax.jit(prompt_probabilities)
 """`prompt_probabilities` of Gaussians or of a picture, compiled."""
@@ -57,7 +56,7 @@ class _Seen(NamedTuple):
 
 def draw(
     folder: Path,
-    stored: StoredDeformation,
+    result: DeformResult,
     pictured: Sequence[int],
     wanted: Wanted,
     threshold: float,
@@ -69,80 +68,85 @@ def draw(
 
     Args:
         folder: for them.
-        stored: the scene.
-        pictured: positions of the frames.
-        wanted: what is asked for.
+        result: the scene.
+        pictured: indices of the frames.
+        wanted: what is looked for.
         threshold: of the score of a Gaussian, and of a pixel.
-        changes: what else is done with what is meant.
-        console: shows how far it is.
+        changes: edits of what is meant.
+        console: shows progress.
 
     Returns:
-        How many pixels each mask has.
+        The number of pixels of each mask.
     """
     pixels: dict[str, int] = {}
-    with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, console):
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
             assert seen.gaussians.features is not None
             selected = wanted.scores(seen.gaussians.features) > threshold
-            both = {f"frame {stored.frame_ids[seen.t]}": to_uint8(seen.colors)}
+            both = {f"frame {result.timeline.frame_ids[seen.t]}": to_uint8(seen.colors)}
             both["without it"] = _picture(hidden(seen.gaussians, selected), seen)
             video.write(in_rows(both, 2, _PANEL_HEIGHT))
             if seen.t in pictured:
-                name = f"{stored.frame_ids[seen.t]:06d}"
+                name = f"{result.timeline.frame_ids[seen.t]:06d}"
                 mask = (np.asarray(wanted.scores(seen.features)) > threshold) & seen.there
                 write_png(folder / "masks" / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
                 pixels[name] = int(mask.sum())
                 scenes = {"it alone": hidden(seen.gaussians, ~selected)}
                 changed = changes.of(seen.gaussians, np.asarray(selected))
-                scenes |= {_SAID[edit]: scene for edit, scene in changed.items()}
+                scenes |= {_WORDS[edit]: scene for edit, scene in changed.items()}
                 panels = both | {words: _picture(scene, seen) for words, scene in scenes.items()}
                 write_png(folder / "frames" / f"{name}.png", in_rows(panels, 2, _PANEL_HEIGHT))
     return pixels
 
 
 def draw_labels(
-    folder: Path, stored: StoredDeformation, pictured: Sequence[int], console: Console
+    folder: Path, result: DeformResult, pictured: Sequence[int], console: Console
 ) -> dict[str, dict[str, float]]:
     """Writes label maps masks/FRAME.png and frames/FRAME.png of some frames, and video.mp4 of all: the scene
     beside what each pixel most likely is.
 
     Args:
         folder: for them.
-        stored: what a run learned.
-        pictured: frames, counted from 0.
-        console: shows how far it is.
+        result: of a run.
+        pictured: indices of the frames.
+        console: shows progress.
 
     Returns:
-        By frame, which share of the picture each name has.
+        By frame, the share of the picture that each name has.
     """
-    assert stored.meaning is not None
-    codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
+    assert result.meaning is not None
+    codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
     shares: dict[str, dict[str, float]] = {}
-    with VideoWriter(folder / "video.mp4", frame_rate(stored.times * stored.seconds)) as video:
-        for seen in _frames(stored, console):
-            said = np.asarray(probabilities_of(seen.features, codebook))
-            labels = np.where(seen.there, 1 + most_likely(said), 0)
+    with VideoWriter(folder / "video.mp4", _frame_rate(result)) as video:
+        for seen in _frames(result, console):
+            likely = np.asarray(probabilities_of(seen.features, codebook))
+            labels = np.where(seen.there, 1 + most_likely(likely), 0)
             colors = to_uint8(seen.colors)
             over = overlay_labels(colors, labels)
             panel = in_rows(
-                {f"frame {stored.frame_ids[seen.t]}": colors, "what is what": over}, 2, _PANEL_HEIGHT
+                {f"frame {result.timeline.frame_ids[seen.t]}": colors, "what is what": over}, 2, _PANEL_HEIGHT
             )
             video.write(panel)
             if seen.t in pictured:
-                name = f"{stored.frame_ids[seen.t]:06d}"
+                name = f"{result.timeline.frame_ids[seen.t]:06d}"
                 write_png(folder / "masks" / f"{name}.png", labels.astype(np.uint8))
                 write_png(folder / "frames" / f"{name}.png", panel)
                 shares[name] = {
-                    word: float((labels == label).mean()) for label, word in enumerate(stored.names, 1)
+                    word: float((labels == label).mean()) for label, word in enumerate(result.names, 1)
                 }
     return shares
 
 
-def _frames(stored: StoredDeformation, console: Console) -> Iterator[_Seen]:
+def _frame_rate(result: DeformResult) -> float:
+    """Pictures a second of a film of all frames."""
+    return frame_rate(result.timeline.times * result.timeline.seconds)
+
+
+def _frames(result: DeformResult, console: Console) -> Iterator[_Seen]:
     """All frames, one after the other."""
     plan = None
-    for t in track(range(len(stored.times)), "drawing", console=console, transient=True):
-        gaussians, camera = stored.at(stored.times[t]), stored.camera(t)
+    for t in track(range(len(result.timeline.times)), "drawing", console=console, transient=True):
+        gaussians, camera = result.at(result.timeline.times[t]), result.camera(t)
         drawn, plan = render_with_room(gaussians, camera, plan)
         assert drawn.features is not None
         there = np.asarray(drawn.alphas[0]) > _OPAQUE

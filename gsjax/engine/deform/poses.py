@@ -9,21 +9,22 @@ from gsjax.engine.deform.data import DeformData
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.io.atomic import write_npz
-from gsjax.methods.deform import DeformingScene, DeformProblem, refined_viewmats
+from gsjax.methods.deform import DeformingScene, Problem, refined_viewmats, times_of
 
 NAME = "poses.npz"
 """View matrices that were found, of all frames and cameras, in the folder of a run."""
 
 
 def as_refined(
-    folder: RunFolder, problem: DeformProblem, scene: DeformingScene, data: DeformData, notes: Notes
+    folder: RunFolder, problem: Problem, scene: DeformingScene, data: DeformData, notes: Notes
 ) -> tuple[DeformData, dict[str, Any] | None]:
-    """The data with poses as they were found, which are also written, and what metrics.json says of them; the
-    data themselves and None where poses stand as given."""
+    """The data with poses as they were found, which are also written, and the part of metrics.json on them;
+    the data themselves and None where poses stand as given."""
     if scene.twists is None:
         return data, None
     given = data.sequence.viewmats
-    found = refined_viewmats(given, data.times, scene.twists, problem.looks, problem.radius)
+    learned = times_of(problem.frames)
+    found = refined_viewmats(given, data.times, scene.twists, learned, problem.radius)
     sequence = replace(data.sequence, viewmats=found)
     arrays = {"viewmats": found, "frame_ids": sequence.frame_ids, "camera_ids": sequence.camera_ids}
     write_npz(folder.path / NAME, arrays)

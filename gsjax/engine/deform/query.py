@@ -3,6 +3,7 @@ them are, at every time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,15 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
 
-from gsjax.engine.deform.file import StoredDeformation
 from gsjax.engine.deform.pictures import draw, draw_labels, probabilities_of
-from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
 from gsjax.engine.folder import OF_QUERY, replaced_folder
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import parse_frames
 from gsjax.engine.selected import Changes, write_scenes, write_selection
 from gsjax.io.atomic import write_json, write_npz
 from gsjax.io.ply import write_ply
+from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
 from gsjax.methods.deform.query import most_likely, region_feature
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render_with_room
@@ -31,18 +31,18 @@ from gsjax.viz.viewer.drawing import recolored
 
 @dataclass(frozen=True)
 class DeformQuestion:
-    """What is asked of a deforming scene: one of text, point and box; without any, what everything is.
+    """A query of a deforming scene: one of text, point and box; without any, what everything is.
 
     Attributes:
-        text: one of the scene's names, or what the encoder of its features reads.
+        text: one of the scene's names, or a text for the encoder of its features.
         point: x, y in pixels of a frame, as the scene was learned.
         box: x0, y0, x1, y1, likewise.
-        frame: what the recording calls the frame in which point and box lie, and whose Gaussians are written;
-            the first unless given.
-        frames: of which pictures are made, as Python slices them; the held-out ones unless given.
-        threshold: of the score; by a rule unless given.
-        negatives: texts that a text is held against, where an encoder reads it; its own unless given.
-        weights: of CLIP, where they are now.
+        frame: the recording's number of the frame in which point and box lie, and whose Gaussians are written
+            (default: the first).
+        frames: those that pictures are made of, as a Python slice (default: the held-out ones).
+        threshold: of the score (default: by a rule).
+        negatives: texts that a text is held against, where an encoder reads it (default: the encoder's own).
+        weights: folder of CLIP's, where they are now.
     """
 
     text: str | None = None
@@ -61,7 +61,7 @@ class DeformQuestion:
 
     @property
     def words(self) -> str:
-        """What was asked, in short."""
+        """The query in short."""
         if self.point is not None:
             return "what is at {:g},{:g}".format(*self.point)
         if self.box is not None:
@@ -71,18 +71,18 @@ class DeformQuestion:
 
 def answer_deformation(
     path: Path,
-    stored: StoredDeformation,
+    result: DeformResult,
     question: DeformQuestion,
     changes: Changes,
     folder: Path,
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Ask, and write what is found into a folder; returns what query.json says.
+    """Answer a query and write what is found into a folder; returns the content of query.json.
 
         query/
-          query.json          what was asked, how many Gaussians are meant, where, how large; pixels by frame
-          selection.npz       as a field's, of the frame that was asked about (rows of the run's scene.ply)
+          query.json          the query; the Gaussians that are meant: count, place, size; pixels by frame
+          selection.npz       as a field's, of the frame in question (rows of the run's scene.ply)
           object.ply          what was found, in that frame; without.ply the scene without it, recolored.ply
                               with it in another colour, moved.ply with it elsewhere
           masks/FRAME.png     255 where a pixel's own features mean it
@@ -95,17 +95,17 @@ def answer_deformation(
 
     Args:
         path: of the run.
-        stored: what it learned.
+        result: its scene.
         question, changes, folder, notes, console: as for a field's `answer`.
 
     Raises:
         ValueError: the question cannot be understood, or means nothing of the scene.
         FileExistsError: something is in the folder that is no answer.
     """
-    t = _frame(stored, question.frame)
-    shown = sorted({t, *_pictured(stored, question)})
-    there = stored.at(stored.times[t])
-    if stored.meaning is None or there.features is None:
+    t = _frame(result, question.frame)
+    shown = sorted({t, *_pictured(result, question)})
+    there = result.at(result.timeline.times[t])
+    if result.meaning is None or there.features is None:
         raise ValueError(
             f"{path}: expected a scene that knows what is what in it, found none with features: there "
             "was one class among the pixels that counted; reconstruct it with --tools draw, or with "
@@ -115,20 +115,20 @@ def answer_deformation(
         "text": question.text,
         "point": question.point,
         "box": question.box,
-        "features": stored.meaning.source.kind,
-        "names": stored.names,
-        "frame": int(stored.frame_ids[t]),
+        "features": result.meaning.source.kind,
+        "names": result.names,
+        "frame": int(result.timeline.frame_ids[t]),
         "of": there.num,
     }
     if question.text is None and question.region is None:
-        codebook = jnp.asarray(stored.meaning.codebook, jnp.float32)
-        said, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
+        codebook = jnp.asarray(result.meaning.codebook, jnp.float32)
+        likely, about["query_seconds"] = _timed(lambda: probabilities_of(there.features, codebook))
         with replaced_folder(folder, OF_QUERY) as new:
-            found = _write_labels(new, stored, there, said)
-            told = about | found | {"shares": draw_labels(new, stored, shown, console), "notes": notes.all}
-            write_json(new / "query.json", told)
-        return told
-    wanted = wanted_of(stored, question, t, there)
+            found = _write_labels(new, result, there, likely)
+            answer = about | found | {"shares": draw_labels(new, result, shown, console), "notes": notes.all}
+            write_json(new / "query.json", answer)
+        return answer
+    wanted = wanted_of(result, question, t, there)
     scores, about["query_seconds"] = _timed(lambda: wanted.scores(there.features))
     threshold = wanted.threshold(scores, question.threshold)
     selected = scores > threshold.value
@@ -137,9 +137,9 @@ def answer_deformation(
         every, scenes = np.arange(there.num), changes.of(there, selected)
         write_selection(new / "selection.npz", there, selected, scores, every, there.num)
         write_scenes(new, there, selected, scenes)
-        pixels = draw(new, stored, shown, wanted, threshold.value, changes, console)
+        pixels = draw(new, result, shown, wanted, threshold.value, changes, console)
         means = np.asarray(there.means)[selected]
-        told = about | {
+        answer = about | {
             "meant": wanted.meant,
             "against": wanted.against,
             "threshold": threshold.value,
@@ -151,12 +151,12 @@ def answer_deformation(
             "pixels": pixels,
             "notes": notes.all,
         }
-        write_json(new / "query.json", told)
-    return told
+        write_json(new / "query.json", answer)
+    return answer
 
 
 def _timed(score: Callable[[], Float[jax.Array, "*n"]]) -> tuple[Float[np.ndarray, "*n"], float]:
-    """Scores, and the seconds that they took; what compiles is no answer's time."""
+    """Scores, and the seconds that they took, without compiling."""
     jax.block_until_ready(score())
     begun = perf_counter()
     return np.asarray(score()), perf_counter() - begun
@@ -170,7 +170,7 @@ def _check_count(
     frame: int,
     notes: Notes,
 ) -> None:
-    """Raises a ValueError where nothing is meant, and says where all is."""
+    """Raises a ValueError where nothing is meant, and warns where everything is."""
     if not selected.any():
         raise ValueError(
             f"{question.words} means nothing of this scene in frame {frame}: the best score is "
@@ -182,55 +182,55 @@ def _check_count(
 
 
 def _write_labels(
-    folder: Path, stored: StoredDeformation, there: Gaussians, said: Float[np.ndarray, "n k"]
+    folder: Path, result: DeformResult, there: Gaussians, likely: Float[np.ndarray, "n k"]
 ) -> dict[str, Any]:
-    """Writes what all Gaussians most likely are; returns how many are what, and in which colour they stand in
+    """Writes what all Gaussians most likely are; returns the number of each name, and its colour in
     recolored.ply."""
-    labels = 1 + most_likely(said)
-    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": said, "names": stored.names})
-    colors = {name: label_color(label) for label, name in enumerate(stored.names, 1)}
+    labels = 1 + most_likely(likely)
+    write_npz(folder / "selection.npz", {"labels": labels, "probabilities": likely, "names": result.names})
+    colors = {name: label_color(label) for label, name in enumerate(result.names, 1)}
     shades = np.array([INVALID, *colors.values()], np.float32) / 255
     write_ply(folder / "recolored.ply", recolored(there, shades[labels]), labels=labels)
-    counts = {name: int((labels == label).sum()) for label, name in enumerate(stored.names, 1)}
+    counts = {name: int((labels == label).sum()) for label, name in enumerate(result.names, 1)}
     return {"classes": counts, "colors": colors}
 
 
-def wanted_of(stored: StoredDeformation, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
-    """What a text, a point or a box is in the scene's channels.
+def wanted_of(result: DeformResult, question: DeformQuestion, t: int, there: Gaussians) -> Wanted:
+    """A text, a point or a box in the scene's channels.
 
     Args:
-        stored: what a run learned.
-        question: what is asked.
-        t: the frame that is asked about.
+        result: of a run.
+        question: the query.
+        t: index of the frame in question.
         there: the scene at that frame.
 
     Raises:
         ValueError: the text cannot be read, or nothing of the scene lies there.
         FileNotFoundError: weights are not there.
     """
-    assert stored.meaning is not None
+    assert result.meaning is not None
     if question.region is None:
         assert question.text is not None
-        source = stored.meaning.source
-        told = (question.negatives, lambda: source.encoder(question.weights))
-        return wanted_text(stored.meaning, question.text, *told)
-    drawn, _ = render_with_room(there, stored.camera(t))
+        source = result.meaning.source
+        encoder = partial(source.encoder, question.weights)
+        return wanted_text(result.meaning, question.text, question.negatives, encoder)
+    drawn, _ = render_with_room(there, result.camera(t))
     assert drawn.features is not None
     try:
         feature = region_feature(np.asarray(drawn.features[0]), np.asarray(drawn.alphas[0]), question.region)
     except ValueError as error:
         option = "--point" if question.box is None else "--box"
-        raise ValueError(f"{option}: {error} (frame {stored.frame_ids[t]})") from None
-    return wanted_like(stored.meaning, feature.astype(np.float64))
+        raise ValueError(f"{option}: {error} (frame {result.timeline.frame_ids[t]})") from None
+    return wanted_like(result.meaning, feature.astype(np.float64))
 
 
-def _frame(stored: StoredDeformation, frame: int | None) -> int:
-    """The position of a frame.
+def _frame(result: DeformResult, frame: int | None) -> int:
+    """The index of a frame.
 
     Raises:
-        ValueError: the run had none that is called so.
+        ValueError: the run had none of this number.
     """
-    known = stored.frame_ids.tolist()
+    known = result.timeline.frame_ids.tolist()
     if frame is None:
         return 0
     if frame not in known:
@@ -238,13 +238,13 @@ def _frame(stored: StoredDeformation, frame: int | None) -> int:
     return known.index(frame)
 
 
-def _pictured(stored: StoredDeformation, question: DeformQuestion) -> list[int]:
-    """Positions of the frames that pictures are made of."""
+def _pictured(result: DeformResult, question: DeformQuestion) -> list[int]:
+    """Indices of the frames that pictures are made of."""
     if question.frames is None:
-        return stored.held_out.tolist()
-    chosen = list(range(len(stored.times))[parse_frames(question.frames)])
+        return result.timeline.held_out.tolist()
+    chosen = list(range(len(result.timeline.times))[parse_frames(question.frames)])
     if not chosen:
         raise ValueError(
-            f"--frames: {question.frames} holds no frame of the run, which has {len(stored.times)}"
+            f"--frames: {question.frames} holds no frame of the run, which has {len(result.timeline.times)}"
         )
     return chosen

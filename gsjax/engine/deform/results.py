@@ -95,7 +95,7 @@ def _over_time(test: dict[str, Any]) -> list[Table]:
 
 
 def _of_classes(classes: list[dict[str, Any]], test: dict[str, Any]) -> list[Table]:
-    """How well what is drawn says what is what."""
+    """How well classes are told apart in what is drawn."""
     if not classes:
         return []
     keys = ("class", "iou", "dice")

@@ -1,7 +1,9 @@
-"""Scores of a deforming scene: held-out frames and their neighbours in time, the other eye, what is what in
-them, and tracks where truth has them."""
+"""Scores of a deforming scene: held-out frames and their neighbours in time, the other eye, classes, and
+tracks where truth has them."""
 
 from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -15,25 +17,25 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import peak_memory_mb
 from gsjax.engine.pictures import PANELS
 from gsjax.engine.scores import mean_scores
-from gsjax.geometry.cameras import Camera, pixels_of
+from gsjax.geometry.cameras import Camera, on_device, pixels_of
 from gsjax.io.pictures import write_png
 from gsjax.methods.deform import (
     DeformingScene,
-    DeformProblem,
-    DeformState,
-    Look,
+    DeformResult,
     Moving,
     counted_ids,
     on_grid,
+    prompt_probabilities,
 )
-from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.image import MS_SSIM_LEAST_SIDE, ms_ssim, psnr, ssim
 from gsjax.metrics.segmentation import IGNORED_LABEL, LabelOverlap
 from gsjax.metrics.temporal import temporal_scores
 from gsjax.metrics.tracking import carried_points
 from gsjax.perception.optical_flow import DisFlow
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import Plan, with_room
+from gsjax.rasterize.rasterization import Meta
+from gsjax.scene.frame import Frame
 from gsjax.scene.render import render
 from gsjax.viz.colors import in_rows, overlay_labels, to_uint8
 
@@ -44,49 +46,56 @@ _OF_FRAMES = ("psnr_masked", "ssim", "depth_mm", "psnr_other", "ms_ssim", "f_psn
 _OF_FRAMES += tuple(f"{name}{end}" for name in OVER_TIME for end in ("", "_true", "_gap"))
 _SHOWN = 8  # frames in the report
 _PANEL_HEIGHT = 200  # pixels, at least
-_TIMED = 12  # frames drawn to say how many a second
+_TIMED = 12  # frames drawn to measure how many a second
 _SEEN_WITHIN = 0.01  # of the depth: how far from what a pixel sees a tracked point may lie
-_HEADROOM = 1.3
 _LEAST_SIDE = 11  # of SSIM's window
 _LEAST_LONGER_SIDE = 12  # of DIS's patches
 
 
 def judge(
-    folder: RunFolder, problem: DeformProblem, state: DeformState, data: DeformData, tools: Tools
+    folder: RunFolder, result: DeformResult, plan: Plan, data: DeformData, tools: Tools
 ) -> dict[str, Any]:
-    """Scores of held-out frames, or of some that were learned from where none is, and pictures of them."""
+    """Scores of held-out frames, or of some that were learned from where none is, and pictures of them.
+
+    Args:
+        folder: of the run.
+        result: the scene.
+        plan: that frames were drawn with.
+        data: what it was learned from, with poses as they were refined.
+        tools: whether tools count.
+    """
     memory = peak_memory_mb()  # of learning, before anything is scored
-    plan, scene, moving = problem.plan_for(state), state.scene, state.moving
+    scene, moving = result.scene, result.moving
     which = data.test or data.train[:: max(1, len(data.train) // _SHOWN)][:_SHOWN]
     rows: list[dict[str, Any]] = []
     overlap = LabelOverlap()
     for t in which:
-        look = data.look(t, 0, tools)
-        drawn = draw(scene, moving, look, plan)
+        frame = data.frame(t, 0, tools)
+        drawn = draw(scene, moving, frame, plan)
         number = data.sequence.frame_ids[t]
         path = folder.path / "test" / f"{number:06d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, to_uint8(drawn.colors))
-        row = {"frame": number, **_of_frame(drawn, look), **_of_classes(drawn, look, data, t, overlap)}
+        row = {"frame": number, **_of_frame(drawn, frame), **_of_classes(drawn, frame, data, t, overlap)}
         neighbor = t + 1 if t + 1 < data.sequence.num_frames else t - 1
         if neighbor >= 0:
-            beside = data.look(neighbor, 0, tools)
-            pair = [(drawn.colors, look), (draw(scene, moving, beside, plan).colors, beside)]
+            beside = data.frame(neighbor, 0, tools)
+            pair = [(drawn.colors, frame), (draw(scene, moving, beside, plan).colors, beside)]
             row |= over_time(pair if neighbor > t else pair[::-1])
         if _other_counts(data, t, tools):
-            other = data.look(t, 1, tools)
+            other = data.frame(t, 1, tools)
             there = draw(scene, moving, other, plan).colors
-            row["psnr_other"] = psnr(there, other.image / 255.0, other.counts)
+            row["psnr_other"] = psnr(there, _photograph(other), _counted(other))
         if len(rows) < _SHOWN:
             panels = folder.render("held_out" if data.test else "learned", number)
-            write_png(panels, _panels(drawn, look, data))
+            write_png(panels, _panels(drawn, frame, data))
             row["picture"] = str(panels.relative_to(folder.path))
         rows.append(row)
     test = mean_scores(rows, _OF_FRAMES)
     test |= _means_of_classes(overlap, len(data.names))
     return {
         "judged_by": "held out" if data.test else "learned",
-        "test": test | {"fps": _fps(scene, moving, data.look(0, 0, tools), plan)},
+        "test": test | {"fps": _fps(scene, moving, data.frame(0, 0, tools), plan)},
         "tracks": _tracks(scene, moving, data, tools),
         "classes": _classes(overlap, data.names),
         "memory_mb": memory,
@@ -103,7 +112,7 @@ def _other_counts(data: DeformData, t: int, tools: Tools) -> bool:
 
 
 class Drawn(NamedTuple):
-    """A deforming scene where and when a look was.
+    """A deforming scene where and when a frame was seen.
 
     Attributes:
         colors: 0 to 1, on the host.
@@ -116,57 +125,71 @@ class Drawn(NamedTuple):
     features: Float[Array, "h w c"] | None
 
 
-def draw(scene: DeformingScene, moving: Moving, look: Look, plan: Plan) -> Drawn:
-    """The scene where and when a look was."""
-    height, width = look.image.shape[:2]
-    viewmat, K = (jnp.asarray(a, jnp.float32)[None] for a in (look.viewmat, look.K))
-    camera = Camera(viewmat, K, width, height, look.near)
-    while True:
-        time = jnp.asarray(look.time, jnp.float32)
-        colors, depths, features, overflow, needed = _drawn(scene, moving, time, camera, plan)
-        if not bool(overflow):  # views that nothing learned from may need a larger plan
-            return Drawn(np.asarray(colors), np.asarray(depths), features)
-        plan = plan.grown(int(needed), _HEADROOM)
+def draw(scene: DeformingScene, moving: Moving, frame: Frame, plan: Plan) -> Drawn:
+    """The scene where and when a frame of one camera was seen. Views that nothing was learned from may need a
+    larger plan, and get it."""
+    time = jnp.asarray(0.0 if frame.time is None else frame.time, jnp.float32)
+    (colors, depths, features), _ = with_room(
+        partial(_drawn, scene, moving, time, on_device(frame.cameras)), plan
+    )
+    return Drawn(np.asarray(colors), np.asarray(depths), features)
 
 
 @jax.jit
-def _drawn(scene: DeformingScene, moving: Moving, time, camera: Camera, plan: Plan):
+def _drawn(
+    scene: DeformingScene, moving: Moving, time: Float[Array, ""], camera: Camera, plan: Plan
+) -> tuple[tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w c"] | None], Meta]:
     got = render(scene.at(time, moving), camera, plan)
     colors, features = jnp.clip(got.colors[0], 0, 1), None if got.features is None else got.features[0]
-    return colors, got.depths[0], features, got.meta.overflow.any(), got.meta.needed.max()
+    return (colors, got.depths[0], features), got.meta._replace(features=None)
 
 
-def _of_frame(drawn: Drawn, look: Look) -> dict[str, Any]:
+def _photograph(frame: Frame) -> Float[np.ndarray, "h w 3"]:
+    """The picture of a frame of one camera, 0 to 1."""
+    return frame.images[0] / 255.0
+
+
+def _counted(frame: Frame) -> Bool[np.ndarray, "h w"] | None:
+    """The pixels of a frame of one camera that count; None if all do."""
+    return None if frame.masks is None else np.asarray(frame.masks[0])
+
+
+def _of_frame(drawn: Drawn, frame: Frame) -> dict[str, Any]:
     """Scores of the colours and depth of one frame."""
-    true, least = look.image / 255.0, min(look.image.shape[:2])
-    row: dict[str, Any] = {"psnr_masked": psnr(drawn.colors, true, look.counts)}
-    row["ssim"] = ssim(drawn.colors, true, look.counts) if least >= _LEAST_SIDE else None
+    true, counts = _photograph(frame), _counted(frame)
+    least = min(true.shape[:2])
+    row: dict[str, Any] = {"psnr_masked": psnr(drawn.colors, true, counts)}
+    row["ssim"] = ssim(drawn.colors, true, counts) if least >= _LEAST_SIDE else None
     row["ms_ssim"] = None
     if least >= MS_SSIM_LEAST_SIDE:
-        row["ms_ssim"] = ms_ssim(_filled(drawn.colors, look), true, look.counts)
+        row["ms_ssim"] = ms_ssim(_filled(drawn.colors, frame), true, counts)
     row["depth_mm"] = None
-    if look.depth is not None:
-        known = look.depth > 0 if look.counts is None else look.counts & (look.depth > 0)
+    if frame.depths is not None:
+        depth = np.asarray(frame.depths[0])
+        known = depth > 0 if counts is None else counts & (depth > 0)
         if known.any():
-            row["depth_mm"] = 1e3 * float(np.abs(drawn.depths - look.depth)[known].mean())
+            row["depth_mm"] = 1e3 * float(np.abs(drawn.depths - depth)[known].mean())
     return row
 
 
-def _filled(colors: np.ndarray, look: Look) -> Float[np.ndarray, "h w 3"]:
+def _filled(colors: np.ndarray, frame: Frame) -> Float[np.ndarray, "h w 3"]:
     """What is drawn where it counts, and the photograph elsewhere: windows that reach there find nothing."""
-    if look.counts is None:
+    counts = _counted(frame)
+    if counts is None:
         return np.asarray(colors, np.float64)
-    return np.where(look.counts[..., None], colors, look.image / 255.0)
+    return np.where(counts[..., None], colors, _photograph(frame))
 
 
-def _of_classes(drawn: Drawn, look: Look, data: DeformData, t: int, overlap: LabelOverlap) -> dict[str, Any]:
-    """f-PSNR of a frame, on the teacher's grid; what its pixels that count are, by the nearest code, is added
-    to `overlap`, against what the teacher's are."""
-    said = data.said(t)
-    if said is None or data.meaning is None or drawn.features is None:
+def _of_classes(
+    drawn: Drawn, frame: Frame, data: DeformData, t: int, overlap: LabelOverlap
+) -> dict[str, Any]:
+    """f-PSNR of a frame, on the teacher's grid; the classes of its pixels that count, by the nearest code,
+    are added to `overlap`, against those of the teacher's."""
+    labels = data.labels(t)
+    if labels is None or data.meaning is None or drawn.features is None:
         return {"f_psnr": None}
-    ids = counted_ids(look._replace(ids=said.ids))
-    known, teacher = ids >= 0, jnp.asarray(said.codes[np.maximum(ids, 0)], jnp.float32)
+    ids = counted_ids(labels.ids, _counted(frame))
+    known, teacher = ids >= 0, jnp.asarray(labels.codes[np.maximum(ids, 0)], jnp.float32)
     features = on_grid(drawn.features, ids.shape)
     codebook = jnp.asarray(data.meaning.codebook, jnp.float32)
     named, true = (np.asarray(classes_of_pixels(one, codebook)) for one in (features, teacher))
@@ -177,12 +200,12 @@ def _of_classes(drawn: Drawn, look: Look, data: DeformData, t: int, overlap: Lab
 @jax.jit
 def classes_of_pixels(features: Float[Array, "h w c"], codebook: Float[Array, "k c"]) -> Int[Array, "h w"]:
     """The row whose code is the nearest; -1 where all are as near, as where nothing is drawn."""
-    said = prompt_probabilities(features, codebook)
-    return jnp.where(said.max(axis=-1) > said.min(axis=-1), said.argmax(axis=-1), IGNORED_LABEL)
+    likely = prompt_probabilities(features, codebook)
+    return jnp.where(likely.max(axis=-1) > likely.min(axis=-1), likely.argmax(axis=-1), IGNORED_LABEL)
 
 
 def _classes(overlap: LabelOverlap, names: Iterable[str]) -> list[dict[str, Any]]:
-    """Of each class: its name, and how far what is drawn and what was seen of it overlap, over all frames."""
+    """The name of each class, and how far what is drawn and what was seen of it overlap, over all frames."""
     return [
         {"class": name, "iou": overlap.iou(row), "dice": overlap.dice(row), "f1": overlap.f1(row)}
         for row, name in enumerate(names)
@@ -197,7 +220,7 @@ def _means_of_classes(overlap: LabelOverlap, count: int) -> dict[str, float | No
     return {name: None if np.isnan(value) else value for name, value in found.items()}
 
 
-def over_time(pair: list[tuple[np.ndarray, Look]]) -> dict[str, Any]:
+def over_time(pair: list[tuple[np.ndarray, Frame]]) -> dict[str, Any]:
     """How steady two neighbouring frames are, as they are drawn and as they were recorded; empty for pictures
     that are smaller than windows.
 
@@ -205,14 +228,14 @@ def over_time(pair: list[tuple[np.ndarray, Look]]) -> dict[str, Any]:
     with that before it), which as a rule was learned from. What does not count is as it was photographed.
 
     Args:
-        pair: colours and look of the earlier frame and of the later one.
+        pair: drawn colours and the frame, of the earlier one and of the later one.
     """
-    sides = sorted(pair[0][1].image.shape[:2])
+    sides = sorted(pair[0][1].images.shape[1:3])
     if sides[0] < _LEAST_SIDE or sides[1] < _LEAST_LONGER_SIDE:
         return {}
-    ours = np.stack([_filled(colors, look) for colors, look in pair])
-    true = np.stack([look.image / 255.0 for _, look in pair])
-    counts = [look.counts for _, look in pair if look.counts is not None]
+    ours = np.stack([_filled(colors, frame) for colors, frame in pair])
+    true = np.stack([_photograph(frame) for _, frame in pair])
+    counts = [counts for _, frame in pair if (counts := _counted(frame)) is not None]
     masks = np.stack(counts) if counts else None
     found, wanted = (temporal_scores(video, masks=masks, optical_flow=DisFlow()) for video in (ours, true))
     row = {name: found[name] for name in (*OVER_TIME, "flow_warp_share")}
@@ -223,9 +246,9 @@ def over_time(pair: list[tuple[np.ndarray, Look]]) -> dict[str, Any]:
     return row
 
 
-def _panels(drawn: Drawn, look: Look, data: DeformData) -> np.ndarray:
-    """What was seen, what is drawn, their difference, and, of a scene that knows it, what is what."""
-    pictures = (to_uint8(look.image), to_uint8(drawn.colors), _difference(drawn.colors, look))
+def _panels(drawn: Drawn, frame: Frame, data: DeformData) -> np.ndarray:
+    """The photograph, what is drawn, their difference, and, of a scene that knows it, what is what."""
+    pictures = (to_uint8(frame.images[0]), to_uint8(drawn.colors), _difference(drawn.colors, frame))
     named = dict(zip(PANELS, pictures, strict=True))
     if data.meaning is not None and drawn.features is not None:
         labels = classes_of_pixels(drawn.features, jnp.asarray(data.meaning.codebook, jnp.float32))
@@ -233,20 +256,18 @@ def _panels(drawn: Drawn, look: Look, data: DeformData) -> np.ndarray:
     return in_rows(named, 2 if len(named) == 4 else 3, _PANEL_HEIGHT)
 
 
-def _difference(colors: np.ndarray, look: Look) -> np.ndarray:
+def _difference(colors: np.ndarray, frame: Frame) -> np.ndarray:
     """Five times the difference; grey where nothing counts."""
-    off = 5 * np.abs(colors - look.image / 255.0)
-    return to_uint8(
-        np.clip(off if look.counts is None else np.where(look.counts[..., None], off, 0.25), 0, 1)
-    )
+    off, counts = 5 * np.abs(colors - _photograph(frame)), _counted(frame)
+    return to_uint8(np.clip(off if counts is None else np.where(counts[..., None], off, 0.25), 0, 1))
 
 
-def _fps(scene: DeformingScene, moving: Moving, look: Look, plan: Plan) -> float:
+def _fps(scene: DeformingScene, moving: Moving, frame: Frame, plan: Plan) -> float:
     """How often a second the scene is deformed and drawn; the median."""
     took = []
     for i in range(_TIMED):
         begun = perf_counter()
-        draw(scene, moving, look._replace(time=i / _TIMED), plan)
+        draw(scene, moving, replace(frame, time=np.asarray(i / _TIMED)), plan)
         took.append(perf_counter() - begun)
     return 1 / float(np.median(took[2:]))
 
@@ -256,7 +277,7 @@ def _tracks(scene: DeformingScene, moving: Moving, data: DeformData, tools: Tool
     truth, count = data.sequence.truth, data.sequence.num_frames
     if truth is None or truth.tracks is None or count < 2:
         return None
-    seen = _seen(truth.tracks[0], data.look(0, 0, tools))
+    seen = _seen(truth.tracks[0], data.frame(0, 0, tools))
     start = truth.tracks[0][seen]
     if not len(start):
         return None
@@ -275,12 +296,13 @@ def _tracks(scene: DeformingScene, moving: Moving, data: DeformData, tools: Tool
     }
 
 
-def _seen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
-    """Which points a look sees, by its depth and masks."""
-    height, width = look.image.shape[:2]
-    column, row, z, inside = pixels_of(points, look.viewmat, look.K, width, height)
-    counts = inside if look.counts is None else inside & look.counts[row, column]
-    if look.depth is None:
+def _seen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
+    """Which points a frame sees, by its depth and mask."""
+    camera = frame.cameras
+    column, row, z, inside = pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
+    counted = _counted(frame)
+    counts = inside if counted is None else inside & counted[row, column]
+    if frame.depths is None:
         return counts
-    depth = look.depth[row, column]
+    depth = np.asarray(frame.depths[0])[row, column]
     return counts & (np.abs(depth - z) < _SEEN_WITHIN * depth)

@@ -1,9 +1,9 @@
-"""Who says what there is in frames of a deforming scene: classes of masks, or features of files or of an
-encoder, brought into the scene's few channels."""
+"""Teachers of a deforming scene's features: classes of masks, or features of files or of an encoder, brought
+into the scene's few channels."""
 
 from collections import Counter
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,44 +19,22 @@ from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.distill.source import Source
 from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.messages import Notes, describe
-from gsjax.methods.deform import Look, counted_ids
+from gsjax.methods.deform import Meaning, counted_ids
 from gsjax.methods.distill import Teacher
 from gsjax.perception.codebook import ClassCodebook
+from gsjax.scene.frame import Frame
 
 GROUPS = 8
-"""Into how many kinds, at most, features without names are parted."""
-_SAMPLE = 2000  # of the vectors that are parted, for all pairs are compared
+"""The most kinds into which features without names are split."""
+_SAMPLE = 2000  # of the vectors that are split into kinds, for all pairs are compared
 _ALIKE = 0.98  # cosine of directions that are of one kind
 
 
-@dataclass(frozen=True, eq=False)
-class Meaning:
-    """What features say, apart from any frame.
+class Labels(NamedTuple):
+    """A teacher's labels of a frame.
 
     Attributes:
-        source: who made what they learn.
-        names: of what they tell apart: classes, or groups of features that are alike.
-        codebook: the feature of each.
-        basis: orthonormal columns that bring the source's vectors of D numbers into the scene's channels.
-            Fixed, for two that learn agree best where both are 0 (METHODS.md).
-    """
-
-    source: Source
-    names: tuple[str, ...]
-    codebook: Float[np.ndarray, "k channels"]
-    basis: Float[np.ndarray, "D channels"]
-
-    def hint(self, weights: Path | None = None) -> str:
-        """What can be asked for, to who is about to; as `Source.hint`."""
-        said = self.source.hint(weights)
-        return said if self.source.kind == "classes" else f"{said}; or one of: {', '.join(self.names)}"
-
-
-class Said(NamedTuple):
-    """Of a frame.
-
-    Attributes:
-        ids: which of the codes each of the teacher's pixels has, -1 for none; a grid of any size.
+        ids: row of the codes of each of the teacher's pixels, -1 for none; a grid of any size.
         codes: in the scene's channels.
     """
 
@@ -88,39 +66,39 @@ class ClassTeacher:
         basis, _ = basis_of([codes], channels)
         self.meaning = Meaning(source, tuple(names.values()), codes @ basis, basis)
 
-    def said(self, t: int) -> Said:
-        """By the mask of frame t; nothing of any pixel where there is none."""
+    def labels(self, t: int) -> Labels:
+        """Labels of frame t, by its mask; -1 everywhere where it has none."""
         return self.of_mask(self._sequence.mask(t, 0))
 
-    def of_mask(self, mask: Int[np.ndarray, "h w"] | None) -> Said:
-        """By a mask that was read."""
+    def of_mask(self, mask: Int[np.ndarray, "h w"] | None) -> Labels:
+        """Labels by a mask that was read."""
         ids = np.full((self._sequence.height, self._sequence.width), -1, np.int32)
         if mask is not None:
             for row, value in enumerate(self._values):
                 ids[mask == value] = row
-        return Said(ids, self.meaning.codebook)
+        return Labels(ids, self.meaning.codebook)
 
     def digest(self) -> str:
-        """Of what is taught beside the looks' ids, in hexadecimal."""
+        """Digest of what is taught beside the frames' ids, in hexadecimal."""
         return content_digest(f"classes {self.meaning.names}", {})
 
 
 class EncodedTeacher:
     """Features of files, or of an encoder, brought into the scene's channels."""
 
-    def __init__(self, teaching: Teaching, looks: Many[Look], channels: int):
+    def __init__(self, teaching: Teaching, frames: Many[Frame], channels: int):
         """
         Args:
             teaching: has frames segmented and encoded, or their features read.
-            looks: of the frames that teach.
+            frames: those that teach, of one camera each.
             channels: of a Gaussian's feature.
 
         Raises:
-            ValueError: grids differ, or nothing is said of pixels that count.
+            ValueError: grids differ, or no pixel that counts has features.
         """
         self._teaching, teacher = teaching, teaching.teacher
         self.ids = _ids(teacher)
-        weights = _counts(teacher, self.ids, looks)
+        weights = _counts(teacher, self.ids, frames)
         blocks = _vectors(teacher)
         counted = np.split(weights > 0, np.cumsum([len(block) for block in blocks])[:-1])
         vectors = [block[some] for block, some in zip(blocks, counted, strict=True)]
@@ -130,8 +108,8 @@ class EncodedTeacher:
         names = tuple(f"group {n}" for n in range(1, len(groups) + 1))
         self.meaning = Meaning(teaching.source, names, groups, basis)
 
-    def said(self, t: int) -> Said | None:
-        """Of frame t, whether it teaches or not; None where that is nothing.
+    def labels(self, t: int) -> Labels | None:
+        """Labels of frame t, whether it teaches or not; None where there are none.
 
         Raises:
             ValueError, OSError: it cannot be read, or its file does not fit.
@@ -140,14 +118,14 @@ class EncodedTeacher:
         if teacher is None:
             return None
         (ids,) = _ids(teacher)
-        return Said(ids, _codes(teacher, self.meaning.basis))
+        return Labels(ids, _codes(teacher, self.meaning.basis))
 
     def digest(self) -> str:
-        """Of what is taught, in hexadecimal."""
+        """Digest of what is taught, in hexadecimal."""
         return self._teaching.digest()
 
     def note(self) -> str:
-        """What a run says of it."""
+        """The note that a run has of it."""
         (dimension, channels), count = self.meaning.basis.shape, len(self.meaning.names)
         parted = f"they are parted into {count} groups"
         if count == 1:
@@ -175,16 +153,23 @@ def teaching_of(sequence: Sequence, train: Many[int], asked: TeacherChoice, cons
     return Teaching(_as_photographs(sequence), train, asked, FeatureCache(), console)
 
 
-def said_of(
+def labels_of(
     teacher: ClassTeacher | EncodedTeacher, frames: Many[int], sequence: Sequence, notes: Notes
-) -> dict[int, Said]:
-    """Of frames that are only judged; those that cannot be read are noted and left out."""
-    found: dict[int, Said] = {}
+) -> dict[int, Labels]:
+    """Labels of frames that are only judged; those that cannot be read are noted and left out.
+
+    Args:
+        teacher: of the frames that are learned from.
+        frames: indices of the others.
+        sequence: the recording.
+        notes: receives what could not be read.
+    """
+    found: dict[int, Labels] = {}
     failed: dict[int, str] = {}
     for t in frames:
         try:
-            if (said := teacher.said(t)) is not None:
-                found[t] = said
+            if (labels := teacher.labels(t)) is not None:
+                found[t] = labels
         except FileNotFoundError:
             failed[int(sequence.frame_ids[t])] = "they have no file"
         except (ValueError, OSError) as error:
@@ -219,8 +204,8 @@ def groups_of(
 
     Args:
         codes: not all zeros.
-        weights: what each counts, the pixels that it is said of.
-        most: there may be so many groups.
+        weights: of each code, the number of its pixels.
+        most: number of groups, at most.
     """
     chosen = np.unique(np.linspace(0, len(codes) - 1, _SAMPLE).astype(int))
     codes, weights = codes[chosen], weights[chosen]
@@ -265,19 +250,22 @@ def _as_photographs(sequence: Sequence) -> Photographs:
     return replace(alone, names=tuple(names), load_depth=None)
 
 
-def _counts(teacher: Teacher, ids: Many[Int[np.ndarray, "h w"]], looks: Many[Look]) -> Float[np.ndarray, "n"]:
-    """Of how many pixels that count each vector is said.
+def _counts(
+    teacher: Teacher, ids: Many[Int[np.ndarray, "h w"]], frames: Many[Frame]
+) -> Float[np.ndarray, "n"]:
+    """The number of pixels that count which have each vector.
 
     Raises:
-        ValueError: grids differ, or that is none of any.
+        ValueError: grids differ, or no pixel has any.
     """
     grids = Counter(one.shape for one in ids)
     if len(grids) > 1:
         found = ", ".join(f"{width}x{height} ({n})" for (height, width), n in grids.most_common())
         raise ValueError(f"--features: expected one grid in all frames, found (frames) {found}")
     counts = np.zeros(1 + sum(map(len, _vectors(teacher))))
-    for look, one in zip(looks, ids, strict=True):
-        counts += np.bincount(1 + counted_ids(look._replace(ids=one)).ravel(), minlength=len(counts))
+    for frame, one in zip(frames, ids, strict=True):
+        counted = counted_ids(one, None if frame.masks is None else frame.masks[0])
+        counts += np.bincount(1 + counted.ravel(), minlength=len(counts))
     if not counts[1:].any():
         silent = all((one < 0).all() for one in ids)
         found = "zeros alone" if silent else "none; do masks hide all?"
@@ -286,7 +274,7 @@ def _counts(teacher: Teacher, ids: Many[Int[np.ndarray, "h w"]], looks: Many[Loo
 
 
 def _vectors(teacher: Teacher) -> list[Float[np.ndarray, "_ D"]]:
-    """What it says: rows of its codebook, or a block of them for each map, whose pixels have one each."""
+    """Its vectors: rows of its codebook, or a block of them for each map, whose pixels have one each."""
     if teacher.codebook is not None:
         return [teacher.codebook]
     assert teacher.maps is not None
@@ -299,7 +287,7 @@ def _codes(teacher: Teacher, basis: Float[np.ndarray, "D channels"]) -> Float[np
 
 
 def _ids(teacher: Teacher) -> list[Int[np.ndarray, "h w"]]:
-    """Which of these each pixel of each view has; -1 where nothing is said, as where a map is zero."""
+    """The row of these of each pixel of each view; -1 where there is none, as where a map is zero."""
     if teacher.maps is None:
         return teacher.ids
     ids, begin = [], 0

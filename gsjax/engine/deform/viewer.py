@@ -1,4 +1,4 @@
-"""A run of `gsjax deform` in the viewer: over time, and how it is asked."""
+"""A run of `gsjax deform` in the viewer, over time, with queries."""
 
 import threading
 from functools import cache
@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gsjax.data.ordered import open_as_sequence
-from gsjax.engine.deform.file import NAME, StoredDeformation, read_deformation
+from gsjax.engine.deform.file import NAME, read_deformation
 from gsjax.engine.deform.pictures import probabilities_of
-from gsjax.engine.deform.prompts import Wanted, wanted_like, wanted_text
 from gsjax.engine.files import reopen
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.selected import EXTRACTED, keep_part
+from gsjax.methods.deform import DeformResult, Wanted, wanted_like, wanted_text
 from gsjax.methods.deform.query import most_likely
 from gsjax.viz.viewer import Answer, Asking, Motion, Shots, Viewable
 
@@ -29,47 +29,47 @@ def viewable_deformation(path: Path, notes: Notes, weights: Path | None = None) 
 
     Args:
         path: of the run.
-        notes: told of what is odd.
+        notes: receives what is odd.
         weights: of CLIP, where they are now.
 
     Raises:
         ValueError: the file of the scene is damaged, or there are weights that it has no use for.
     """
-    stored = read_deformation(path / NAME)
-    kind = None if stored.meaning is None else stored.meaning.source.kind
+    result = read_deformation(path / NAME)
+    kind = None if result.meaning is None else result.meaning.source.kind
     if weights is not None and kind in (None, "classes", "closed"):
         raise ValueError(f"--weights: {path} has learned nothing of CLIP; leave it out")
-    first, labels = stored.at(0.0), None
-    if stored.meaning is not None and first.features is not None:
-        said = probabilities_of(first.features, jnp.asarray(stored.meaning.codebook, jnp.float32))
-        labels = 1 + most_likely(np.asarray(said))
+    first, labels, times = result.at(0.0), None, result.timeline.times
+    if result.meaning is not None and first.features is not None:
+        likely = probabilities_of(first.features, jnp.asarray(result.meaning.codebook, jnp.float32))
+        labels = 1 + most_likely(np.asarray(likely))
     return Viewable(
         path.absolute().name,
         first,
         labels,
-        dict(enumerate(stored.names, 1)),
-        motion=Motion(len(stored.times), first.num, lambda frame: stored.at(stored.times[frame])),
-        times=stored.times * stored.seconds,
-        shots=_shots(path, stored, notes),
-        unit="m" if stored.metric else "",
-        asking=None if labels is None else asking_of(path, stored, weights),
+        dict(enumerate(result.names, 1)),
+        motion=Motion(len(times), first.num, lambda frame: result.at(times[frame])),
+        times=times * result.timeline.seconds,
+        shots=_shots(path, result, notes),
+        unit="m" if result.timeline.metric else "",
+        asking=None if labels is None else asking_of(path, result, weights),
     )
 
 
-def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None) -> Asking:
+def asking_of(path: Path, result: DeformResult, weights: Path | None = None) -> Asking:
     """How the page asks it; what it saves goes to `extracted/` in the run's folder. Where features change
     over time, an answer is of the frame that is looked at.
 
     Args:
         path: of the run.
-        stored: what it learned.
+        result: what it learned.
         weights: folder of CLIP's, where they are no longer where they were.
     """
-    assert stored.meaning is not None
-    meaning = stored.meaning
+    assert result.meaning is not None
+    meaning = result.meaning
 
     def features_in(frame: int) -> jax.Array:
-        features = stored.at(stored.times[frame] if stored.meaning_changes else 0.0).features
+        features = result.at(result.timeline.times[frame] if result.meaning_changes else 0.0).features
         assert features is not None
         return features
 
@@ -93,22 +93,23 @@ def asking_of(path: Path, stored: StoredDeformation, weights: Path | None = None
         return answer(f"like Gaussian {row} ({wanted.meant})", wanted, features)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:
-        there, called = stored.at(stored.times[frame]), f"{name} frame {stored.frame_ids[frame]}"
+        timeline = result.timeline
+        there, called = result.at(timeline.times[frame]), f"{name} frame {timeline.frame_ids[frame]}"
         return keep_part(path / EXTRACTED, called, there, selected)
 
     return Asking(meaning.hint(weights), ask, like, save)
 
 
-def _shots(path: Path, stored: StoredDeformation, notes: Notes) -> Shots:
+def _shots(path: Path, result: DeformResult, notes: Notes) -> Shots:
     """The cameras of all frames, with what they saw if that is still there."""
     load = None
     try:
         sequence = reopen(path / "config.yml", _AGAIN, opened=open_as_sequence)[0].judged
         found = (sequence.num_frames, sequence.width, sequence.height)
-        if found != (wanted := (len(stored.times), *stored.size)):
+        if found != (wanted := (len(result.timeline.times), *result.timeline.size)):
             raise ValueError(f"expected frames, width and height {wanted} as then, found {found}")
         load = lambda t, _: sequence.image(t, 0)  # noqa: E731
     except (ValueError, OSError) as error:
         notes.warn(f"its photographs are not shown: {describe(error)}")
-    sizes = np.array([stored.size])
-    return Shots(("camera",), stored.viewmats[:, None], stored.Ks[:, None], sizes, load_image=load)
+    sizes = np.array([result.timeline.size])
+    return Shots(("camera",), result.viewmats[:, None], result.timeline.Ks[:, None], sizes, load_image=load)

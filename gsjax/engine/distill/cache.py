@@ -1,4 +1,4 @@
-"""What encoders and segmenters said of pictures, kept on disk by the content of what they were shown."""
+"""Outputs of encoders and segmenters, kept on disk under a hash of their inputs."""
 
 import hashlib
 import json
@@ -17,53 +17,53 @@ _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zli
 
 
 def cache_folder() -> Path:
-    """Where answers are kept unless told; what lies there may be deleted."""
+    """Where outputs are kept by default; what lies there may be deleted."""
     return Path(user_cache_dir("gsjax", appauthor=False)) / "features"
 
 
 class FeatureCache:
-    """A folder of answers. One that is damaged is asked for again, and one that cannot be written is not.
+    """A folder of outputs. A damaged one is computed again, and one that cannot be written is not kept.
 
     Attributes:
-        found, asked: how many answers were there, and how many had to be worked out.
+        found, asked: how many outputs were there, and how many had to be computed.
     """
 
     def __init__(self, folder: Path | None = None):
         """
         Args:
-            folder: where; in the user's cache folder unless given.
+            folder: the folder (default: in the user's cache folder).
         """
         self._folder = folder or cache_folder()
         self.found = self.asked = 0
 
     def __call__(self, who: str, shown: Arrays, ask: Callable[[], Arrays]) -> dict[str, np.ndarray]:
-        """What `who` says of what is shown.
+        """The output of `who` for some inputs.
 
         Args:
-            who: everything else that the answer depends on: which encoder, its weights, its settings.
-            shown: arrays.
-            ask: works it out.
+            who: everything else that the output depends on: the encoder, its weights, its settings.
+            shown: the inputs.
+            ask: computes the output.
         """
         path = self._folder / f"{content_digest(who, shown)}.npz"
         try:
             with np.load(path, allow_pickle=False) as stored:
-                said = dict(stored)
+                output = dict(stored)
             self.found += 1
-            return said
+            return output
         except _READ_ERRORS:
             pass
-        said = dict(ask())
+        output = dict(ask())
         self.asked += 1
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_npz(path, said)
-        except OSError:  # a full disk, or no home: then it is worked out next time too
+            write_npz(path, output)
+        except OSError:  # a full disk, or no home: then it is computed next time too
             pass
-        return said
+        return output
 
 
 def folder_digest(folder: Path) -> str:
-    """SHA-256 over the names and contents of a folder's files: which weights these are."""
+    """SHA-256 over the names and contents of a folder's files, which identifies weights."""
     digest = hashlib.sha256()
     for file in sorted(entry for entry in folder.iterdir() if entry.is_file()):
         with open(file, "rb") as stream:
@@ -72,7 +72,7 @@ def folder_digest(folder: Path) -> str:
 
 
 def content_digest(who: str, shown: Arrays) -> str:
-    """SHA-256 over what is shown to whom."""
+    """SHA-256 over an encoder and its inputs, as for `FeatureCache`."""
     digest = hashlib.sha256(json.dumps(who).encode())
     for name, array in sorted(shown.items()):
         array = np.ascontiguousarray(array)

@@ -1,4 +1,4 @@
-"""Whose masks and features teach a scene its meaning, as it is told on the command line."""
+"""Which masks and features teach a field, as chosen on the command line."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,32 +16,32 @@ OF_CLIP = ("clip", "maskclip")
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherOptions(SamWeights, ClipWeights):
-    """Who teaches."""
+    """Which masks and features teach."""
 
     features: str = "auto"
-    """What is to be learned: classes (a code for each class of the mask files), closed (colour and outline of
+    """Features to learn: classes (a code for each class of the mask files), closed (colour and outline of
     each mask; no foundation model), clip or maskclip (with --weights), or a folder of feature files
     (LangSplat's, Feature-3DGS's, LERF's, .npy, .npz; named as the pictures, or by frame number). auto:
-    classes if there are mask files, else closed. Of gsjax deform also none, which is its auto where masks
+    classes if there are mask files, else closed. For gsjax deform also none, which is its auto where masks
     have fewer than two classes among the pixels that count."""
     masks: Masks = "auto"
-    """Whose masks: the recording's own, or a segmenter's that needs no weights. auto: files if there are."""
+    """Source of the masks: the recording's own files, or a segmenter without weights. auto: files, if any."""
     level: Level = "default"
-    """Of LangSplat's files, which size of objects."""
+    """Size of objects in LangSplat's files."""
 
 
 @dataclass(frozen=True)
 class TeacherChoice:
-    """Whose masks and features.
+    """Which masks and features teach.
 
     Attributes:
         features: an encoder (`KINDS`), a folder of files, or "auto".
         masks: those of files, those of a segmenter, or "auto".
-        sam: folder of SAM's weights; a segmenter without weights unless given.
-        weights: folder of CLIP's.
-        level: of LangSplat's files.
-        second: who teaches beside CLIP's vectors of masks.
-        snap: pixels within which outlines of masks are put on the picture's edges.
+        sam: folder of SAM's weights (default: a segmenter without weights).
+        weights: folder of CLIP's weights.
+        level: size of objects in LangSplat's files.
+        second: second teacher, beside CLIP's vectors of masks.
+        snap: distance in pixels within which outlines of masks are moved to the picture's edges.
     """
 
     features: str = "auto"
@@ -54,18 +54,25 @@ class TeacherChoice:
 
     @property
     def of_files(self) -> bool:
-        """Whether features are those of a folder of files."""
+        """Whether the features come from a folder of files."""
         return self.features not in ("auto", *KINDS)
 
     def located(self) -> dict[str, Any]:
-        """Its paths as they are found from elsewhere, by the options that name them."""
+        """Its paths as they are found from any folder, by the options that name them."""
         paths = {"sam": self.sam, "weights": self.weights}
         found: dict[str, Any] = {name: path and Path(located(str(path))) for name, path in paths.items()}
         return found | ({"features": located(self.features)} if self.of_files else {})
 
     def check(self, also: tuple[str, ...] = ()) -> None:
-        """Raises ValueError where these contradict each other, FileNotFoundError for files not there.
-        `also`: what else --features may be, to say so."""
+        """Check the choice before anything takes time.
+
+        Args:
+            also: further values of --features, for the error.
+
+        Raises:
+            ValueError: options contradict each other.
+            FileNotFoundError: a folder is not there.
+        """
         if self.of_files and not Path(self.features).is_dir():
             known = ", ".join(("auto", *KINDS, *also))
             raise FileNotFoundError(

@@ -1,8 +1,8 @@
-"""Pictures of what a query found: masks, and the photograph, the heat of the scores, and the scene without
-it, alone, recoloured, moved.
+"""Pictures of the result of a query: masks, and the photograph, a heat map of the scores, and the scene
+without what was found, it alone, recoloured, moved.
 
-All are drawn by one program a size of picture, for as many Gaussians in one colour each: compiling takes
-longer than drawing. What is not to be seen is hidden, not left out.
+All are drawn by one program for each size of picture, with one colour a Gaussian, for compiling takes longer
+than drawing. What is not to be seen is hidden, not left out, so the number of Gaussians is the same.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,8 +29,8 @@ from gsjax.viz.viewer.drawing import Drawer, recolored
 
 _MARK = (255, 70, 160)
 _PANEL_HEIGHT = 240  # pixels, at least
-_MOST = 0.5  # of a pixel's light
-_SAID = {"recolored": "recoloured", "moved": "moved"}
+_MOST = 0.5  # share of a pixel's light above which it shows the object
+_WORDS = {"recolored": "recoloured", "moved": "moved"}
 
 
 def draw(
@@ -47,18 +47,18 @@ def draw(
     """Writes masks/CAMERA.png for each camera, and overview.png of the one that shows most.
 
     Args:
-        folder: for them.
-        run: what was asked.
-        which: of its photographs.
-        selected: what was found: a pixel shows it that has more than half of its light from there.
-        scores: of all.
-        threshold: of the scores, which is marked on their scale.
-        scenes: with it changed, by name.
-        notes: told which photograph cannot be read.
-        console: shows how far it is.
+        folder: for the pictures.
+        run: the field and its scene.
+        which: indices of its photographs.
+        selected: the Gaussians that were found; a pixel shows them if more than half of its light is theirs.
+        scores: of all Gaussians.
+        threshold: of the scores, marked on their scale.
+        scenes: changed scenes by name.
+        notes: receives warnings of photographs that cannot be read.
+        console: shows the progress.
 
     Returns:
-        How many pixels each mask has.
+        Number of pixels in each mask.
     """
     photographs = run.photographs
     drawer = Drawer(antialiased=run.rasterize_mode == "antialiased", compiler_options=host_options())
@@ -82,7 +82,7 @@ def draw(
     shown = {"the object alone": hidden(run.gaussians, ~there)}
     if not selected.all():
         shown["without it"] = hidden(run.gaussians, there)
-    shown |= {_SAID[name]: scene for name, scene in scenes.items()}
+    shown |= {_WORDS[name]: scene for name, scene in scenes.items()}
     behind_is = "photograph"
     try:
         behind = photographs.image(v)
@@ -108,13 +108,13 @@ def _one(camera: Camera) -> Camera:
 
 
 def _ends(scores: Float[np.ndarray, "n"]) -> tuple[float, float]:
-    """The least score and the largest, but for a few outliers at the lower end."""
+    """The least and largest score, without a few outliers at the lower end."""
     scores = np.nan_to_num(scores)
     return float(np.percentile(scores, 1)), float(scores.max())
 
 
 def _seen_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The scene in the colours that it has from one camera, the same from all sides."""
+    """The scene with the colours that one camera sees, the same from all sides."""
     return _painted(gaussians, np.asarray(_colors(gaussians, camera)))
 
 
@@ -125,5 +125,5 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
 
 
 def _painted(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
-    """The scene in one colour a Gaussian, and nothing else to be drawn."""
+    """The scene with one colour a Gaussian and no features."""
     return eqx.tree_at(lambda g: g.features, recolored(gaussians, colors), None, is_leaf=lambda x: x is None)

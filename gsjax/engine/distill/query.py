@@ -1,6 +1,7 @@
-"""`gsjax query` on a field: the Gaussians that a text, a picture or a point means, and what is done with
-them."""
+"""`gsjax query` on a field: the Gaussians that match a text, a picture or a point, and what is done with
+them. `select` is the one query, of the command as of the viewer."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -10,7 +11,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from rich.console import Console
 
 from gsjax.data.photographs import Photographs
@@ -23,27 +24,25 @@ from gsjax.io.atomic import write_json
 from gsjax.methods.distill import (
     Threshold,
     frozen_views,
-    gaussian_cosines,
     pixel_features,
-    relevancy,
     threshold_for,
 )
 from gsjax.rasterize.frozen import strip_of
 
-_LITTLE = 0.5  # of a pixel's light that the scene must send
+_LEAST_ALPHA = 0.5  # share of a pixel's light that the scene must send
 
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a field: one of text, image and point, and how it is understood.
+    """A query of a field: one of text, image and point, and how it is scored.
 
     Attributes:
         text: "red can".
         image: a picture of the thing; where it has an alpha channel, only what is opaque.
         point: x, y in pixels of the photographs as the field learned from them.
         camera: short name of the photograph that the point is in, and of the only mask to draw.
-        negatives: texts that it is held against; the source's own unless given.
-        threshold: of the score; by a rule unless given.
+        negatives: texts to compare with (default: those of the source).
+        threshold: score above which a Gaussian is selected (default: by a rule).
     """
 
     text: str | None = None
@@ -55,7 +54,7 @@ class Question:
 
     @property
     def words(self) -> str:
-        """What was asked, in short."""
+        """The query in short."""
         if self.point is not None:
             return f"what is at {self.point[0]:g},{self.point[1]:g} of {self.camera}"
         return repr(self.text) if self.image is None else f"what {self.image.name} shows"
@@ -63,14 +62,14 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The answer.
+    """The result of a query.
 
     Attributes:
         scores: of all Gaussians.
-        threshold: from which on they are meant.
-        against: what the question was held against.
-        seconds: that it took to score all Gaussians.
-        meant: the class that a point shows; None where it was not asked so, or is of no class.
+        threshold: score above which they are selected.
+        against: the negatives.
+        seconds: time that it took to score all Gaussians.
+        meant: the class that a point shows; None for other queries, and without classes.
     """
 
     scores: Float[np.ndarray, "n"]
@@ -81,17 +80,17 @@ class Selection:
 
     @property
     def selected(self) -> Bool[np.ndarray, "n"]:
-        """Which Gaussians score above the threshold."""
+        """The Gaussians that score above the threshold."""
         return self.scores > self.threshold.value
 
 
 def answer(
     run: FieldRun, question: Question, changes: Changes, folder: Path, notes: Notes, console: Console
 ) -> dict[str, Any]:
-    """Ask, and write what is found into a folder; returns what query.json says.
+    """Query a field, and write the result into a folder; returns the content of query.json.
 
         query/
-          query.json          what was asked, by which rule, how many Gaussians, where and how large it is
+          query.json          the query, the rule of its threshold, how many Gaussians, where and how large
           selection.npz       indices [n], rows of the scene's PLY file; their scores [n] and means [n,3]; and
                               all_scores, one for each row of the file, NaN for one that cannot be drawn
           object.ply          what was found; without.ply the scene without it, recolored.ply with it in
@@ -100,16 +99,16 @@ def answer(
           overview.png        it in a photograph, the scores with their scale, and these scenes
 
     Args:
-        run: the field.
-        question: what is asked.
-        changes: what is done with what is found.
-        folder: for it, in place of an earlier answer, which stays until this one is whole.
-        notes: told of what is odd.
-        console: shows how far it is.
+        run: the field and its scene.
+        question: the query.
+        changes: what is done with the selected Gaussians.
+        folder: for the result, which replaces an earlier one once it is complete.
+        notes: receives warnings.
+        console: shows the progress.
 
     Raises:
-        ValueError: the question cannot be understood, or means nothing of the scene.
-        FileExistsError: something is in the folder that is no answer.
+        ValueError: the query cannot be answered, or selects nothing of the scene.
+        FileExistsError: the folder holds something else than a result of a query.
     """
     chosen = _chosen(run, question)
     found = select(run, question)
@@ -122,7 +121,7 @@ def answer(
         )
     if count == len(selected):
         notes.warn(
-            f"{question.words} means all {count} Gaussians; a higher --threshold would tell them apart"
+            f"{question.words} means all {count} Gaussians; a higher --threshold would select some of them"
         )
     scenes = changes.of(run.gaussians, selected)
     with replaced_folder(folder, OF_QUERY) as new:
@@ -162,48 +161,39 @@ def select(run: FieldRun, question: Question) -> Selection:
     """Score all Gaussians.
 
     Raises:
-        ValueError: the question cannot be understood.
+        ValueError: the query cannot be answered.
     """
-    queries, against, least, meant = _queries(run, question)
-    field, located = run.stored.at(run.gaussians.means)
-    queries = jnp.asarray(queries, field.lift.dtype)
-    if queries.shape[1] != field.dimension:
-        raise ValueError(
-            f"expected a query of {field.dimension} numbers like this field's features, found "
-            f"{queries.shape[1]}: --weights are those of another encoder"
-        )
-    jax.block_until_ready(_scores(field, located, queries))  # what compiles is no answer's time
-    begun = perf_counter()
-    scores = np.asarray(_scores(field, located, queries))
-    seconds = perf_counter() - begun
+    vectors, against, least, meant = _vectors(run, question)
+    scores, seconds = timed_scores(lambda: run.stored.scores(vectors))
     given = question.threshold
-    if given is None and least is not None and len(queries) == 1:
+    if given is None and least is not None and len(vectors) == 1:
         threshold = Threshold(float(least), "the encoder's own")
     else:
-        threshold = threshold_for(scores, len(queries) > 1, given)
+        threshold = threshold_for(scores, len(vectors) > 1, given)
     return Selection(scores, threshold, against, seconds, meant)
 
 
-@jax.jit
-def _scores(field, located, queries):
-    return relevancy(gaussian_cosines(field, located, queries))
+def timed_scores(score: Callable[[], Float[Array, "n"]]) -> tuple[Float[np.ndarray, "n"], float]:
+    """Scores, and the seconds that they took without compiling.
+
+    Args:
+        score: computes them.
+    """
+    jax.block_until_ready(score())  # compiles
+    begun = perf_counter()
+    return np.asarray(score()), perf_counter() - begun
 
 
-def _queries(
+def _vectors(
     run: FieldRun, question: Question
 ) -> tuple[np.ndarray, tuple[str, ...], float | None, str | None]:
-    """The vector that is asked for and those of negatives, their texts, the encoder's own threshold, and the
+    """The vector of the query and those of negatives, the negatives, the encoder's own threshold, and the
     class that a point shows."""
-    source, against, least, meant = run.stored.source, question.negatives, None, None
-    if question.point is not None:
-        vector = _at_point(run, question)
-        if source.kind == "classes":  # it means the class that it is nearest to
-            names = list(source.names.values())
-            codes = np.stack([run.encoder.embed_text(name) for name in names])
-            name = names[int((codes @ vector).argmax())]
-            vector, against = run.encoder.embed_text(name), _against(against, source.negatives(name))
-            meant = name
-    elif question.image is not None:
+    stored, source, text, least = run.stored, run.stored.source, question.text, None
+    if text is not None:
+        least = run.encoder.min_score if source.kind == "closed" else None
+        return *stored.text_vectors(text, question.negatives, run.encoder), least, None
+    if question.image is not None:
         if source.kind == "classes":
             raise ValueError(
                 "--image: classes are known by name, not by sight; ask by text or --point, or distil "
@@ -211,16 +201,14 @@ def _queries(
             )
         vector = _of_image(run, question.image)
     else:
-        assert question.text is not None
-        vector = run.encoder.embed_text(question.text)
-        against = _against(against, source.negatives(question.text))
-        least = run.encoder.min_score if source.kind == "closed" else None
-    against = against or ()
-    return np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against, least, meant
-
-
-def _against(given: tuple[str, ...] | None, otherwise: tuple[str, ...]) -> tuple[str, ...]:
-    return otherwise if given is None else given
+        vector = _at_point(run, question)
+        if source.kind == "classes":  # the point means the class that it is nearest to
+            names = list(source.names.values())
+            codes = np.stack([run.encoder.embed_text(name) for name in names])
+            name = names[int((codes @ vector).argmax())]
+            return *stored.text_vectors(name, question.negatives, run.encoder), None, name
+    against = question.negatives or ()
+    return np.stack([vector, *(run.encoder.embed_text(text) for text in against)]), against, None, None
 
 
 def _of_image(run: FieldRun, path: Path) -> np.ndarray:
@@ -235,13 +223,13 @@ def _of_image(run: FieldRun, path: Path) -> np.ndarray:
     opaque = picture[..., 3] > 127 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)
     if not opaque.any():
         raise ValueError(f"--image {path}: expected something opaque in it, found nothing")
-    label = max(run.stored.source.names, default=0) + 1  # which has no name: it is known by sight
+    label = max(run.stored.source.names, default=0) + 1  # one without a name, which is known by sight
     image, labels = np.ascontiguousarray(picture[..., 2::-1]), np.where(opaque, label, 0).astype(np.int32)
     return np.asarray(run.encoder.embed_objects(image, labels, label))[-1]
 
 
 def _at_point(run: FieldRun, question: Question) -> np.ndarray:
-    """What the field says of a pixel, in the teacher's channels."""
+    """The field's feature at a pixel, in the teacher's channels."""
     photographs = run.photographs
     assert question.point is not None
     assert question.camera is not None
@@ -251,22 +239,22 @@ def _at_point(run: FieldRun, question: Question) -> np.ndarray:
     x, y = question.point
     if not (0 <= x < width and 0 <= y < height):
         raise ValueError(f"--point: expected one in {width}x{height} pixels, found {x:g},{y:g}")
-    field, located = run.stored.at(run.gaussians.means)
+    field, located = run.stored.placed
     view, plan = frozen_views(run.gaussians, [photographs.camera(v)], run.rasterize_mode)[0]
     row, below = divmod(int(y), plan.tile_size)
     strip, strip_plan = strip_of(view, plan, row, 1)  # all that has to be drawn for one pixel
     pixel = jnp.array([[int(x), below]])
     features, alphas = jax.jit(pixel_features)(field, located, strip, strip_plan, pixel)
-    if float(alphas[0]) < _LITTLE:
+    if float(alphas[0]) < _LEAST_ALPHA:
         raise ValueError(f"--point {x:g},{y:g}: expected something of the scene, found nothing there")
     return np.asarray(features[0])
 
 
 def _chosen(run: FieldRun, question: Question) -> list[int]:
-    """Which photographs a mask is drawn for.
+    """Indices of the photographs to draw a mask for.
 
     Raises:
-        ValueError: the question names one that is not there.
+        ValueError: the query names one that is not there.
     """
     if run.photographs is None:
         if question.camera is not None:
@@ -280,7 +268,7 @@ def _chosen(run: FieldRun, question: Question) -> list[int]:
 
 
 def _number(photographs: Photographs, camera: str) -> int:
-    """Which photograph a name means, in short or in full.
+    """The index of a photograph by its name, in short or in full.
 
     Raises:
         ValueError: there is none of that name.

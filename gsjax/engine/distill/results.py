@@ -1,4 +1,4 @@
-"""What a distillation came to: how it agrees with its teacher, pictures of what it learned, the report."""
+"""Results of a distillation: agreement with the teacher, pictures of the features, the report."""
 
 from typing import Any
 
@@ -8,7 +8,6 @@ from jaxtyping import Array, Float, UInt8
 from rich.console import Console
 from rich.table import Table as Grid
 
-from gsjax.engine.distill.file import StoredField
 from gsjax.engine.distill.scene import FieldScene
 from gsjax.engine.distill.scores import ClassScores, Frozen, angle_error, class_maps, classes_of, one_by_one
 from gsjax.engine.distill.teacher import Teaching
@@ -19,7 +18,7 @@ from gsjax.engine.messages import Notes, describe
 from gsjax.engine.report import Media, Table, write_report
 from gsjax.engine.scores import mean_scores
 from gsjax.io.pictures import write_png
-from gsjax.methods.distill import DistillConfig, FeatureField, carried
+from gsjax.methods.distill import DistillConfig, DistillResult, FeatureField, rendered_features
 from gsjax.rasterize.frozen import paint
 from gsjax.scene.feature_grid import Located
 from gsjax.viz.colors import (
@@ -32,9 +31,9 @@ from gsjax.viz.colors import (
 )
 from gsjax.viz.plots import losses_over_steps, save
 
-_SHOWN = 6  # views in the report, classes in a line
+_SHOWN = 6  # views in the report, classes in a line of the terminal
 _WEAK = 0.5  # IoU of a class that is not learned well
-_OF_PCA = 20_000  # Gaussians that the colours are made for
+_PCA_GAUSSIANS = 20_000  # at most, to fit the colours to
 _PANEL_HEIGHT = 240  # pixels, at least
 
 
@@ -42,24 +41,24 @@ def judge(
     folder: RunFolder,
     scene: FieldScene,
     teaching: Teaching,
-    stored: StoredField,
+    result: DistillResult,
     config: DistillConfig,
     notes: Notes,
 ) -> dict[str, Any]:
-    """Compares held-out views, or those that taught where none is held out, with what the teacher says of
-    them, and draws some. What cannot be read is noted, and nothing is compared there.
+    """Compares held-out views, or some of those that taught where none is held out, with the teacher, and
+    draws some. A photograph that cannot be read is noted and not compared.
 
     Args:
         folder: of the run, for pictures.
-        scene: what the field is of, and its photographs.
-        teaching: who says what of them.
-        stored: the field.
-        config: how it was learned.
-        notes: told of what cannot be read.
+        scene: the scene and its photographs.
+        teaching: the teacher of any photograph.
+        result: the field.
+        config: its settings.
+        notes: receives warnings.
     """
     held_out, photographs = len(scene.held_out) > 0, scene.photographs
     which = scene.held_out if held_out else scene.taught[:: max(1, len(scene.taught) // _SHOWN)][:_SHOWN]
-    field, located = stored.at(scene.gaussians.means)
+    field, located = result.placed
     views = one_by_one(scene.gaussians, (photographs.camera(i) for i in which), scene.rasterize_mode)
     names = {label - 1: name for label, name in teaching.source.names.items()}
     codes = of_gaussians = None
@@ -75,8 +74,8 @@ def judge(
         try:
             panels["photograph"] = to_uint8(photographs.image(i))
             true = photographs.labels(i)
-            if (said := teaching.of(i)) is not None:
-                row["cosine"] = 1 - error_of(field, located, view, said)
+            if (teacher := teaching.of(i)) is not None:
+                row["cosine"] = 1 - error_of(field, located, view, teacher)
         except (ValueError, OSError) as error:
             notes.warn(f"{row['view']} was not compared with the teacher: {describe(error)}")
         if shown:
@@ -106,12 +105,12 @@ def judge(
 
 
 def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[Array, "n three"], PcaColors]:
-    """The three numbers of each Gaussian's feature that its colour comes from, and which colours they are."""
-    parts = carried(field, located)
-    some = parts.values[:: max(1, len(parts.values) // _OF_PCA)]
+    """The three principal components of each Gaussian's feature, and the colours that stand for them."""
+    parts = rendered_features(field, located)
+    some = parts.values[:: max(1, len(parts.values) // _PCA_GAUSSIANS)]
     pca = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(some, jnp.ones(len(some), some.dtype)))))
     axes = jnp.asarray(pca.axes, parts.values.dtype)
-    # Linear, as rendering is: three numbers a pixel are painted, not all channels.
+    # Linear, as rendering is: three channels are painted, not all.
     ones = jnp.ones(len(parts.values), parts.values.dtype)
     numbers = jnp.matmul(parts.joined(parts.values, ones), parts.lifted(axes.T).T, precision="highest")
     return numbers, pca._replace(mean=pca.mean @ pca.axes, axes=np.eye(3))
@@ -120,12 +119,12 @@ def feature_colors(field: FeatureField, located: Located | None) -> tuple[Float[
 def draw_features(
     numbers: Float[Array, "n three"], frozen: Frozen, pca: PcaColors
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A view in the colours of its features; what shows little of the scene is near black.
+    """A view in the colours of its features; pixels that show little of the scene are near black.
 
     Args:
-        numbers: three of each Gaussian, as `feature_colors` has them.
+        numbers: components of each Gaussian, from `feature_colors`.
         frozen: the view.
-        pca: which colours they are.
+        pca: their colours, from `feature_colors`.
     """
     image, alphas = (np.asarray(a) for a in paint(frozen[0], numbers, frozen[1]))
     alphas = alphas[..., None]

@@ -1,7 +1,7 @@
 """The folder of `gsjax distill` read back: the field, its scene, and the photographs of it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,13 @@ import yaml
 from jaxtyping import Int
 
 from gsjax.data.photographs import Photographs
-from gsjax.engine.distill.file import FOLDER, NAME, StoredField, read_field
+from gsjax.engine.distill.file import FOLDER, NAME, read_field
 from gsjax.engine.distill.scene import SceneOptions, open_scene
 from gsjax.engine.files import read_drawable, read_options
 from gsjax.engine.folder import is_run
 from gsjax.engine.messages import Notes, describe
 from gsjax.engine.records import digest
+from gsjax.methods.distill import DistillResult
 from gsjax.methods.protocols import LanguageEncoder
 from gsjax.scene.gaussians import Gaussians
 
@@ -27,12 +28,12 @@ _OF_IMAGES = ("images", "scale", "frames", "cameras", "eval_cameras", "test_ever
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where that is now which a field goes with; where it was, unless given.
+    """Where the things are now that a field belongs to (default: where they were).
 
     Attributes:
-        scene: a PLY file.
+        scene: the scene's PLY file.
         images: the photographs.
-        weights: folder of CLIP's.
+        weights: folder of CLIP's weights.
     """
 
     scene: Path | None = None
@@ -45,22 +46,22 @@ AS_IT_WAS = Whereabouts()
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """A field and what it is of.
+    """A field and its scene.
 
     Attributes:
-        path: its folder.
-        stored: the field.
-        file: the scene's.
+        path: folder of the field.
+        stored: the field, with the means of the scene's Gaussians.
+        file: the scene's PLY file.
         gaussians: the scene.
-        rows: of the file, one for each Gaussian.
-        num_rows: of the file, those that cannot be drawn too.
-        labels: of each Gaussian, where the file has them.
+        rows: row of the file of each Gaussian.
+        num_rows: number of rows in the file, including Gaussians that cannot be drawn.
+        labels: label of each Gaussian, where the file has them.
         photographs: of the scene; None where these are no longer there.
-        weights: of CLIP, where they are now; where they were, unless given.
+        weights: folder of CLIP's weights (default: where they were).
     """
 
     path: Path
-    stored: StoredField
+    stored: DistillResult
     file: Path
     gaussians: Gaussians
     rows: Int[np.ndarray, "n"]
@@ -71,17 +72,17 @@ class FieldRun:
 
     @property
     def rasterize_mode(self) -> str:
-        """How its scene was fitted, and is drawn."""
+        """How the scene was fitted and is drawn: "classic" or "antialiased"."""
         return str(self.stored.scene.get("rasterize_mode", "classic"))
 
     @property
     def unit(self) -> str:
-        """Of lengths: only a sensor of depth makes them metres."""
+        """Unit of lengths: metres with a depth sensor, else unknown."""
         return "m" if self.photographs is not None and self.photographs.load_depth is not None else ""
 
     @cached_property
     def encoder(self) -> LanguageEncoder:
-        """Who reads texts in the space of the field's features.
+        """The encoder that reads texts in the space of the field's features.
 
         Raises:
             ValueError, FileNotFoundError: as `Source.encoder`.
@@ -90,7 +91,7 @@ class FieldRun:
 
 
 def field_of(path: Path) -> Path | None:
-    """The folder of the field that lies at `path`, or in the run there; None where there is none."""
+    """The folder of the field at `path`, or in the run there; None where there is none."""
     return next((folder for folder in (path, path / FOLDER) if (folder / NAME).is_file()), None)
 
 
@@ -109,13 +110,13 @@ def _is_of_distill(config: Path) -> bool:
 def open_field_run(
     folder: Path, notes: Notes, now: Whereabouts = AS_IT_WAS, *, photographs: bool = True
 ) -> FieldRun:
-    """Read it.
+    """Read a field and its scene.
 
     Args:
-        folder: that holds field.npz.
-        notes: told what is odd.
-        now: where things are.
-        photographs: whether they are wanted.
+        folder: the folder that holds field.npz.
+        notes: receives warnings.
+        now: where things are now.
+        photographs: whether to open the photographs too.
 
     Raises:
         FileNotFoundError: a file of it, or the scene, is missing.
@@ -131,21 +132,23 @@ def open_field_run(
             f"{gaussians.num} in {file}; --scene names another, or distil it again"
         )
     gaussians = jax.tree.map(jnp.asarray, gaussians)
+    stored = replace(stored, means=gaussians.means)
     shown = _photographs(folder, stored, file, gaussians, now.images, notes) if photographs else None
     of_file = (report.rows, report.stored, report.labels)
     return FieldRun(folder, stored, file, gaussians, *of_file, shown, now.weights)
 
 
-def _scene_file(folder: Path, stored: StoredField, given: Path | None, notes: Notes) -> Path:
-    """The PLY file that a field is of: by what is in it, wherever it was moved to."""
-    told, parent = Path(str(stored.scene.get("file"))), folder.absolute().parent
+def _scene_file(folder: Path, stored: DistillResult, given: Path | None, notes: Notes) -> Path:
+    """The PLY file of a field's scene, recognised by its content wherever it was moved to."""
+    was, parent = Path(stored.scene.get("file") or folder / "scene.ply"), folder.absolute().parent
     beside = (parent / "scene.ply", parent / "canonical" / "scene.ply", folder / "scene.ply")
-    there = [file for file in (told, *beside) if file.is_file()] if given is None else [given]
+    there = [file for file in (was, *beside) if file.is_file()] if given is None else [given]
     if not there or not there[0].is_file():
         raise FileNotFoundError(
-            f"{given or told}: expected the scene of {folder}, found no file; --scene names it"
+            f"{given or was}: expected the scene of {folder}, found no file; --scene names it"
         )
-    fitting = (file for file in there if digest(file) == stored.scene.get("sha256"))
+    sha256 = stored.scene.get("sha256")  # None for a field that was distilled in Python
+    fitting = (file for file in there if sha256 in (None, digest(file)))
     if (file := next(fitting, None)) is not None:
         return file
     notes.warn(
@@ -156,17 +159,16 @@ def _scene_file(folder: Path, stored: StoredField, given: Path | None, notes: No
 
 
 def _photographs(
-    folder: Path, stored: StoredField, file: Path, gaussians: Gaussians, images: str | None, notes: Notes
+    folder: Path, stored: DistillResult, file: Path, gaussians: Gaussians, images: str | None, notes: Notes
 ) -> Photographs | None:
-    """Those that the field tells of; None, and a warning, where they are not to be had.
+    """The photographs that the field learned from; None, and a warning, where they cannot be read.
 
     Raises:
         ValueError: they are not where `images` says.
     """
-    told = stored.scene.get("photographs")
     try:
         try:
-            options = _options(told, folder, file, images)
+            options = _options(stored.scene.get("photographs"), folder, file, images)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{folder / NAME}: expected which photographs it learned from, found others ({error}); "
@@ -183,8 +185,8 @@ def _photographs(
         return None
 
 
-def _options(settings: Mapping[str, Any], folder: Path, file: Path, images: str | None) -> SceneOptions:
-    """What was told `gsjax distill`, as far as it says which photographs."""
+def _options(settings: Any, folder: Path, file: Path, images: str | None) -> SceneOptions:
+    """The options of `gsjax distill` that chose the photographs."""
     chosen = {name: _tuple(settings[name]) for name in _OF_IMAGES}
     if images is not None:
         chosen["images"] = images
@@ -199,7 +201,7 @@ def _tuple(value: Any) -> Any:
 
 
 def short_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Short names of photographs, which files can have: of a recording's one frame, its cameras'."""
+    """Short names of photographs, fit for files: for one frame of a recording, those of its cameras."""
     parts = [name.rsplit("/", 1) for name in names]
     if all(len(part) == 2 for part in parts) and len({part[1] for part in parts}) == 1:
         short = [part[0] for part in parts]

@@ -1,5 +1,5 @@
-"""The scene that a field is distilled for, and the photographs of it: those of a run, or of a PLY file that
-others made."""
+"""The scene that a field is distilled for, and photographs of it: those of a run, or of a PLY file of another
+program."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,32 +27,33 @@ _OF_PHOTOGRAPHS = ("frames", "cameras", "eval_cameras", "test_every", "read")  #
 
 @dataclass(frozen=True)
 class SceneAndImages:
-    """A scene that stands, and where its photographs are."""
+    """A static scene, and where its photographs are."""
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCENE.ply")]
     """Folder of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame);
-    or a PLY file that anybody made, with --images and --out."""
+    or a PLY file of any program, with --images and --out."""
     images: str | None = None
-    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`, of which --frames,
-    --cameras, --eval-cameras and --test-every choose. Of a run, which has chosen: where they are now."""
+    """Photographs of a PLY file's scene, posed in its world: a folder, as for `gsjax fit`, from which
+    --frames, --cameras, --eval-cameras and --test-every choose. For a run, which has chosen: where they are
+    now."""
 
 
 @dataclass(frozen=True)
 class SceneOptions(HeldOutFrames, Selection, SceneAndImages):
-    """Which scene, and which photographs of it."""
+    """A scene, and which photographs of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldScene:
-    """What stands still while a field learns.
+    """A static scene and its photographs.
 
     Attributes:
         file: the PLY file.
         gaussians: the scene.
-        photographs: of it, posed as the scene was fitted.
-        taught: which of them may teach.
-        held_out: which of them only judge.
-        rasterize_mode: as the scene was fitted.
+        photographs: of the scene, posed as it was fitted.
+        taught: indices of the photographs to learn from.
+        held_out: indices of those that the field is only judged by.
+        rasterize_mode: as the scene was fitted: "classic" or "antialiased".
     """
 
     file: Path
@@ -67,11 +68,11 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
     """The scene and its photographs.
 
     Args:
-        options: which.
-        gaussians: the scene's, where they were read already.
+        options: which scene and photographs.
+        gaussians: the scene's, if they were read already.
 
     Raises:
-        ValueError, OSError: they are not there, or options are given that a run has chosen itself.
+        ValueError, OSError: they are not there, or options are given that the run has chosen itself.
     """
     path = options.scene
     if path.is_file():
@@ -89,17 +90,18 @@ def open_scene(options: SceneOptions, gaussians: Gaussians | None = None) -> Fie
             )
         scene = scene_of_run(path, options.images, gaussians)
     if not scene.gaussians.num:
-        raise ValueError(f"{scene.file}: expected Gaussians to give a meaning to, found none")
+        raise ValueError(f"{scene.file}: expected Gaussians, found none")
     return scaled(scene, options.scale)
 
 
 def scene_of_run(path: Path, images: str | None = None, gaussians: Gaussians | None = None) -> FieldScene:
-    """That of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical frame).
+    """The scene of a run of `gsjax fit`, `gsjax track` (its first frame) or `gsjax parts` (its canonical
+    frame).
 
     Args:
         path: the run's folder.
-        images: where its photographs are now; where they were, unless given.
-        gaussians: the scene's, where they were read already.
+        images: where its photographs are now (default: where they were).
+        gaussians: the scene's, if they were read already.
 
     Raises:
         FileNotFoundError, ValueError: there is no such run, or it has no scene, or no photographs that can be
@@ -142,9 +144,9 @@ def scene_of_file(
         file: the scene.
         images: a dataset.
         read: what its layout leaves open.
-        test_every: hold out every so-manieth photograph where the data has no split.
-        gaussians: the scene's, where they were read already.
-        **chosen: as `choose_photographs` has them.
+        test_every: hold out every n-th photograph where the data has no split.
+        gaussians: the scene's, if they were read already.
+        **chosen: as for `choose_photographs`.
 
     Raises:
         PlyError, DataError, ValueError: one of them cannot be read.
@@ -155,7 +157,7 @@ def scene_of_file(
 
 
 def scaled(scene: FieldScene, scale: float) -> FieldScene:
-    """With smaller photographs.
+    """The scene with smaller photographs.
 
     Raises:
         ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of them.
@@ -173,7 +175,7 @@ def _read(file: Path) -> Gaussians:
 
 
 def _as_learned(photographs: Photographs, file: Path) -> Photographs:
-    """With the poses that a fit found for its photographs, where it looked for them."""
+    """The photographs with the poses that the fit refined, where it did."""
     if not file.is_file():
         return photographs
     arrays = read_arrays(file, ("names", "viewmats"), _AGAIN)

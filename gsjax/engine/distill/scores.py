@@ -1,4 +1,4 @@
-"""How well a field says of views what its teacher would have said: angles, and masks of classes."""
+"""Scores of a field in views: angles to the teacher's features, and masks of classes."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -12,15 +12,15 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill import (
-    DistillBatch,
+    Batch,
     DistillConfig,
     FeatureField,
     Teacher,
-    carried,
     distill_loss,
     frozen_views,
     gaussian_cosines,
     painted_cosines,
+    rendered_features,
 )
 from gsjax.methods.distill.teacher import most_rows, of_view
 from gsjax.metrics.segmentation import MaskOverlap
@@ -38,14 +38,14 @@ class ClassScores:
     """Masks of classes in views, by either query, against true labels.
 
     Attributes:
-        by_pixel: overlaps of each class, by what pixels say (2D query).
-        in_space: the same by Gaussians, each of the class that it is nearest to, drawn (3D query).
+        by_pixel: overlaps of each class by pixels' own features (2D query).
+        in_space: overlaps by Gaussians, each drawn as the class that it is nearest to (3D query).
     """
 
     def __init__(self, names: Mapping[int, str]):
         """
         Args:
-            names: of true labels.
+            names: names of the true labels.
         """
         self.names = dict(names)
         self.by_pixel = {label: MaskOverlap() for label in names}
@@ -57,19 +57,19 @@ class ClassScores:
         in_space: Int[np.ndarray, "h w"],
         truth: Int[np.ndarray, "h w"],
     ) -> None:
-        """Count one view; -1 where nothing is said.
+        """Count one view; -1 where the class is unknown.
 
         Args:
             by_pixel: class of each pixel by its own features.
-            in_space: the same by the Gaussians that it shows.
-            truth: its true label.
+            in_space: class by the Gaussians that it shows.
+            truth: true label.
         """
         for label in self.names:
             self.by_pixel[label].add(by_pixel == label, truth == label)
             self.in_space[label].add(in_space == label, truth == label)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Of each class that occurred: name, iou and boundary_iou by either query."""
+        """Name, iou and boundary_iou by either query, for each class that occurred."""
         found = []
         for label, name in self.names.items():
             ours, theirs = self.by_pixel[label], self.in_space[label]
@@ -95,13 +95,13 @@ def class_maps(
     of_gaussians: Int[np.ndarray, "n"],
     strip_megabytes: float = 256.0,
 ) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Which class each pixel of a view is, by either query; -1 where little of the scene shows.
+    """The class of each pixel of a view, by either query; -1 where little of the scene shows.
 
     Args:
-        field, located: as queries take them.
+        field, located: as `gaussian_cosines` takes them.
         frozen: the view.
-        codes: of the classes.
-        of_gaussians: which class each Gaussian is (`classes_of`).
+        codes: vector of each class.
+        of_gaussians: class of each Gaussian (`classes_of`).
         strip_megabytes: memory of a strip; larger pictures are drawn strip by strip, to the same result.
     """
     view, plan = frozen
@@ -113,38 +113,40 @@ def class_maps(
 def classes_of(
     field: FeatureField, located: Located | None, codes: Float[np.ndarray, "k d"]
 ) -> Int[np.ndarray, "n"]:
-    """Which class each Gaussian is nearest to.
+    """The class that each Gaussian is nearest to.
 
     Args:
-        field: of features.
-        located: where in its grid the Gaussians lie, or None where it has a vector for each.
-        codes: what each class is called, in features.
+        field, located: as `gaussian_cosines` takes them.
+        codes: vector of each class.
     """
     return np.asarray(gaussian_cosines(field, located, jnp.asarray(codes)).argmax(axis=-1))
 
 
 def angle_error(config: DistillConfig) -> Callable[[FeatureField, Located | None, Frozen, Teacher], float]:
-    """1 - cosine to what a teacher of one view says, the mean over its pixels, by a program that is compiled
-    once for views of one kind."""
+    """A function for 1 - cosine to the teacher of one view, a mean over its pixels, compiled once for views
+    of one kind.
+
+    Args:
+        config: of the field.
+    """
     quiet = replace(config, weights=replace(config.weights, rec=1.0, contrast=0.0, tv=0.0))
     loss = jax.jit(partial(distill_loss(quiet), step=0, key=None), compiler_options=host_options())
 
     def error(field: FeatureField, located: Located | None, frozen: Frozen, teacher: Teacher) -> float:
         view, plan = frozen
-        rows = 1 << (most_rows(teacher) - 1).bit_length()  # few lengths
+        rows = 1 << (most_rows(teacher) - 1).bit_length()  # few lengths, so few programs
         ids, codebook = of_view(teacher, 0, rows)
-        said = None if teacher.maps is None else teacher.maps[0]
-        batch = DistillBatch(
-            view, located, jnp.asarray(ids), None if codebook is None else jnp.asarray(codebook), said, plan
-        )
+        of_pixels = None if teacher.maps is None else teacher.maps[0]
+        codebook = None if codebook is None else jnp.asarray(codebook)
+        batch = Batch(view, located, jnp.asarray(ids), codebook, of_pixels, plan)
         return float(loss(field, batch)[1]["cos"])
 
     return error
 
 
 def one_by_one(gaussians: Gaussians, cameras: Iterable[Camera], rasterize_mode: str) -> Iterator[Frozen]:
-    """The scene in each camera, of which only one is in memory. Lists are filled up to few lengths, which
-    never shrink, so that views of one size share what is compiled for them.
+    """The scene in each camera, one at a time in memory. Lists are padded to few lengths, which never
+    shrink, so that views of one size share a compiled program.
 
     Args:
         gaussians: the scene.
@@ -171,7 +173,7 @@ def _maps(
     plan: Plan,
     strip_megabytes: float,
 ):
-    parts = carried(field, located, view.rows)
+    parts = rendered_features(field, located, view.rows)
     kinds = jax.nn.one_hot(of_gaussians[view.rows], len(codes))
     rows = rows_within(strip_megabytes, 2 * (parts.values.shape[1] + len(codes)), plan)
 

@@ -1,4 +1,4 @@
-"""What a field's features mean: who made them, by which texts and pictures find their way back into them."""
+"""The encoder of a field's features, which takes texts and pictures into the same space."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -11,7 +11,7 @@ from gsjax.perception.codebook import ClassCodebook
 
 Kind = Literal["classes", "closed", "clip", "maskclip", "files"]
 KINDS = ("classes", "closed", "clip", "maskclip")
-SAID = {
+ABOUT = {
     "classes": "a code for each class: a stand-in for a model of language, which knows the labels' names",
     "closed": "colour and outline of each mask (a closed vocabulary; no foundation model)",
     "clip": "CLIP's vector of each mask's crop",
@@ -19,7 +19,7 @@ SAID = {
     "files": "features from files",
 }
 GENERIC = ("object", "things", "stuff", "texture")
-"""What a text is held against unless told otherwise (Kerr et al. 2023, "LERF", section 3.4)."""
+"""Negatives of a text by default (Kerr et al. 2023, "LERF", section 3.4)."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Source:
     """Where features come from.
 
     Attributes:
-        kind: which encoder.
-        names: of the labels, where names are features.
-        weights: the encoder's folder, or that of the files.
+        kind: the encoder; "files" for features of an unknown one.
+        names: names of the labels, where the features depend on them.
+        weights: folder of the encoder's weights, or of the feature files.
     """
 
     kind: Kind
@@ -41,25 +41,26 @@ class Source:
         """The inverse of `plain`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not one.
+            KeyError, TypeError, ValueError: it is not what `plain` makes.
         """
         names = {int(label): str(name) for label, name in stored["names"].items()}
-        if stored["kind"] not in SAID:
-            raise ValueError(f"kind: expected one of {', '.join(SAID)}, found {stored['kind']!r}")
+        if stored["kind"] not in ABOUT:
+            raise ValueError(f"kind: expected one of {', '.join(ABOUT)}, found {stored['kind']!r}")
         return Source(stored["kind"], names, stored["weights"])
 
     def plain(self) -> dict[str, Any]:
-        """What JSON can hold of it."""
+        """The source as JSON has it."""
         return asdict(self) | {"names": {str(label): name for label, name in self.names.items()}}
 
     def encoder(self, weights: Path | None = None) -> LanguageEncoder:
-        """Who reads texts in the space of these features.
+        """The encoder that reads texts in the space of these features.
 
         Args:
-            weights: of CLIP, where they are now; or for features from files, if they are CLIP's.
+            weights: folder of CLIP's weights (default: where they were); also for features from files, if
+                they are CLIP's.
 
         Raises:
-            ValueError: nobody does, a package is missing, or weights are given to one that has none.
+            ValueError: there is none, a package is missing, or weights are given for one that has none.
             FileNotFoundError: the weights are not there.
         """
         if self.kind in ("classes", "closed") and weights is not None:
@@ -70,8 +71,8 @@ class Source:
             return ClosedVocabulary(self.names, sizes=False)
         if self.kind == "files" and weights is None:
             raise ValueError(
-                "these features are from files, and nobody here reads texts in their space; if they are "
-                "CLIP's, --weights names its folder; else ask by --point, or in gsjax view for what is picked"
+                "these features are from files, and no encoder of their texts is known; if they are CLIP's, "
+                "--weights names its folder; else ask by --point, or in gsjax view for what is picked"
             )
         from gsjax.perception.clip import load_clip
 
@@ -81,10 +82,10 @@ class Source:
             raise FileNotFoundError(f"{error}; --weights says where they are now") from error
 
     def hint(self, weights: Path | None = None) -> str:
-        """What can be asked for, to who is about to.
+        """What can be asked for, in words.
 
         Args:
-            weights: of CLIP, where they are now; or for features from files, if they are CLIP's.
+            weights: as for `encoder`.
         """
         if self.kind == "classes":
             return "One of: " + ", ".join(sorted(self.names.values()))
@@ -95,8 +96,7 @@ class Source:
         return "Any words"
 
     def negatives(self, text: str) -> tuple[str, ...]:
-        """What a text is held against unless told: with classes all others, with CLIP what is meant by
-        nothing in particular."""
+        """Negatives of a text by default: all other classes; with CLIP, words for nothing in particular."""
         if self.kind == "classes":
             return ClassCodebook(self.names).others(text)
         return () if self.kind == "closed" else GENERIC

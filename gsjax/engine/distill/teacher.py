@@ -1,4 +1,4 @@
-"""What photographs are to say of a scene: whose masks, whose features, and where they are kept."""
+"""Teachers of photographs: whose masks, whose features, and where they are kept."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from gsjax.data.errors import DataWarning
 from gsjax.data.photographs import Photographs
 from gsjax.engine.distill.cache import FeatureCache, content_digest, folder_digest
 from gsjax.engine.distill.choice import TeacherChoice
-from gsjax.engine.distill.source import SAID, Source
+from gsjax.engine.distill.source import ABOUT, Source
 from gsjax.methods.distill import Teacher, teacher_of_maps, teacher_of_objects, with_maps
 from gsjax.methods.distill.teacher import UNKNOWN_ID
 from gsjax.methods.protocols import LanguageEncoder, Segmenter
@@ -24,17 +24,17 @@ from gsjax.perception.outlines import snap_outlines
 from gsjax.perception.segmenters import PieceSegmenter, PlaneOrRegionSegmenter
 
 _OF_OBJECTS = ("classes", "closed", "clip")
-_STRETCH = 0.02  # by which the sides of a feature file's masks may be off
+_STRETCH = 0.02  # tolerance of the logarithm of the aspect ratio of a feature file's masks
 _IN_FILES = "in the feature files"
-_VERSION = 2  # of what is kept; another one is worked out anew
+_VERSION = 2  # of kept outputs; those of others are computed again
 
 
 class _View(NamedTuple):
     """Masks of a photograph.
 
     Attributes:
-        ids: place in `labels` of what each pixel shows; -1 where nobody says.
-        labels: as they were given, in order; 0 is the background, which is one thing more.
+        ids: index in `labels` of what each pixel shows; -1 where unknown.
+        labels: the labels that occur, in order; 0 is the background, which is a thing like others.
     """
 
     ids: Int[np.ndarray, "h w"]
@@ -42,13 +42,13 @@ class _View(NamedTuple):
 
 
 class Teaching:
-    """Who says what of a scene's photographs. It is settled by those that are to teach, so that others are
-    asked about in the same terms.
+    """The teacher of a scene's photographs. Encoder and names are settled by those to learn from, so that
+    held-out photographs have features in the same terms.
 
     Attributes:
-        teacher: of those that are to teach, in their order.
+        teacher: of the photographs to learn from, in their order.
         source: of its features.
-        masks: whose: "files", "segment", "sam", "in the feature files", or "none".
+        masks: source of the masks: "files", "segment", "sam", "in the feature files", or "none".
         about: the features in words.
     """
 
@@ -60,14 +60,14 @@ class Teaching:
         cache: FeatureCache,
         console: Console,
     ):
-        """Has photographs segmented and encoded.
+        """Segments and encodes photographs.
 
         Args:
             photographs: of the scene.
-            indices: which of them are to teach.
-            asked: whose masks and features; checked.
-            cache: what was said before.
-            console: shows how far it is.
+            indices: indices of those to learn from.
+            asked: the choice of masks and features; checked.
+            cache: earlier outputs.
+            console: shows the progress.
 
         Raises:
             ValueError: there are no masks, feature files do not fit, or a package is missing.
@@ -75,7 +75,7 @@ class Teaching:
         """
         self._photographs, self._indices = photographs, list(indices)
         self._asked, self._cache = asked, cache
-        # What may be missing comes before what takes long.
+        # First what may be missing, then what takes long.
         clip, weights = (None, "") if asked.weights is None else _clip(asked.weights)
         reads = asked.masks != "segment" and asked.sam is None
         reads &= asked.masks == "files" or asked.features in ("auto", *_OF_OBJECTS)
@@ -94,8 +94,8 @@ class Teaching:
             {label + 1: name for label, name in names.items()},
             None if where is None else str(where.resolve()),
         )
-        self.about = SAID[kind] + (", and its vectors of patches" if asked.second == "maskclip" else "")
-        # To an encoder labels are 1 to n, whatever numbers they bear; CLIP knows no names.
+        self.about = ABOUT[kind] + (", and its vectors of patches" if asked.second == "maskclip" else "")
+        # For an encoder labels are 1 to n, whatever their values; CLIP needs no names.
         self._named = () if kind == "clip" else tuple(names)
         named = {n: names[label] for n, label in enumerate(self._named, start=1)}
         self._encoder: Any = Source(kind, named).encoder() if kind in ("classes", "closed") else clip
@@ -104,7 +104,7 @@ class Teaching:
         self.teacher = self._taught(views, console)
 
     def of(self, i: int) -> Teacher | None:
-        """What is said of one photograph, by its masks or else by its map; None where that is nothing.
+        """The teacher of one photograph, by its masks or else by its map; None where nothing is known.
 
         Raises:
             ValueError, OSError: it cannot be read, or its file of features does not fit.
@@ -131,11 +131,11 @@ class Teaching:
         return teacher_of_objects([ids], [rows]) if known else None
 
     def digest(self) -> str:
-        """Of all that is taught, and from where: whether two lessons are the same."""
-        said, photographs = self.teacher, self._photographs
-        arrays = {f"ids {v}": ids for v, ids in enumerate(said.ids)}
-        arrays |= {f"map {v}": one for v, one in enumerate(said.maps or ())}
-        arrays |= {} if said.codebook is None else {"codebook": said.codebook}
+        """SHA-256 over the teacher and the poses, which tells whether two distillations learn the same."""
+        teacher, photographs = self.teacher, self._photographs
+        arrays = {f"ids {v}": ids for v, ids in enumerate(teacher.ids)}
+        arrays |= {f"map {v}": one for v, one in enumerate(teacher.maps or ())}
+        arrays |= {} if teacher.codebook is None else {"codebook": teacher.codebook}
         arrays |= {name: getattr(photographs, name)[self._indices] for name in ("sizes", "Ks", "viewmats")}
         return content_digest("lesson", arrays)
 
@@ -161,7 +161,7 @@ class Teaching:
             shown = track(indices, "features", console=console, transient=True)
             rows = [self._embedded(i, view) for i, view in zip(shown, views, strict=True)]
             ids = [view.ids for view in views]
-        with warnings.catch_warnings():  # views that it counts have names here
+        with warnings.catch_warnings():  # named below
             warnings.filterwarnings("ignore", "views without any mask")
             teacher = teacher_of_objects(ids, rows)
         if self._asked.second != "none":
@@ -174,16 +174,16 @@ class Teaching:
             warnings.warn(message, DataWarning, stacklevel=2)
         return teacher
 
-    def _view(self, i: int, said: np.ndarray | None) -> _View:
-        """Masks of a photograph: those that a file says, or a segmenter."""
+    def _view(self, i: int, file: np.ndarray | None) -> _View:
+        """Masks of a photograph: those of its file, or a segmenter's."""
         photographs = self._photographs
-        labels = np.full(photographs.sizes[i][::-1], UNKNOWN_ID) if said is None else said.astype(np.int64)
+        labels = np.full(photographs.sizes[i][::-1], UNKNOWN_ID) if file is None else file.astype(np.int64)
         if (segmenter := self._segmenter) is not None:
             image, depth, K = photographs.image(i), photographs.depth(i), photographs.Ks[i]
             shown = {"image": image, "K": K} | ({} if depth is None else {"depth": depth})
             found = self._cache(self._segments, shown, lambda: {"labels": segmenter(image, depth, K)})
             labels = found["labels"].astype(np.int64)
-            if self.masks == "sam" or depth is None:  # these have no background: 0 is what lies in no mask
+            if self.masks == "sam" or depth is None:  # no background here: 0 is what lies in no mask
                 labels = np.where(labels == 0, UNKNOWN_ID, labels)
         if self._asked.snap:
             labels = snap_outlines(labels, photographs.image(i), self._asked.snap)
@@ -194,7 +194,7 @@ class Teaching:
         return _View((place.reshape(labels.shape) - unknown).astype(np.int32), there[unknown:])
 
     def _embedded(self, i: int, view: _View) -> Float[np.ndarray, "n d"]:
-        """The vectors of a photograph's labels; zeros of one that the encoder knows nothing of."""
+        """The vectors of a photograph's labels; zeros for one that the encoder does not know."""
         numbers = {label: n for n, label in enumerate(self._named, start=1)}
         of_labels = [numbers.setdefault(label, len(numbers) + 1) for label in view.labels.tolist()]
         image = self._photographs.image(i)
@@ -207,20 +207,20 @@ class Teaching:
         return self._cache(self._who, {"image": image, **view._asdict()}, embed)["rows"]
 
     def _of_patches(self, indices: Sequence[int], views: list[_View] | None, console: Console) -> Teacher:
-        """MaskCLIP's maps; masks, where there are any, say what is one thing."""
+        """MaskCLIP's maps; masks, where there are any, tell what is one thing."""
         from gsjax.perception.maskclip import MaskClipEncoder
 
         encoder, maps = MaskClipEncoder(self._encoder), []
         for i in track(indices, "patches", console=console, transient=True):
             image = self._photographs.image(i)
-            said = self._cache(
+            output = self._cache(
                 self._who_of_patches, {"image": image}, lambda image=image: {"map": encoder(image[None])[0]}
             )
-            maps.append(said["map"])
+            maps.append(output["map"])
         return teacher_of_maps(maps, self._sizes(indices), _ids(views))
 
     def _files(self, indices: Sequence[int]) -> list[PictureFeatures]:
-        """What a folder has of photographs."""
+        """Features of photographs from a folder."""
         folder, photographs = Path(self._asked.features), self._photographs
         found = read_feature_folder(folder, photographs.names, which=indices, level=self._asked.level)
         for one, i in zip(found, indices, strict=True):
@@ -228,17 +228,36 @@ class Teaching:
         return found
 
     def _sizes(self, indices: Sequence[int]) -> list[tuple[int, int]]:
-        """(height, width) of each."""
+        """(height, width) of each photograph."""
         return [tuple(self._photographs.sizes[i][::-1].tolist()) for i in indices]
 
 
-def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
-    """Which features and whose masks it is to be.
+def teacher_for(photographs: Photographs, wanted: Teacher | TeacherChoice | str) -> tuple[Teacher, Source]:
+    """A teacher of all photographs, and the source of its features.
 
     Args:
-        asked: what was asked for.
+        photographs: of the scene.
+        wanted: the teacher itself, a choice of one, or its features as `TeacherChoice.features` has them.
+
+    Raises:
+        ValueError, FileNotFoundError: as `TeacherChoice.check` and `Teaching`.
+    """
+    if isinstance(wanted, Teacher):
+        return wanted, Source("files")
+    choice = TeacherChoice(wanted) if isinstance(wanted, str) else wanted
+    choice.check()
+    every, quiet = range(photographs.num), Console(quiet=True)
+    teaching = Teaching(photographs, every, choice, FeatureCache(), quiet)
+    return teaching.teacher, teaching.source
+
+
+def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
+    """The kind of features and the source of masks, with "auto" settled.
+
+    Args:
+        asked: the choice.
         files: whether there are mask files.
-        name: of the photographs.
+        name: name of the photographs.
     """
     if asked.masks == "files" and not files:
         raise ValueError(f"--masks files: {name} has none of these photographs; use --masks segment")
@@ -257,7 +276,7 @@ def _settled(asked: TeacherChoice, files: bool, name: str) -> tuple[Any, str]:
 
 
 def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
-    """And by what its answers are told from those of others."""
+    """CLIP, and what identifies it in the cache."""
     from gsjax.perception.clip import load_clip
 
     try:
@@ -267,7 +286,7 @@ def _clip(weights: Path) -> tuple[LanguageEncoder, str]:
 
 
 def _segmenter(asked: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]:
-    """Whose masks are nobody's yet, and by what its answers are told from those of others."""
+    """The segmenter, where one is needed, and what identifies it in the cache."""
     if masks in ("files", "none"):
         return None, ""
     if asked.sam is None:
@@ -282,7 +301,7 @@ def _segmenter(asked: TeacherChoice, masks: str) -> tuple[Segmenter | None, str]
 
 
 def _names(views: list[_View], known: Mapping[int, str]) -> dict[int, str]:
-    """Of each label that occurs."""
+    """The name of each label that occurs."""
     there = sorted({label for view in views for label in view.labels.tolist() if label > 0})
     if there == [1] and not known:
         return {0: "background", 1: "foreground"}
@@ -294,7 +313,7 @@ def _ids(views: list[_View] | None) -> list[np.ndarray] | None:
 
 
 def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> None:
-    """Raises ValueError where a file is of a picture of another shape."""
+    """Raises a ValueError where a file belongs to a picture of another shape."""
     width, height = (int(side) for side in photographs.sizes[i])
     rows, columns = np.shape(one.ids if one.map is None else one.map)[:2]
     # A grid of square patches leaves up to one of them at the far side of each axis.
@@ -308,7 +327,7 @@ def _expect_shape(one: PictureFeatures, photographs: Photographs, i: int) -> Non
 
 
 def _as_large(one: PictureFeatures, photographs: Photographs, i: int) -> Int[np.ndarray, "h w"]:
-    """Rows of a file for each pixel of its photograph."""
+    """Row of a file's codebook for each pixel of its photograph."""
     assert one.ids is not None
     width, height = (int(side) for side in photographs.sizes[i])
     if one.ids.shape == (height, width):

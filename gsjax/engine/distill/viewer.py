@@ -1,45 +1,38 @@
-"""A field in the viewer: what the page asks it, and what it keeps."""
+"""A field in the viewer: queries, and what is kept of their results."""
 
 import threading
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float
 
-from gsjax.engine.distill.query import Question, select
+from gsjax.engine.distill.query import Question, select, timed_scores
 from gsjax.engine.distill.saved import FieldRun
 from gsjax.engine.selected import EXTRACTED, keep_part
-from gsjax.methods.distill import FeatureField, features_of, gaussian_cosines, threshold_for
+from gsjax.methods.distill import FeatureField, threshold_for
 from gsjax.viz.viewer import Answer, Asking
 
 
 def asking_of(run: FieldRun) -> Asking:
-    """How the page asks a field; what it saves goes to `extracted/` in the field's folder."""
-    grid, located = run.stored.at(run.gaussians.means)
-    # Asked again and again: features are worked out once, and who reads texts is loaded once.
-    field, one_by_one = FeatureField(features_of(grid, located), grid.lift), threading.Lock()
-    run = replace(run, stored=replace(run.stored, field=field, rows=None))
+    """Queries of a field for the viewer's page, which saves to `extracted/` in the field's folder."""
+    # Many queries follow: features are computed once, and the encoder of texts is loaded once.
+    field = FeatureField(run.stored.features(), run.stored.field.lift)
+    one_by_one, run = threading.Lock(), replace(run, stored=replace(run.stored, field=field, rows=None))
 
-    @jax.jit
-    def likeness(row):
+    def similarity(row: int) -> Float[Array, "n"]:
         vector = jnp.matmul(field.lift, field.encoding[row], precision="highest")
-        return gaussian_cosines(field, None, vector[None])[:, 0]
+        return run.stored.scores(vector[None])
 
     def ask(text: str, frame: int) -> Answer:
-        with one_by_one:  # several pages may ask before the encoder is loaded
+        with one_by_one:  # several pages may query before the encoder is loaded
             found = select(run, Question(text=text))
         return Answer(text, found.scores, found.threshold.value, found.threshold.rule, found.seconds)
 
     def like(row: int, frame: int) -> Answer:
-        jax.block_until_ready(likeness(jnp.asarray(row)))  # what compiles is no answer's time
-        begun = perf_counter()
-        scores = np.asarray(likeness(jnp.asarray(row)))
+        scores, seconds = timed_scores(lambda: similarity(row))
         threshold = threshold_for(scores, False)
-        seconds = perf_counter() - begun
         return Answer(f"like Gaussian {row}", scores, threshold.value, threshold.rule, seconds)
 
     def save(selected: Bool[np.ndarray, "n"], name: str, frame: int) -> Path:

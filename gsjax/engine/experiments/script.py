@@ -2,38 +2,48 @@
 
 import ast
 import hashlib
-import re
 import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
 from gsjax.engine.experiments.config import CONFIG, expect
 
+SHARED = "shared"
+"""The folder below the root that holds what experiments share."""
 
-def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:
+
+def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:
     """A script's `run`, and its `figure` or None.
 
+    The script is the module of its path, `experiments.NAME.sweep`, as with `python -m` from the folder that
+    holds the root. So it may import what experiments share, `experiments.shared.recordings`, and what stands
+    beside the root, such as `benchmarks`; and also, as with `python sweep.py`, what stands beside itself.
+
     Args:
-        name: of the experiment.
+        root: the folder of all experiments.
         path: of the script.
-        text: what stands in it; what runs is the text that the fingerprint is of.
+        text: the script's source; what runs is the text that was fingerprinted.
         described: whether the config describes a figure, so that there has to be one.
 
     Raises:
         ValueError: it cannot be loaded, or lacks a function.
     """
-    module = ModuleType("gsjax_experiment_" + re.sub(r"\W", "_", name))
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses and pickle look it up there
-    beside = str(path.resolve().parent)  # helpers may stand there, as with `python script.py`
-    if beside not in sys.path:
+    _make_importable(root.resolve())
+    if (beside := str(path.resolve().parent)) not in sys.path:
         sys.path.insert(0, beside)
+    name = _module_name(root, path)
+    spec = spec_from_file_location(name, path)
+    assert spec is not None
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses, pickle and other scripts look it up there
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
+        sys.modules.pop(name, None)
         found = f"{type(error).__name__}: {error}"
         raise ValueError(f"{path}: expected a script that can be loaded, found {found}") from error
     run, figure = getattr(module, "run", None), getattr(module, "figure", None)
@@ -43,31 +53,65 @@ def load_script(name: str, path: Path, text: str, described: bool) -> tuple[Call
     return run, figure
 
 
+def _make_importable(root: Path) -> None:
+    """Put what stands beside the root on Python's path, and make the root a package by its name.
+
+    Another folder of that name on the path, such as that of a checkout of gsjax, would otherwise be searched
+    as well. A package with an `__init__.py` stays what it is.
+    """
+    if str(root.parent) not in sys.path:
+        sys.path.insert(0, str(root.parent))
+    known = sys.modules.get(root.name)
+    is_regular = getattr(known, "__file__", None) is not None or (root / "__init__.py").exists()
+    if is_regular or list(getattr(known, "__path__", ())) == [str(root)]:
+        return
+    for name in [name for name in sys.modules if f"{name}.".startswith(f"{root.name}.")]:
+        del sys.modules[name]  # those of the other folder
+    spec = ModuleSpec(root.name, None, is_package=True)
+    spec.submodule_search_locations = [str(root)]
+    sys.modules[root.name] = module_from_spec(spec)
+
+
+def _module_name(root: Path, path: Path) -> str:
+    """The dotted name of a script, of which the root is the first part."""
+    root, path = root.resolve(), path.resolve().with_suffix("")
+    return ".".join(part.replace(".", "_") for part in (root.name, *path.relative_to(root).parts))
+
+
 def forget_scripts(root: Path) -> None:
-    """Have this process load scripts of experiments at `root`, and what stands beside them, anew when they
-    are imported next. What else is below `root`, as an environment, stays."""
+    """Remove the scripts of experiments at `root`, and the modules beside them, from this process, so that
+    they are loaded afresh when they are imported next. Other modules below `root`, as shared ones or those of
+    an environment, stay."""
     folders = {config.parent.resolve() for config in root.resolve().glob(f"*/{CONFIG}")}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if file is not None and Path(file).resolve().parent in folders:
             del sys.modules[name]
+            package, _, last = name.rpartition(".")
+            vars(sys.modules.get(package, module)).pop(last, None)  # `from package import last` looks there
     sys.path[:] = [path for path in sys.path if Path(path).resolve() not in folders]
 
 
-def fingerprint_of(path: Path, text: str, version: int) -> str:
+def fingerprint_of(root: Path, path: Path, text: str, version: int) -> str:
     """Changes with a script, with what stands beside it and with the config's version.
 
-    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax,
-    without `as`, which change where a module moved. Rows say themselves which gsjax made them.
+    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax or
+    from the experiments, without `as`, which change where a module moved. Rows say themselves which gsjax
+    and which shared modules made them.
 
     Args:
+        root: the folder of all experiments.
         path: of the script.
-        text: what stands in it.
+        text: the script's source.
         version: the config's.
     """
+
+    def moves(node: ast.AST) -> bool:
+        return _only_imports(node, ("gsjax", root.resolve().name))
+
     beside = sorted(other for other in path.parent.glob("*.py") if other.name != path.name)
-    helpers = [_without(other.read_text(encoding="utf-8"), _imports_gsjax) for other in beside]
-    script = _without(text, lambda node: _imports_gsjax(node) or _is_figure(node))
+    helpers = [_without(other.read_text(encoding="utf-8"), moves) for other in beside]
+    script = _without(text, lambda node: moves(node) or _is_figure(node))
     return hashlib.sha256("\n".join([str(version), script, *helpers]).encode()).hexdigest()[:16]
 
 
@@ -75,16 +119,16 @@ def _is_figure(node: ast.AST) -> bool:
     return isinstance(node, ast.FunctionDef) and node.name == "figure" and node.col_offset == 0
 
 
-def _imports_gsjax(node: ast.AST) -> bool:
-    """Whether it is an import of nothing but gsjax and its modules, under names that are their own: under
-    another name, one thing may stand for another without a change of what uses it."""
+def _only_imports(node: ast.AST, packages: tuple[str, ...]) -> bool:
+    """Whether it is an import of nothing but these packages and their modules, under names that are their
+    own: under another name, one thing may stand for another without a change of what uses it."""
     if isinstance(node, ast.Import | ast.ImportFrom) and any(alias.asname for alias in node.names):
         return False
     if isinstance(node, ast.ImportFrom):
         modules = [node.module or ""] if node.level == 0 else [""]
     else:
         modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [""]
-    return all(module.split(".")[0] == "gsjax" for module in modules)
+    return all(module.split(".")[0] in packages for module in modules)
 
 
 def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
@@ -104,14 +148,15 @@ def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
 
 
 def made_with_of(root: Path) -> str:
-    """Version of gsjax, and a hash of its sources and of what experiments share at their root: rows of one
-    table may have been made with several, which is said below it."""
+    """Version of gsjax, and a hash of its sources and of what experiments share: rows of one table may have
+    been made with several, which is noted below it."""
     return f"{import_module('gsjax').__version__}+{_hash_of(root.resolve())}"
 
 
 @cache
 def _hash_of(root: Path) -> str:
-    """Of gsjax's files and those at the root of the experiments, as they are when first asked for."""
+    """Hash of gsjax's files, of those at the root of the experiments and of its folder of shared ones, as
+    they are at the first call."""
     package = Path(import_module("gsjax").__file__).parent
-    paths = sorted(package.rglob("*.py")) + sorted(root.glob("*.py"))
+    paths = sorted(package.rglob("*.py")) + sorted(root.glob("*.py")) + sorted((root / SHARED).rglob("*.py"))
     return hashlib.sha256(b"\n".join(path.read_bytes() for path in paths)).hexdigest()[:8]

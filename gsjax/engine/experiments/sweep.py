@@ -77,7 +77,7 @@ class Experiment:
     @cached_property
     def fingerprint(self) -> str:
         """Of its script: what was made under another one is stale."""
-        return fingerprint_of(self.script, self.text, self.config.version)
+        return fingerprint_of(self.root, self.script, self.text, self.config.version)
 
     @property
     def made_with(self) -> str:
@@ -86,7 +86,7 @@ class Experiment:
 
     def load(self) -> tuple[Callable, Callable | None]:
         """The script's `run`, and its `figure` or None."""
-        return load_script(self.name, self.script, self.text, bool(self.config.figure))
+        return load_script(self.root, self.script, self.text, bool(self.config.figure))
 
     def path(self, cell: Cell) -> Path:
         """The file of a cell that was run from this machine."""

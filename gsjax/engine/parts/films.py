@@ -1,4 +1,4 @@
-"""The film that edits make of a run of `gsjax parts`, and its folder, whoever asks for it."""
+"""The film that edits make of a run of `gsjax parts`, and its folder."""
 
 import re
 import shutil
@@ -58,7 +58,7 @@ class Shot(NamedTuple):
 
 
 Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
-"""Passes on the frames of a film, of which there are so many; a KeyboardInterrupt from it ends the film."""
+"""(frames of a film, their number) -> the same frames; a KeyboardInterrupt from it ends the film."""
 
 
 def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
@@ -83,7 +83,7 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
 
 
 def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
-    """The id of the camera, of those that a run had, to which most looks different from the recording.
+    """The id of the camera of a run in which most differs from the recording.
 
     Args:
         film: what is filmed.
@@ -274,7 +274,7 @@ def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list
 
 
 def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
-    """The length, seconds, that fewer edits need to be told to make a film as long as this one."""
+    """The length, seconds, with which fewer edits make a film as long as this one."""
     recorded = saved.layer.trajectory.times
     step = 1 / script.fps if script.fps else float(np.median(np.diff(recorded)))
     return float(np.clip(float(film[0].trajectory.times[-1]) + step / 2, *LENGTHS))

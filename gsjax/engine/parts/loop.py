@@ -1,124 +1,145 @@
-"""The frames of `gsjax parts`: followed, shown and saved, until all are found."""
+"""The steps of `gsjax parts`: parts are followed through all frames, and then the scene is refined."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsjax.data import Sequence
-from gsjax.engine.messages import Notes, counted, reason
-from gsjax.methods.parts import Parts, PartsConfig, Start, follow, refine
-
-_LINES = 10  # of a log, about the frames of a run
+from gsjax.engine.drive import Tick, drive
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.messages import Notes, counted, reason, stage
+from gsjax.engine.progress import Progress, Schedule, load_run, means_of, watch
+from gsjax.io.checkpoints import load_checkpoint
+from gsjax.methods.parts import Discovery, Parts, Problem, RefineParams
+from gsjax.optim.method import Run
 
 
 @dataclass
-class Following:
-    """What following gave so far.
+class Loop:
+    """What the loops over steps need.
 
     Attributes:
-        parts: the state.
-        update_s: seconds of each frame, compiling apart.
-        losses: at the first and at the last steps of each frame.
-        skipped: steps that changed nothing, because a number in them was not finite.
-        joined: what became one: (part, into which).
-        divided: what became two: (new part, of which).
-        compile_s: seconds spent compiling, since it began or was resumed.
-        stopped: what ended it early, or None.
-    """
-
-    parts: Parts
-    update_s: list[float] = field(default_factory=list)
-    losses: list[tuple[float, float]] = field(default_factory=list)
-    skipped: int = 0
-    joined: list[tuple[int, int]] = field(default_factory=list)
-    divided: list[tuple[int, int]] = field(default_factory=list)
-    compile_s: float = 0.0
-    stopped: BaseException | None = None
-
-
-def follow_parts(
-    views: Sequence, start: Start, following: Following, config: PartsConfig, save: Any, console: Console
-) -> Following:
-    """Go on from what there is until all frames are found, Ctrl-C or an error; `save(following, last=...)` is
-    called after each.
-
-    Args:
-        views: the cameras that are looked through.
-        start: the canonical scene and what may move.
-        following: how far it is.
-        config: how parts are followed.
-        save: as above.
+        method, problem: which steps, of what.
+        run: how far it is.
+        progress: how it has gone so far.
+        seconds: by stage; added to.
+        folder: of the run.
+        notes: receive what is odd.
         console: shows how far it is.
     """
-    columns = (TextColumn("following parts"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    words = TextColumn("{task.description}")
-    if not console.is_terminal:
-        console.print(
-            "following parts; compiling, which takes a minute or two the first time", soft_wrap=True
-        )
-    with Progress(*columns, words, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(following.parts.done))
-        bar.update(task, completed=int(following.parts.done.sum()), description="compiling")
-        try:
-            frames = follow(views, start, following.parts, config)
-            for found in frames:
-                following.parts = found.parts
-                following.update_s.append(found.seconds)
-                following.compile_s += found.compile_seconds
-                few = max(1, len(found.losses) // 8)
-                following.losses.append((float(found.losses[:few].mean()), float(found.losses[-few:].mean())))
-                following.skipped += found.skipped
-                following.joined += found.joined
-                following.divided += found.divided
-                told = f"{counted(_count(found.parts), 'part')}, loss {following.losses[-1][1]:.4f}"
-                done, asked = int(found.parts.done.sum()), len(found.parts.done)
-                bar.update(task, completed=done, description=told)
-                if not console.is_terminal and _LINES * done // asked > _LINES * (done - 1) // asked:
-                    console.print(f"{done} of {asked} frames: {told}", soft_wrap=True)
-                save(following, last=False)
-        except (KeyboardInterrupt, Exception) as stopped:
-            following.stopped = stopped
-        save(following, last=True)
-    return following
 
+    method: Parts
+    problem: Problem
+    run: Run
+    progress: Progress
+    seconds: dict[str, float]
+    folder: RunFolder
+    notes: Notes
+    console: Console
 
-def refine_parts(
-    views: Sequence, parts: Parts, following: Following, config: PartsConfig, notes: Notes, console: Console
-) -> Parts:
-    """Parts with the scene and all poses fitted to all frames, as far as it came where it was stopped.
-    `following` is told of Ctrl-C.
+    def follow(self) -> None:
+        """Find the poses of all frames; a row of the progress for each."""
+        steps, frames = self.method.config.stream.iterations, self.problem.sequence.num_frames
+        total, progress = self.method.steps_of_frames(self.problem), self.progress
 
-    Args:
-        views: the cameras that are looked through.
-        parts: as they were followed.
-        following: how that went.
-        config: how parts are refined.
-        notes: told of what was left out.
-        console: shows how far it is.
-    """
-    done, skipped, steps = 0, [], config.refine.iterations
-    columns = (TextColumn("refining the scene over all frames"), BarColumn(), MofNCompleteColumn())
-    if steps and not console.is_terminal:
-        console.print("refining the scene over all frames", soft_wrap=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=steps)
-        try:
-            for refined in refine(views, parts, config):
-                parts, done = refined.parts, done + 1
-                skipped.append(refined.skipped)
-                bar.update(task, completed=done)
-        except (KeyboardInterrupt, OSError) as stopped:
-            notes.warn(
+        def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
+            """What the row of a frame has, after its last step."""
+            kept: Discovery = now.run.kept
+            return {
+                "frame": kept.frame,
+                "losses": _losses(infos),
+                "found": kept.count + 2,  # with the anchor and this one
+                "parts": int(np.asarray(kept.canonical.alive).sum()) - 1,
+                "update_s": progress.seconds - sum(update_seconds(progress)),
+            }
+
+        def in_words(row: Mapping[str, Any]) -> str:
+            loss = "" if row["losses"] is None else f", loss {row['losses'][1]:.4f}"
+            return f"{row['found']} of {frames} frames, {counted(row['parts'], 'part')}{loss}"
+
+        if self.run.step < total:
+            self._watch(Schedule("following parts", total, row, in_words, every=steps))
+        self.seconds |= {"updates": sum(update_seconds(progress)), "compile": progress.compile_seconds}
+
+    def finish(self) -> None:
+        """Leave out parts that no picture needs."""
+        if isinstance(self.run.params, RefineParams):
+            return
+        begun = perf_counter()
+        with stage(self.console, "leaving out parts that no picture needs"):
+            self.run = self.method.brought_up_to_date(self.problem, self.run)
+        self.seconds["finish"] = perf_counter() - begun
+        if not np.asarray(self.run.kept.weights)[:, 1:].any():
+            self.notes.warn("no part is left that any picture needs; the outcome is the canonical scene")
+
+    def refine(self) -> None:
+        """Fit the scene and all poses to all frames, as far as it comes where it is stopped. An error of the
+        system ends that early, and the run all the same is complete."""
+        steps, begun = self.method.config.refine.iterations, perf_counter()
+        first, total = self.method.steps_of_frames(self.problem), self.method.total(self.problem)
+        skipped = self.progress.skipped
+
+        def in_words(row: Mapping[str, Any]) -> str:
+            losses = row.get("losses") or [row.get("loss")]  # at first the newest row is a frame's
+            return "no finite loss" if losses[-1] is None else f"loss {losses[-1]:.4f}"
+
+        if steps:
+            self._watch(Schedule("refining the scene over all frames", total, means_of(), in_words))
+        self.seconds["refine"] = perf_counter() - begun
+        done, stopped = self.run.step - first, self.progress.stopped
+        if stopped is not None:
+            self.notes.warn(
                 f"the scene was refined by {done} of {steps} steps, and then stopped by {reason(stopped)}"
             )
-            following.stopped = stopped if isinstance(stopped, KeyboardInterrupt) else None
-    if lost := int(np.sum(skipped)):
-        notes.warn(f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite")
-    return parts
+            if isinstance(stopped, OSError):
+                self.progress.stopped = None
+        if lost := self.progress.skipped - skipped:
+            self.notes.warn(
+                f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite"
+            )
+
+    def _watch(self, schedule: Schedule) -> None:
+        """Go on to the last step of a schedule."""
+        ticks = drive(
+            self.method,
+            self.problem,
+            self.run,
+            progress=lambda step: step / schedule.total,
+            headroom=self.method.config.headroom,
+        )
+        try:
+            watch(ticks, self.progress, schedule, self.folder, self.console)
+        finally:
+            self.run = ticks.run
 
 
-def _count(parts: Parts) -> int:
-    return int(np.asarray(parts.canonical.alive).sum()) - 1
+def resumed(folder: RunFolder, run: Run, progress: Progress) -> tuple[Run, Progress]:
+    """The newest run that was saved, and how it had gone; those given where none was.
+
+    Args:
+        folder: of the run.
+        run, progress: before the first step.
+
+    Raises:
+        CheckpointError: there are only damaged ones, or one of an earlier version of gsjax.
+        ValueError: it is made from another canonical scene.
+    """
+    earlier = folder.resume / "parts.npz"  # versions up to 0.1 wrote one
+    if earlier.is_file():
+        load_checkpoint(earlier)
+    return load_run(folder.resume, run, progress)
+
+
+def update_seconds(progress: Progress) -> list[float]:
+    """Seconds of each frame that was followed, compiling apart."""
+    return [row["update_s"] for row in progress.rows if "update_s" in row]
+
+
+def _losses(infos: list[Mapping[str, Any]]) -> list[float] | None:
+    """The losses of a frame's picture at its first and at its last steps; None where none was finite."""
+    losses = np.array([float(info["now"]) for info in infos])
+    few = max(1, len(losses) // 8)
+    return [float(losses[:few].mean()), float(losses[-few:].mean())] if len(losses) else None

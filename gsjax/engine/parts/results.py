@@ -1,4 +1,4 @@
-"""What `gsjax parts` comes to: parts.npz, videos, scores, joints, the report."""
+"""The files of a run of `gsjax parts`: parts.npz, videos, scores, joints, the report."""
 
 import shlex
 from dataclasses import replace
@@ -13,10 +13,11 @@ from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.machine import in_words
 from gsjax.engine.messages import Notes, counted, reason
-from gsjax.engine.parts.loop import Following
-from gsjax.engine.parts.scoring import joints_of, part_rows, score_parts
+from gsjax.engine.parts.loop import update_seconds
+from gsjax.engine.parts.scoring import part_rows, score_parts
 from gsjax.engine.parts.views import part_views
 from gsjax.engine.pictures import Film
+from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording
 from gsjax.engine.report import Media, format_number, write_report
 from gsjax.engine.scores import CAMERA_COLUMNS, Scores, camera_metrics, camera_rows
@@ -24,7 +25,8 @@ from gsjax.engine.tables import Column, grid, table, time_table
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.parts import Parts, PartScene, PartsConfig, Start, Trajectory, outcome
+from gsjax.methods.parts import PartScene, PartsResult, Start, Trajectory
+from gsjax.optim.method import Run
 from gsjax.viz.colors import label_color
 
 PART_COLUMNS = (
@@ -58,9 +60,9 @@ def finished(
     folder: RunFolder,
     recording: Recording,
     start: Start,
-    parts: Parts,
-    following: Following,
-    config: PartsConfig,
+    run: Run,
+    found: PartsResult,
+    progress: Progress,
     seconds: dict[str, float],
     notes: Notes,
     console: Console,
@@ -69,26 +71,24 @@ def finished(
 
     Args:
         folder: of the run.
-        recording: what was looked through, and who judges.
+        recording: its tracked cameras, and those that are only judged.
         start: the canonical scene.
-        parts: as they were found.
-        following: how that went.
-        config: how they were found.
+        run: of the method, after its last step.
+        found: what it has come to.
+        progress: how that went.
         seconds: by stage, so far.
-        notes: told of what is odd.
+        notes: receive what is odd.
         console: shows how far it is.
     """
-    frames = np.flatnonzero(parts.done)
-    stopped = following.stopped
+    frames, kept = np.flatnonzero(found.done), run.kept
+    stopped, scene, trajectory = progress.stopped, found.scene, found.trajectory
     complete = stopped is None
     if stopped is not None:
         why = reason(stopped).rstrip(".")
         notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {why}.")
-    scene, trajectory = outcome(start, parts, recording.tracked.times)
-    write_parts(folder.path / "parts.npz", scene, trajectory, start.anchor.frame)
+    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor)
     write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
-    joints = joints_of(scene, trajectory, parts.done, float(parts.canonical.pixel))
-    scores = Scores(None, None)
+    joints, scores = found.joints(), Scores(None, None)
     if complete:
         colors = np.arange(scene.num_parts)
         try:
@@ -96,28 +96,26 @@ def finished(
                 Film(folder, recording, recording.tracked.num_frames, colors) as film,
                 console.status("") as status,
             ):
-                for frame in part_views(scene, trajectory, recording, config.stream.blend):
+                for frame in part_views(scene, trajectory, recording, found.blend):
                     status.update(f"rendering and scoring frame {frame[0].t + 1} of {len(frames)}")
                     for view in frame:
                         scores.add(view)
                         film.add(view)
         except (KeyboardInterrupt, OSError) as error:
             notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
-            following.stopped = error if isinstance(error, KeyboardInterrupt) else None
-    rows = part_rows(scene, trajectory, joints)
-    told = (
-        score_parts(
-            scene, trajectory, joints, rows, recording, start.anchor.frame, config.stream.blend, notes
+            progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
+    rows, against_truth = part_rows(scene, trajectory, joints), {}
+    if complete:
+        against_truth = score_parts(
+            scene, trajectory, joints, rows, recording, found.anchor, found.blend, notes
         )
-        if complete
-        else {}
-    )
-    sequence = recording.tracked
+    sequence, update_s = recording.tracked, update_seconds(progress)
     return {
         "kind": "parts",
         "dataset": sequence.name,
-        **ended(following.stopped),
-        "anchor": start.anchor.frame,
+        **ended(progress.stopped),
+        "anchor": found.anchor,
+        "steps": run.step,
         "frames": {
             "followed": len(frames),
             "asked": sequence.num_frames,
@@ -128,22 +126,23 @@ def finished(
         "tracked_cameras": list(sequence.camera_ids),
         "held_out_cameras": list(recording.held_out),
         "num_gaussians": scene.gaussians.num,
-        "movable": parts.canonical.movable.num,
+        "movable": kept.canonical.movable.num,
         "num_parts": scene.num_parts - 1,
         "pieces": int(start.masks.max()),
-        "joined": following.joined,
-        "divided": following.divided,
-        "skipped": following.skipped,
-        "ari": told.get("ari"),
-        "true_parts": told.get("true_parts"),
-        "missed": told.get("missed"),
+        "joined": kept.joined,
+        "divided": kept.divided,
+        "skipped": progress.skipped,
+        "ari": against_truth.get("ari"),
+        "true_parts": against_truth.get("true_parts"),
+        "missed": against_truth.get("missed"),
         "parts": rows,
         **camera_metrics(scores),
         "update_s": {
-            "median": float(np.median(following.update_s)) if following.update_s else None,
-            "p95": float(np.percentile(following.update_s, 95)) if following.update_s else None,
+            "median": float(np.median(update_s)) if update_s else None,
+            "p95": float(np.percentile(update_s, 95)) if update_s else None,
         },
         "seconds": seconds,
+        "curve": progress.rows,
         "machine": describe_machine(),
     }
 

@@ -14,9 +14,8 @@ import yaml
 from gsjax.engine.files import check_arrays, chosen_camera, read_arrays, read_scene, reopen
 from gsjax.engine.folder import expect_run
 from gsjax.engine.recording import Recording
-from gsjax.methods.parts import PartScene, trajectory_of
+from gsjax.methods.parts import PartScene, order_of_frames, trajectory_of
 from gsjax.methods.parts.film import Layer
-from gsjax.methods.parts.follow import order_of_frames
 from gsjax.methods.parts.timeline import Names
 from gsjax.scene.handles import Blend, HandlePose
 
@@ -53,7 +52,7 @@ class PartsRun:
     blend: Blend
 
     def camera(self, camera: int | None) -> int:
-        """The id of a camera of the run; the first held out one, else the first, unless given.
+        """The id of a camera of the run; default: the first held out one, else the first.
 
         Raises:
             ValueError: the run had no such camera.

@@ -1,78 +1,34 @@
-"""Parts that were found: how they moved, which joints explain that, and how both compare to the truth."""
+"""Scores of parts that were found: how they moved, and how they and their joints compare to the truth."""
 
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from gsjax.engine.messages import Notes
 from gsjax.engine.recording import Recording
 from gsjax.engine.scores import motion_metrics
-from gsjax.geometry.joints import FittedJoint, fit_joint
-from gsjax.geometry.rotations import quats_to_matrices
-from gsjax.methods.parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
-from gsjax.methods.parts.unify import motions_of
+from gsjax.geometry.joints import FittedJoint
+from gsjax.methods.parts import BACKGROUND, PartScene, Trajectory, gaussians_at, moment, motions_in_world
 from gsjax.metrics.parts import adjusted_rand_index, joint_error, match_parts
 from gsjax.metrics.tracking import relative_motion, score_tracks, true_labels
 from gsjax.scene.handles import Blend
 
-_POINTS = 500  # of a part, by which its joint is fitted ...
-_FAR = 3.0  # ... none so many times as far from its middle as half of them: there, noise of a turn is large
-_OFF_JOINT = 0.15  # share of its way that a part may be off its joint: small ones are followed no better
 _NAMED_IOU = 0.25  # overlap with a true part below which a found one does not bear its name
 _AROUND = 0.05 * np.concatenate([np.eye(3), -np.eye(3)])  # metres about an object of which nothing is drawn
 _STILL_MM = 2.0  # a true part that moves less cannot be found by its motion, and counts as background
 
 
-def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T P 4 4"]:
-    """The rigid motions of all parts against the canonical scene."""
-    rotations, shifts, centers = (
-        np.asarray(array, np.float64)
-        for array in (
-            quats_to_matrices(trajectory.poses.quats),
-            trajectory.poses.translations,
-            scene.centers,
-        )
-    )
-    motions = np.broadcast_to(np.eye(4), (*rotations.shape[:2], 4, 4)).copy()
-    motions[..., :3, :3], motions[..., :3, 3] = motions_of(rotations, shifts, centers)
-    return motions
-
-
-def joints_of(
-    scene: PartScene, trajectory: Trajectory, done: Bool[np.ndarray, "T"], noise_m: float
-) -> dict[int, FittedJoint]:
-    """The joint that explains the motion of each part best, over the frames that were found; what following
-    errs by is `noise_m`, metres.
-
-    Args:
-        scene: the parts.
-        trajectory: where they went.
-        done: frames that were found.
-        noise_m: as above.
-    """
-    motions, labels = motions_in_world(scene, trajectory)[done], np.asarray(scene.labels)
-    means = np.asarray(scene.gaussians.means, np.float64)
-    found = {}
-    for part in range(BACKGROUND + 1, scene.num_parts):
-        mine = means[labels == part]
-        far = np.linalg.norm(mine - np.median(mine, axis=0), axis=1)
-        mine = mine[far <= _FAR * np.median(far)]
-        some = mine[:: max(1, len(mine) // _POINTS)]
-        found[part] = fit_joint(motions[:, part], some, noise_m=noise_m, tolerance=_OFF_JOINT)
-    return found
-
-
 def part_rows(
     scene: PartScene, trajectory: Trajectory, joints: dict[int, FittedJoint]
 ) -> list[dict[str, Any]]:
-    """What is known of each part without truth, by the keys of `PART_COLUMNS`.
+    """A row for each part without what takes truth, by the keys of `PART_COLUMNS`.
 
     Args:
         scene: the parts.
         trajectory: where they went.
-        joints: what explains that, by part.
+        joints: the joint that explains each part's motion, by part.
     """
     motions, labels = motions_in_world(scene, trajectory), np.asarray(scene.labels)
     means = np.asarray(scene.gaussians.means, np.float64)
@@ -111,12 +67,12 @@ def score_parts(
 
     Args:
         scene, trajectory: the parts, and where they went.
-        joints: what explains that, by part.
+        joints: the joint that explains each part's motion, by part.
         rows: of `part_rows`; each gets the scores of its part.
         recording: with the truth.
         anchor: the canonical frame.
         blend: how turns of several parts are blended.
-        notes: told of what was not scored.
+        notes: receive what was not scored.
 
     Returns:
         `ari` (over the Gaussians whose true label is known), `true_parts` (those that move), `missed` (the

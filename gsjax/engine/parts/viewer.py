@@ -45,7 +45,7 @@ class Filmed:
 
     def viewable(self, film: Film, editing: Editing | None = None) -> Viewable:
         """A film to look at. What differs between its frames stands first; each frame is made when it is
-        looked at."""
+        shown."""
         times = np.asarray(film[0].trajectory.times)
         moves = np.concatenate([_moves(layer) for layer in film])
         order = np.argsort(~moves, kind="stable")

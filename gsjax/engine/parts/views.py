@@ -1,4 +1,4 @@
-"""What a scene whose parts were found looks like from each camera, frame by frame."""
+"""Views of a scene with parts from each camera, frame by frame."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -17,7 +17,7 @@ from gsjax.scene.render import Rendered, render
 def part_views(
     scene: PartScene, trajectory: Trajectory, recording: Recording, blend: Blend, every: int = 1
 ) -> Iterator[list[View]]:
-    """The views of all cameras, a list for every so-manieth frame; groups are the parts."""
+    """The views of all cameras, a list for every `every`-th frame; groups are the parts."""
 
     def at(t: int) -> tuple[PartScene, Moment]:
         return scene, moment(trajectory, t)

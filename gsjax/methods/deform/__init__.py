@@ -1,16 +1,23 @@
-"""Deforming scenes with meaning, from an endoscope say: SurstSplat (papers/003), GaussianClin (papers/004).
+"""Scenes that deform, with meaning, as seen by an endoscope: SurstSplat and GaussianClin.
 
-config      what can be set; the two papers' recipes
-start       the first Gaussians, of depth over time
-poses       where cameras stood, where that is refined
-nodes       which places the deformation is asked about
-graph       what the teacher says of nodes, and what it asks of their features
-step        deform, draw colours and features, compare, descend
-train       the host loop
-query       which Gaussians a prompt means
-facts       what can be said of a scene in numbers
-questions   what is asked in plain English
-answers     what is said to it, from facts
+method = Deform(config)
+problem, run = method.start(frames, lesson)
+for now in drive(method, problem, run): ...
+now.result.at(0.5)
+
+config.py     what can be set; the two papers' recipes
+method.py     what the loop has to know
+start.py      the first Gaussians, from depth over time or on a plane
+poses.py      where cameras stood, where that is refined
+nodes.py      the places where the field is evaluated
+graph.py      the teacher's features at nodes, and the losses on their edges
+update.py     the losses, and one step: deform, draw colours and features, compare, descend
+result.py     the scene at any time, and what is what in it
+meaning.py    what features mean, and what a text is among them
+query.py      which Gaussians a prompt means
+facts.py      measurements of a scene
+questions.py  questions in plain English
+answers.py    their answers, from facts
 """
 
 from gsjax.methods.deform.answers import Answer, PromptedAnswerer, TemplatedAnswerer, question_prompt
@@ -30,60 +37,54 @@ from gsjax.methods.deform.graph import (
     graph_of,
     seen_ids,
 )
-from gsjax.methods.deform.method import (
-    Advanced,
-    DeformProblem,
-    DeformState,
-    begin_deform,
-    compiled_step,
-    counted_ids,
-    of_step,
-    reconstruct,
-    with_field,
-)
+from gsjax.methods.deform.meaning import Lesson, Meaning, Wanted, counted_ids, wanted_like, wanted_text
+from gsjax.methods.deform.method import Deform, Kept, Problem, batch_of, with_field
 from gsjax.methods.deform.nodes import nodes_of
-from gsjax.methods.deform.poses import refined_viewmats
+from gsjax.methods.deform.poses import refined_viewmats, times_of
 from gsjax.methods.deform.query import prompt_probabilities
 from gsjax.methods.deform.questions import QUESTIONS, Question, QuestionType, parse_question, rows_of
-from gsjax.methods.deform.start import Look, begins, start_gaussians
+from gsjax.methods.deform.result import DeformResult, Timeline
+from gsjax.methods.deform.start import can_start_from, start_gaussians
 from gsjax.methods.deform.update import (
     Batch,
     DeformingScene,
     Moving,
     deform_loss,
-    deform_step,
     feature_loss,
     on_grid,
 )
+from gsjax.methods.deform.update import deform_step as step
 
 __all__ = [
     "PRESETS",
     "QUESTIONS",
-    "Advanced",
     "Answer",
     "Batch",
+    "Deform",
     "DeformConfig",
-    "DeformProblem",
     "DeformRatesConfig",
-    "DeformState",
+    "DeformResult",
     "DeformWeightsConfig",
     "DeformingScene",
     "FrameGraph",
     "GraphConfig",
-    "Look",
+    "Kept",
+    "Lesson",
+    "Meaning",
     "Moving",
+    "Problem",
     "PromptedAnswerer",
     "Question",
     "QuestionType",
     "SceneFacts",
     "Sight",
     "TemplatedAnswerer",
-    "begin_deform",
-    "begins",
-    "compiled_step",
+    "Timeline",
+    "Wanted",
+    "batch_of",
+    "can_start_from",
     "counted_ids",
     "deform_loss",
-    "deform_step",
     "facts_of_sights",
     "feature_loss",
     "frame_graphs",
@@ -91,16 +92,18 @@ __all__ = [
     "graph_nodes",
     "graph_of",
     "nodes_of",
-    "of_step",
     "on_grid",
     "parse_question",
     "prompt_probabilities",
     "question_prompt",
-    "reconstruct",
     "refined_viewmats",
     "rows_of",
     "scene_facts",
     "seen_ids",
     "start_gaussians",
+    "step",
+    "times_of",
+    "wanted_like",
+    "wanted_text",
     "with_field",
 ]

@@ -1,8 +1,8 @@
-"""Answers to questions on a deforming scene (papers/003, section 3.2; papers/004, section 4.3).
+"""Answers to questions on a deforming scene (SurstSplat, section 3.2; GaussianClin, section 4.3).
 
-The papers give Med-LLaVA the scene's features and let GPT-4 judge its sentences. Here whatever answers is
-given facts, numbers measured of the scene: by default templates of ten types of question, whose answers are
-values that can be checked; or a language model, by its user's own function.
+The papers give Med-LLaVA the scene's features and let GPT-4 judge its sentences. Here answers come from
+facts, numbers measured in the scene: by default from templates of ten types of question, whose answers are
+values that can be checked; or from a language model, by a custom function.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ from gsjax.methods.protocols import LanguageModel
 
 
 class Answer(NamedTuple):
-    """What is said to a question.
+    """The answer to a question.
 
     Attributes:
         text: a sentence.
-        value: what it comes to; None where it is not known, as of things that are not in view, or where only
-            the sentence says it.
+        value: of what was asked; None where it is not known, as of things that are not in view, or where
+            only the sentence has it.
         unit: of the value, "" if it has none.
     """
 
@@ -46,7 +46,7 @@ class TemplatedAnswerer:
 
 
 def _absent(asked: Question, facts: SceneFacts, row: int) -> str | None:
-    """That something asked about is not in view in the frame of a row; None if all is."""
+    """A sentence on the things in question that are not in view in the frame of a row; None if all are."""
     missing = [facts.names[k] for k in asked.things if not facts.present(row, k)]
     return f"There is no {' and no '.join(missing)} in frame {facts.frames[row]}." if missing else None
 
@@ -70,7 +70,7 @@ def _place(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
 
 
 def part_of_picture(x: float, y: float) -> str:
-    """Which of nine parts of a picture a place is in; x from the left, y from the top, 0 to 1."""
+    """The name of the ninth of a picture that a place is in; x from the left, y from the top, 0 to 1."""
     column, row = (min(2, int(3 * v)) for v in (x, y))
     name = f"{('upper', 'middle', 'lower')[row]} {('left', 'middle', 'right')[column]}"
     return "centre" if name == "middle middle" else name
@@ -150,14 +150,14 @@ def _when(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
     things = list(asked.things)
     words = " and ".join(facts.names[k] for k in things)
     if asked.event == "first seen":
-        score, said = np.where(facts.pieces[:, things[0]] > 0, 1.0, np.nan), "are first seen"
+        score, verb = np.where(facts.pieces[:, things[0]] > 0, 1.0, np.nan), "are first seen"
     elif asked.event == "touch":
         gaps = facts.gaps[:, things[0], things[1]]
-        score, said = np.where(gaps < TOUCH, 1.0, np.nan), "first touch"
+        score, verb = np.where(gaps < TOUCH, 1.0, np.nan), "first touch"
     elif asked.event == "nearest":
-        score, said = -facts.depths[:, things[0]], "are nearest to the camera"
+        score, verb = -facts.depths[:, things[0]], "are nearest to the camera"
     else:
-        score, said = speeds(facts, things[0]), "are fastest"
+        score, verb = speeds(facts, things[0]), "are fastest"
     if not np.isfinite(score).any():
         never = f"Never: in none of the {len(rows)} frames."
         if asked.event == "touch" and np.isfinite(gaps).any():
@@ -166,7 +166,7 @@ def _when(asked: Question, facts: SceneFacts, rows: list[int]) -> Answer:
         return Answer(never, None)
     frame = facts.frames[int(np.nanargmax(score))]
     return Answer(
-        f"{words} {said if len(things) == 2 else said.replace('are', 'is')} in frame {frame}.", frame
+        f"{words} {verb if len(things) == 2 else verb.replace('are', 'is')} in frame {frame}.", frame
     )
 
 
@@ -215,7 +215,7 @@ class PromptedAnswerer:
 
 
 def question_prompt(question: str, facts: SceneFacts) -> str:
-    """What a language model is told: the facts in words, and the question."""
+    """The prompt for a language model: the facts in words, and the question."""
     lines = [
         "A scene seen by an endoscope was reconstructed and measured. Answer the question from these facts "
         "alone, in one sentence; if they do not say it, say so.",
@@ -225,12 +225,12 @@ def question_prompt(question: str, facts: SceneFacts) -> str:
     ]
     for row, number in enumerate(facts.frames):
         lines.append(f"Frame {number}:")
-        lines += [f"- {_told(facts, row, k)}" for k in range(len(facts.names))]
+        lines += [f"- {_in_words(facts, row, k)}" for k in range(len(facts.names))]
     return "\n".join([*lines, "", f"Question: {question.strip()}", "Answer:"])
 
 
-def _told(facts: SceneFacts, row: int, thing: int) -> str:
-    """What is known of a class in a frame, in words."""
+def _in_words(facts: SceneFacts, row: int, thing: int) -> str:
+    """The facts of a class in a frame, in words."""
     if not facts.present(row, thing):
         return f"{facts.names[thing]}: not in view"
     x, y = facts.places[row, thing]

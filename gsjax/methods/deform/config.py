@@ -1,4 +1,4 @@
-"""What can be set of a deforming scene, and the two papers' recipes."""
+"""Settings of a deforming scene, and the two papers' recipes."""
 
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -13,26 +13,26 @@ from gsjax.scene.deformation import DeformationConfig
 
 @dataclass(frozen=True)
 class DeformRatesConfig:
-    """Rates of Adam, by which one step changes a number at most."""
+    """Learning rates of Adam: the most by which a step changes a number."""
 
     means: float = 1.6e-4
-    """Of centres, in radii of the scene."""
+    """Learning rate of the centres, in radii of the scene."""
     quats: float = 1e-3
-    """Of orientations."""
+    """Learning rate of the orientations."""
     log_scales: float = 5e-3
-    """Of logarithms of sizes."""
+    """Learning rate of the logarithms of sizes."""
     logit_opacities: float = 2.5e-2
-    """Of logits of opacities."""
+    """Learning rate of the logits of opacities."""
     sh0: float = 2.5e-3
-    """Of colours."""
+    """Learning rate of the colours."""
     features: float = 2.5e-3
-    """Of semantic features."""
+    """Learning rate of the semantic features."""
     planes: float = 1e-2
-    """Of what stands at the vertices of the field's planes or voxels."""
+    """Learning rate of the values at vertices of the field's planes or voxels."""
     layers: float = 1e-3
-    """Of the field's network."""
+    """Learning rate of the field's network."""
     twists: float = 1e-3
-    """Of poses, where they are refined: turns in radians, shifts in radii of the scene."""
+    """Learning rate of the poses, where they are refined: rotations in radians, shifts in radii."""
 
     def __post_init__(self):
         expect(self, "rates.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -40,20 +40,20 @@ class DeformRatesConfig:
 
 @dataclass(frozen=True)
 class DeformWeightsConfig:
-    """What each loss counts in the sum."""
+    """Weights of the losses."""
 
     dssim: float = 0.2
-    """lambda of (1 - lambda) L1 + lambda D-SSIM (papers/003, eq. 13)."""
+    """lambda of (1 - lambda) L1 + lambda D-SSIM (SurstSplat, eq. 13)."""
     depth: float = 1.0
-    """Of the difference in depth, in radii of the scene; 0: depth is for the start alone."""
+    """Weight of the difference in depth, in radii of the scene; 0: depth serves the start alone."""
     feature: float = 1.0
-    """Of the difference in features, where there is a teacher (papers/004, eq. 10)."""
+    """Weight of the difference in features, where there is a teacher (GaussianClin, eq. 10)."""
     plane_tv: float = 2e-4
-    """Of differences between neighbours on the field's planes of space (4DGS)."""
+    """Weight of differences between neighbours on the field's planes of space (4DGS)."""
     time_smoothness: float = 1e-3
-    """Of second differences over time on the field's planes of time (4DGS)."""
+    """Weight of second differences over time on the field's planes of time (4DGS)."""
     time_sparsity: float = 1e-4
-    """Of how far the planes of time are from 1, where nothing moves (4DGS)."""
+    """Weight of the distance of the planes of time from 1, where nothing moves (4DGS)."""
 
     def __post_init__(self):
         expect(self, "weights.", **dict.fromkeys(vars(self), (0, np.inf)))
@@ -64,24 +64,24 @@ class DeformConfig:
     """How a deforming scene is reconstructed."""
 
     warmup: int = 1000
-    """Steps in which the canonical scene learns alone (papers/004, section A)."""
+    """Steps in which the canonical scene learns alone (GaussianClin, section A)."""
     iterations: int = 3000
     """Steps after these, in which scene and deformation learn together."""
     start_pixels: float = 1.3
     """Edge of the cubes that are thinned to one of the first Gaussians, in pixels."""
     plane_depth: float = 1.0
-    """Without depth the scene begins on a plane, so far before the first camera, in the unit of the poses; of
-    no matter for a camera that stands still."""
+    """Distance from the first camera to the plane on which the scene begins without depth, in the unit of the
+    poses; it makes no difference to a camera that stands still."""
     warmup_frames: Literal["first", "all"] = "first"
-    """What the canonical scene learns from: the frame at which it begins, or all."""
+    """Frames that the canonical scene learns from: the one at which it begins, or all."""
     refine_poses: bool = False
-    """Let cameras be turned and shifted from where they are said to be, all but the first look's."""
+    """Rotate and shift the cameras of all frames but the first from their given poses."""
     nodes: int = 2048
-    """Places that the field is asked about, whose answers Gaussians blend; 0: it is asked about every
-    Gaussian, as the papers have it."""
+    """Places at which the field is evaluated, whose values Gaussians blend; 0: it is evaluated at every
+    Gaussian, as in the papers."""
     moving_share: float = 1.0
     """Without nodes, the share of the Gaussians that go on deforming after a quarter of the steps with
-    deformation: those that moved farthest until then. The others stand still and cost the field nothing."""
+    deformation: those that moved farthest by then. The others stand still and cost the field nothing."""
     optimizer: Literal["adam", "adamw"] = "adam"
     """Adam, or AdamW, which also shrinks all numbers by 1e-5 of a rate."""
     schedule: Literal["exponential", "cosine"] = "exponential"
@@ -91,9 +91,9 @@ class DeformConfig:
     weights: DeformWeightsConfig = field(default_factory=DeformWeightsConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     channels: int = 16
-    """Numbers of a Gaussian's feature, where there is a teacher."""
+    """Channels of a Gaussian's feature, where there is a teacher."""
     seed: int = 0
-    """Of first values and of the order of frames."""
+    """Seed of the first values and of the order of frames."""
 
     def __post_init__(self):
         expect(
@@ -121,5 +121,5 @@ PRESETS = MappingProxyType(
         "surst": DeformConfig(optimizer="adamw", schedule="cosine"),
     }
 )
-"""The two papers' recipes: GaussianClin (papers/004, section A: Adam, 1k canonical and 3k joint iterations),
-and SurstSplat (papers/003, section 3: AdamW, cosine, weight decay 1e-5)."""
+"""The two papers' recipes: GaussianClin (section A: Adam, 1k canonical and 3k joint iterations), and
+SurstSplat (section 3: AdamW, cosine, weight decay 1e-5)."""

@@ -1,8 +1,9 @@
-"""What can be said in numbers of a deforming scene at some frames: where its classes are, how deep, how far
-from each other, and how they move. Questions are answered from these alone (`questions`)."""
+"""Measurements of a deforming scene at some frames: where its classes are, how deep, how far from each other,
+and how they move. Questions are answered from these alone (`questions`)."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -16,12 +17,12 @@ from scipy.spatial import cKDTree
 from gsjax.geometry.cameras import Camera, pixels_of
 from gsjax.methods.deform.query import most_likely, prompt_probabilities
 from gsjax.methods.deform.update import DeformingScene, Moving
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import HEADROOM, Plan, with_room
+from gsjax.rasterize.rasterization import Meta
 from gsjax.scene.render import plan_render, render
 
 LEAST_SHARE = 1e-3
 """Of the picture: pieces of a class that are smaller are taken for specks."""
-_HEADROOM = 1.3
 _DRAWN = 0.5  # alpha below which a pixel shows nothing
 _SOLID = 0.3  # opacity below which a Gaussian is no part of a surface
 _NEAR = 0.03  # share of the depth by which a Gaussian may lie before or behind what its pixel sees
@@ -51,16 +52,16 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneFacts:
-    """Of k classes in T frames. What a class does not have, where it is not in view, is NaN.
+    """Measurements of k classes in T frames. What a class does not have, where it is not in view, is NaN.
 
     Attributes:
         names: of classes.
-        frames: what the recording calls them, in order.
+        frames: the recording's own numbers, in order.
         times: of these, 0 to 1 over the recording.
         unit: of lengths: "mm", or "% of the depth" in a scene of no known scale.
-        gaussians: that mean the class, in the whole scene.
+        gaussians: number of those that mean the class, in the whole scene.
         shares: of the picture that the class covers; 0 where it is not in view.
-        pieces: that it has in the picture, connected by sides or corners.
+        pieces: number of those in the picture, connected by sides or corners.
         places: their centre in the picture, from the left and from the top, 0 to 1.
         depths: median along the camera's axis.
         centers: of its visible points, in axes of the camera: right, down, forward.
@@ -141,12 +142,12 @@ def scene_facts(
     the first of the frames, unless two are as likely (`prompt_probabilities`).
 
     Args:
-        scene, moving: as `DeformingScene.at` has them.
+        scene, moving: as for `DeformingScene.at`.
         times: of the frames, 0 to 1.
         cameras: one a frame, viewmat [T,4,4] and K [T,3,3].
-        codebook: what each class is like, in the scene's channels.
-        names: of these.
-        frames: what the recording calls the frames.
+        codebook: the feature of each class, in the scene's channels.
+        names: of the classes.
+        frames: the recording's own numbers of the frames.
         metric: whether the scene's unit is the metre, and lengths are given in mm; if not, they are given in
             per cent of the median depth of all that the first frame shows.
 
@@ -166,10 +167,10 @@ def scene_facts(
         )
     features = scene.at(jnp.asarray(times[0], features.dtype), moving).features
     assert features is not None
-    said = np.asarray(prompt_probabilities(features, jnp.asarray(codebook, features.dtype)))
-    of = np.where(np.asarray(scene.gaussians.opacities) > _SOLID, most_likely(said), -1)
-    counts = np.array([(of == k).sum() for k in range(len(names))])
-    rows = tuple(_thinned(np.flatnonzero(of == k)) for k in range(len(names)))
+    likely = np.asarray(prompt_probabilities(features, jnp.asarray(codebook, features.dtype)))
+    labels = np.where(np.asarray(scene.gaussians.opacities) > _SOLID, most_likely(likely), -1)
+    counts = np.array([(labels == k).sum() for k in range(len(names))])
+    rows = tuple(_thinned(np.flatnonzero(labels == k)) for k in range(len(names)))
     sights = _sights(scene, moving, times, cameras, codebook, rows)
     facts = facts_of_sights(sights, names, frames, times, metric=metric)
     return replace(facts, gaussians=counts)
@@ -187,19 +188,16 @@ def _sights(
     codebook: Float[np.ndarray, "k c"],
     rows: tuple[Int[np.ndarray, "_"], ...],
 ) -> Iterator[Sight]:
-    """What each frame shows, drawn when it is asked for."""
+    """What each frame shows, drawn as it is asked for."""
     codes = jnp.asarray(codebook, jnp.float32)
     plan = None
     for i, time in enumerate(times):
         camera = replace(cameras, viewmat=cameras.viewmat[i : i + 1], K=cameras.K[i : i + 1])
         now = jnp.asarray(time, jnp.float32)
         if plan is None:
-            plan = plan_render(scene.at(now, moving), camera, headroom=_HEADROOM)
-        while True:
-            means, labels, depths, overflow, needed = _drawn(scene, moving, now, camera, codes, plan)
-            if not bool(overflow):
-                break
-            plan = plan.grown(int(needed), _HEADROOM)
+            plan = plan_render(scene.at(now, moving), camera, headroom=HEADROOM)
+        draw = partial(_drawn, scene, moving, now, camera, codes)
+        (means, labels, depths), plan = with_room(draw, plan)
         places = np.asarray(means)
         viewmat, K = np.asarray(camera.viewmat[0]), np.asarray(camera.K[0])
         yield Sight(np.asarray(labels), np.asarray(depths), viewmat, K, tuple(places[r] for r in rows))
@@ -213,14 +211,14 @@ def _drawn(
     camera: Camera,
     codebook: Float[Array, "k c"],
     plan: Plan,
-):
+) -> tuple[tuple[Float[Array, "n 3"], Int[Array, "h w"], Float[Array, "h w"]], Meta]:
     now = scene.at(time, moving)
     drawn = render(now, camera, plan)
     assert drawn.features is not None
-    said = prompt_probabilities(drawn.features[0], codebook)
-    shown = (drawn.alphas[0] > _DRAWN) & (said.max(axis=-1) > said.min(axis=-1))
-    labels = jnp.where(shown, said.argmax(axis=-1), -1)
-    return now.means, labels, drawn.depths[0], drawn.meta.overflow.any(), drawn.meta.needed.max()
+    likely = prompt_probabilities(drawn.features[0], codebook)
+    shown = (drawn.alphas[0] > _DRAWN) & (likely.max(axis=-1) > likely.min(axis=-1))
+    labels = jnp.where(shown, likely.argmax(axis=-1), -1)
+    return (now.means, labels, drawn.depths[0]), drawn.meta._replace(features=None)
 
 
 def facts_of_sights(
@@ -255,7 +253,7 @@ def facts_of_sights(
 
 
 class _Shown(NamedTuple):
-    """What `SceneFacts` has of one frame, and which points of each class are visible in it."""
+    """Measurements of one frame, as in `SceneFacts`, and which points of each class are visible in it."""
 
     shares: Float[np.ndarray, "k"]
     pieces: Int[np.ndarray, "k"]
@@ -304,7 +302,7 @@ def _shown(sight: Sight, scale: float) -> _Shown:
 def _ways(
     seen: list[Sight], visible: list[tuple[np.ndarray, ...]], scale: float
 ) -> tuple[Float[np.ndarray, "T T k"], Float[np.ndarray, "T T k 3"]]:
-    """How points go from each frame to each other one, as `SceneFacts` has it."""
+    """How points move from each frame to each other one, as in `SceneFacts`."""
     count, classes = len(seen), len(seen[0].points)
     moved, shifts = np.full((count, count, classes), np.nan), np.full((count, count, classes, 3), np.nan)
     for k in range(classes):
@@ -318,13 +316,13 @@ def _ways(
 
 
 def _median_depth(sight: Sight) -> float:
-    """Of all that a frame shows; 1 where that is nothing."""
+    """Median depth of all that a frame shows; 1 where that is nothing."""
     drawn = sight.depths[(sight.labels >= 0) & (sight.depths > 0)]
     return float(np.median(drawn)) if len(drawn) else 1.0
 
 
 def _without_specks(mask: Bool[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h w"], int]:
-    """Pieces of a mask that are no specks, and how many they are."""
+    """Pieces of a mask that are no specks, and their number."""
     _, found, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     large = 1 + np.flatnonzero(about[1:, cv2.CC_STAT_AREA] >= LEAST_SHARE * mask.size)
     return np.isin(found, large), len(large)
@@ -355,7 +353,12 @@ def _behind(mask: Bool[np.ndarray, "h w"], sight: Sight) -> Float[np.ndarray, "n
 
 
 def _gap(one: Float[np.ndarray, "_ 3"], other: Float[np.ndarray, "_ 3"], nearest: int) -> float:
-    """How near two sets of points come, by the so-manieth nearest of the smaller one; NaN of too few."""
+    """The distance of two sets of points: that of the n-th nearest point of the smaller one; NaN of too few.
+
+    Args:
+        one, other: the sets.
+        nearest: n, 1 or more.
+    """
     few, many = sorted((one, other), key=len)
     if len(few) < nearest:
         return np.nan

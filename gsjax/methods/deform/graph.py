@@ -1,8 +1,9 @@
-"""The graph over a scene that moves: what the teacher says of nodes, and what it asks of their features.
+"""The graph over a scene that moves: the teacher's features at nodes, and the losses that tie the scene's
+features to them.
 
-Nodes are Gaussians far from each other, the same in all frames, for the scene is one and moves. At a look a
-node is there if the look shows it: it falls on a pixel that counts, and lies at the depth that is seen there.
-A step has the graph of its look and of those around it. Where all looks are known it is made once, on the
+Nodes are Gaussians far from each other, the same in all frames, for the scene is one and moves. In a frame a
+node is valid if the frame shows it: it falls on a pixel that counts, at the depth that is seen there.
+A step has the graph of its frame and of those around it. Where all frames are known it is made once, on the
 host (`frame_graphs`); where they come one by one, within the step (`seen_ids`, `graph_of`).
 """
 
@@ -27,23 +28,25 @@ from gsjax.losses.edges import (
     temporal_edges,
 )
 from gsjax.losses.graph import node_loss, similarity_loss, structure_loss
-from gsjax.methods.deform.start import Look, known_depth
+from gsjax.methods.deform.poses import times_of
+from gsjax.methods.deform.start import known_depth
 from gsjax.methods.settings import expect
+from gsjax.scene.frame import Frame
 
 _NEAR = 0.05  # share of the depth by which what is seen may lie before or behind a node
 
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Nodes and edges, and what each loss counts; the defaults are SurstSplat's (papers/003, section 3)."""
+    """Nodes, edges, and weights of the losses; the defaults are SurstSplat's (section 3)."""
 
     kind: Literal["matching", "similarity", "none"] = "matching"
-    """SurstSplat's node and structure losses (eqs. 11 and 12), GaussianClin's similar pairs (papers/004,
-    eq. 8), or no graph."""
+    """SurstSplat's node and structure losses (eqs. 11 and 12), GaussianClin's similar pairs (eq. 8), or no
+    graph."""
     after: float = 0.5
-    """Share of the steps with deformation before the graph is made: it wants to know where nodes are when."""
+    """Share of the steps with deformation before the graph is made, which needs to know how nodes move."""
     nodes: int = 256
-    """How many."""
+    """Number of nodes."""
     neighbors: int = 8
     """Edges from a node within its frame."""
     matches: int = 4
@@ -51,17 +54,17 @@ class GraphConfig:
     window: int = 2
     """Frames to either side."""
     tau_x: float = 0.1
-    """Distance over which edges lose weight (eq. 8), in radii of the scene."""
+    """Distance over which edges lose weight (SurstSplat, eq. 8), in radii of the scene."""
     tau_t: float = 0.5
     """Time over which edges lose weight, as a share of the window."""
     node: float = 0.1
-    """Of L_node."""
+    """Weight of SurstSplat's node loss."""
     structure: float = 0.1
-    """Of L_mat."""
+    """Weight of SurstSplat's structure loss."""
     spatial: float = 0.1
-    """Of GaussianClin's pairs within a frame."""
+    """Weight of GaussianClin's pairs within a frame."""
     temporal: float = 0.1
-    """Of GaussianClin's pairs across frames."""
+    """Weight of GaussianClin's pairs across frames."""
 
     def __post_init__(self):
         expect(
@@ -79,13 +82,13 @@ class GraphConfig:
 
 
 class FrameGraph(NamedTuple):
-    """The graph of a look and of those around it, T of them.
+    """The graph of a frame and of those around it, T of them.
 
     Attributes:
         nodes: rows of the Gaussians that are nodes.
         times: of the frames, 0 to 1.
-        teacher: what it says of nodes, in the scene's channels.
-        valid: where it says something.
+        teacher: its features at nodes, in the scene's channels.
+        valid: where it has one.
         edges: of each kind, spatial and temporal together for a matching, else one after the other.
         wanted: the teacher's affinities of edges; None without a matching.
         weights: of edges; None without a matching.
@@ -101,31 +104,33 @@ class FrameGraph(NamedTuple):
 
 
 def frame_graphs(
-    places: Float[np.ndarray, "looks n 3"],
+    places: Float[np.ndarray, "frames n 3"],
     nodes: Int[np.ndarray, "n"],
-    looks: Sequence[Look],
+    frames: Sequence[Frame],
+    ids: Sequence[Int[np.ndarray, "h w"]],
     codebook: Float[np.ndarray, "k c"],
     config: GraphConfig,
     radius: float,
 ) -> list[FrameGraph]:
-    """The graph of each look.
+    """The graph of each frame.
 
     Args:
-        places: of nodes, deformed as each look has them, metres.
+        places: of nodes, deformed as in each frame, metres.
         nodes: rows of the Gaussians that are nodes.
-        looks: over time, with the teacher's ids.
-        codebook: what the teacher says, in the scene's channels.
+        frames: of one camera each, over time.
+        ids: row of the codebook of each of the teacher's pixels, for each frame; -1 for none.
+        codebook: the teacher's features, in the scene's channels.
         config: of the graph.
         radius: of the scene, metres.
     """
-    said = [_said(*pair, codebook) for pair in zip(places, looks, strict=True)]
-    teacher, valid = (np.stack(column) for column in zip(*said, strict=True))
-    times = np.array([look.time for look in looks])
-    width = min(2 * config.window + 1, len(looks))
+    labelled = [_labelled(*one, codebook) for one in zip(places, frames, ids, strict=True)]
+    teacher, valid = (np.stack(column) for column in zip(*labelled, strict=True))
+    times = times_of(frames)
+    width = min(2 * config.window + 1, len(frames))
     build = jax.jit(graph_of, static_argnums=(0, 1))
     graphs = []
-    for i in range(len(looks)):
-        first = int(np.clip(i - config.window, 0, len(looks) - width))
+    for i in range(len(frames)):
+        first = int(np.clip(i - config.window, 0, len(frames) - width))
         there = slice(first, first + width)
         arrays = (nodes, times[there], places[there], teacher[there], valid[there])
         given = (jnp.asarray(nodes), *(jnp.asarray(a, jnp.result_type(float)) for a in arrays[1:4]))
@@ -142,13 +147,13 @@ def graph_of(
     teacher: Float[Array, "T n c"],
     valid: Bool[Array, "T n"],
 ) -> FrameGraph:
-    """The graph of T looks; a pure function of its arrays.
+    """The graph of T frames; a pure function of its arrays.
 
     Args:
         config: of the graph.
         radius: of the scene, metres.
-        nodes, times, teacher, valid: as `FrameGraph` has them.
-        places: of nodes at each look, metres.
+        nodes, times, teacher, valid: as in `FrameGraph`.
+        places: of nodes in each frame, metres.
     """
     if config.kind == "similarity":
         edges = (
@@ -170,8 +175,8 @@ def seen_ids(
     ids: Int[Array, "C h w"],
     depths: Float[Array, "C height width"],
 ) -> Int[Array, "n"]:
-    """Which row of the codebook the teacher gives each place, in the first of C cameras that sees it; -1
-    where none does. A pure function of its arrays: what `frame_graphs` works out on the host, within a step.
+    """The row of the codebook that the teacher gives each place, in the first of C cameras that sees it; -1
+    where none does. A pure function of its arrays, for within a step; `frame_graphs` does it on the host.
 
     Args:
         places: metres.
@@ -190,8 +195,8 @@ def seen_ids(
         unhidden = (seen == 0) | (jnp.abs(seen - z) < _NEAR * seen)
         return jnp.where(inside & unhidden, ids[row * high // height, column * wide // width], -1)
 
-    said = jax.vmap(one)(cameras.viewmat, cameras.K, ids, depths)
-    return jnp.take_along_axis(said, jnp.argmax(said >= 0, axis=0)[None], axis=0)[0]
+    found = jax.vmap(one)(cameras.viewmat, cameras.K, ids, depths)
+    return jnp.take_along_axis(found, jnp.argmax(found >= 0, axis=0)[None], axis=0)[0]
 
 
 def graph_nodes(means: Float[Array, "n 3"], count: int) -> Int[np.ndarray, "count"]:
@@ -203,47 +208,49 @@ def graph_nodes(means: Float[Array, "n 3"], count: int) -> Int[np.ndarray, "coun
 def graph_loss(
     features: Float[Array, "N c"] | Float[Array, "T n c"], graph: FrameGraph, config: GraphConfig
 ) -> dict[str, Array]:
-    """What the graph asks of the nodes' features, by name; each times what it counts.
+    """Losses on the nodes' features, by name; each times its weight.
 
     Args:
         features: of all Gaussians, the same at all times; or of the nodes at the graph's times, where they
             change (`features_at`).
-        graph: of a look.
+        graph: of a frame.
         config: of the graph.
     """
-    mine = features
+    ours = features
     if features.ndim == 2:
         one = features[graph.nodes]
-        mine = jnp.broadcast_to(one, (len(graph.times), *one.shape))
+        ours = jnp.broadcast_to(one, (len(graph.times), *one.shape))
     if config.kind == "matching":
         assert graph.wanted is not None
         (edges,) = graph.edges
         return {
-            "node": config.node * node_loss(mine, graph.teacher, graph.valid),
+            "node": config.node * node_loss(ours, graph.teacher, graph.valid),
             "structure": config.structure
-            * structure_loss(mine, graph.wanted, edges, graph.weights, graph.valid, _MATCHING),
+            * structure_loss(ours, graph.wanted, edges, graph.weights, graph.valid, _MATCHING),
         }
     spatial, temporal = graph.edges
     return {
-        "spatial": config.spatial * similarity_loss(mine, spatial, graph.valid),
-        "temporal": config.temporal * similarity_loss(mine, temporal, graph.valid),
+        "spatial": config.spatial * similarity_loss(ours, spatial, graph.valid),
+        "temporal": config.temporal * similarity_loss(ours, temporal, graph.valid),
     }
 
 
 _MATCHING = Matching(derivative="implicit")  # rows are off by 3e-7 at this temperature
 
 
-def _said(
-    places: Float[np.ndarray, "n 3"], look: Look, codebook: Float[np.ndarray, "k c"]
+def _labelled(
+    places: Float[np.ndarray, "n 3"],
+    frame: Frame,
+    ids: Int[np.ndarray, "h w"],
+    codebook: Float[np.ndarray, "k c"],
 ) -> tuple[Float[np.ndarray, "n c"], Bool[np.ndarray, "n"]]:
-    """What the teacher says of places in a look, and where it says something of them and not of what is
-    before or behind them."""
-    height, width = look.image.shape[:2]
-    column, row, z, inside = pixels_of(places, look.viewmat, look.K, width, height)
-    depth = known_depth(look)[row, column]
+    """The teacher's features at places in a frame, and where it has one of them and not of what is before or
+    behind them."""
+    camera = frame.cameras
+    column, row, z, inside = pixels_of(places, camera.viewmat[0], camera.K[0], camera.width, camera.height)
+    depth = known_depth(frame)[row, column]
     unhidden = (depth == 0) | (np.abs(depth - z) < _NEAR * depth)
-    counted = np.ones(len(z), bool) if look.counts is None else look.counts[row, column]
-    assert look.ids is not None
-    high, wide = look.ids.shape
-    ids = look.ids[row * high // height, column * wide // width]
-    return codebook[np.maximum(ids, 0)], inside & counted & unhidden & (ids >= 0)
+    counted = np.ones(len(z), bool) if frame.masks is None else frame.masks[0][row, column]
+    high, wide = ids.shape
+    here = ids[row * high // camera.height, column * wide // camera.width]
+    return codebook[np.maximum(here, 0)], inside & counted & unhidden & (here >= 0)

@@ -1,220 +1,245 @@
-"""The host loop of a deforming scene: which frame is next, in the warm-up or with the deformation."""
+"""The reconstruction as one value: the next frame, when the field opens, what moves, and the graph."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache, partial
-from time import perf_counter
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from gsjax.geometry.cameras import Camera
+from gsjax.geometry.cameras import on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.deform.config import DeformConfig
 from gsjax.methods.deform.graph import FrameGraph, frame_graphs, graph_nodes
+from gsjax.methods.deform.meaning import Lesson, counted_ids
 from gsjax.methods.deform.nodes import nodes_of
-from gsjax.methods.deform.poses import refined_looks
-from gsjax.methods.deform.start import Look, begins, known_depth, on_plane, start_gaussians
+from gsjax.methods.deform.poses import refined_frames, refined_viewmats, times_of
+from gsjax.methods.deform.result import DeformResult, Timeline, timeline_of
+from gsjax.methods.deform.start import can_start_from, known_depth, on_plane, start_gaussians
 from gsjax.methods.deform.update import Batch, DeformingScene, Moving, deform_step
 from gsjax.methods.sampling import shuffled_index
-from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan
+from gsjax.optim.method import Run
+from gsjax.optim.step import Step
+from gsjax.rasterize.plan import HEADROOM, Plan
 from gsjax.scene.deformation import init_deformation
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, cull_invalid
 from gsjax.scene.render import plan_render
 
-_HEADROOM = 1.3
+PLAN = "view"
+"""The name in `Run.plans` of the plan that frames are drawn with."""
 _OUTSIDE = 0.005  # of the Gaussians, that may lie beyond either end of an axis
-_GATE_AFTER = 0.25  # of the steps with deformation: until then it is seen who moves
-_THIN = 0.2  # radii: a scene is taken to reach so far along an axis at least, as a plane's does not
-_NEARLY = 0.95  # of the pixels of a teacher's cell: it counts
+_GATE_AFTER = 0.25  # of the steps with deformation: until then all may move
+_THIN = 0.2  # radii: a scene is taken to reach this far along an axis at least, as a plane does not
 _MARGIN = 0.05  # of the field's box around the scene, as a share of its edges: what moves stays inside
 
 
-class DeformProblem(NamedTuple):
+class Problem(NamedTuple):
     """What does not change during a reconstruction.
 
     Attributes:
-        looks: what was seen.
-        codebook: what the teacher says, in the scene's channels; None without.
-        batches: one a look, without what a state holds.
-        first: the look that the canonical scene is like.
-        config: how.
+        frames: what a camera saw, on the host.
+        lesson: the teacher's labels of them; None without a teacher.
+        seen: the same frames on the device.
+        ids: the teacher's ids of pixels that count, on the device; None without.
+        codebook: of the teacher, on the device; None without.
+        first: index of the frame that the canonical scene is like.
         radius: of the scene, metres; the unit of rates.
         bounds: of the deformation field, around the first Gaussians, metres.
-        plan: that views are drawn with, as large as the first Gaussians need it.
+        timeline: the frames of the whole recording, for the result.
     """
 
-    looks: Sequence[Look]
-    codebook: Float[np.ndarray, "k channels"] | None
-    batches: list[Batch]
+    frames: Sequence[Frame]
+    lesson: Lesson | None
+    seen: list[Frame]
+    ids: list[Int[Array, "h w"]] | None
+    codebook: Float[Array, "k channels"] | None
     first: int
-    config: DeformConfig
     radius: float
     bounds: Float[np.ndarray, "2 3"]
-    plan: Plan
-
-    def plan_for(self, state: "DeformState") -> Plan:
-        """That views of a state are drawn with."""
-        return replace(self.plan, capacity=max(self.plan.capacity, state.capacity))
+    timeline: Timeline
 
 
-class DeformState(eqx.Module):
-    """What a reconstruction goes on from, to the same bits.
+class Kept(NamedTuple):
+    """What steps are given as it is, and `Deform.between` replaces.
 
     Attributes:
-        scene: what trains.
-        optimizer: what the step carries along.
-        moving: what the field is asked about.
-        graphs: of each look, once they were made.
-        step: how many steps were made.
-        capacity: that the plan has grown to.
+        moving: where the field is evaluated.
+        graphs: of each frame; None before they are made, and without.
     """
 
-    scene: DeformingScene
-    optimizer: Any
-    moving: Moving
-    graphs: list[FrameGraph] | None
-    step: int
-    capacity: int
+    moving: Moving = None
+    graphs: list[FrameGraph] | None = None
 
 
-class Advanced(NamedTuple):
-    """A reconstruction after one more step.
+@dataclass(frozen=True)
+class Deform:
+    """A scene that deforms, from what one camera saw (`gsjax.optim.method.Method`): the canonical scene
+    alone, then with its deformation.
 
     Attributes:
-        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
-        info: losses of this step, on the device.
-        seconds: that it took, without what compiled.
-        compile_seconds: that compiling took in it.
+        config: how it is learned.
+        extra_losses: custom losses `loss(scene, rendered, frame)`, whose scene is a `DeformingScene`; see
+            `gsjax.losses.extra`. `info["extra"]` has their values.
     """
 
-    state: DeformState
-    info: dict[str, Array]
-    seconds: float
-    compile_seconds: float
+    config: DeformConfig = field(default_factory=DeformConfig)
+    extra_losses: ExtraLosses = ()
+
+    def __post_init__(self):
+        named_losses(self.extra_losses)
+
+    def start(
+        self,
+        frames: Sequence[Frame],
+        lesson: Lesson | None = None,
+        *,
+        first: int | None = None,
+        gaussians: Gaussians | None = None,
+        timeline: Timeline | None = None,
+    ) -> tuple[Problem, Run]:
+        """A reconstruction before its first step.
+
+        Args:
+            frames: what one camera saw over time, all of one size, on the host. Where none has depth, the
+                scene begins on a plane.
+            lesson: a teacher's labels of these frames, with codes of `config.channels` numbers.
+            first: index of the frame that the canonical scene is like (default: the first with depth where a
+                pixel counts, or where one counts if none has depth).
+            gaussians: canonical scene to begin with, less what cannot be drawn (default: made of depth, or on
+                the plane).
+            timeline: frames of the whole recording, for the result (default: that of `frames`).
+
+        Raises:
+            ValueError: frames differ in size, no pixel counts, depth is nowhere known, or the teacher's ids
+                are not in its codebook.
+        """
+        config = self.config
+        _check(frames, config, lesson)
+        if first is None:
+            first = next((i for i, frame in enumerate(frames) if can_start_from(frame, frames)), 0)
+        if gaussians is None:
+            flat = all(frame.depths is None for frame in frames)
+            begun_with = on_plane(frames, first, config.plane_depth) if flat else frames
+            gaussians = start_gaussians(begun_with, first, config.start_pixels)
+        scene = _first_scene(gaussians, config, len(frames), lesson is not None)
+        means = np.asarray(scene.gaussians.means)
+        middle = np.median(means, axis=0)
+        radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
+        if not radius > 0:
+            raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
+        low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
+        room = _MARGIN * np.maximum(high - low, _THIN * radius)
+        bounds = np.stack([low - room, high + room])
+        seen, ids, codebook = [frame_on_device(frame) for frame in frames], None, None
+        if lesson is not None:
+            pairs = zip(frames, lesson.ids, strict=True)
+            masks_and_ids = ((None if f.masks is None else f.masks[0], one) for f, one in pairs)
+            ids = [jnp.asarray(counted_ids(one, mask), jnp.int32) for mask, one in masks_and_ids]
+            codebook = jnp.asarray(lesson.codebook, jnp.result_type(float))
+        timeline = timeline_of(frames) if timeline is None else timeline
+        problem = Problem(frames, lesson, seen, ids, codebook, first, radius, bounds, timeline)
+        plans = {PLAN: _plan_for_all(scene.gaussians, seen)}
+        return problem, Run(scene, self.step.init(scene), plans=plans, kept=Kept())
+
+    @property
+    def step(self) -> Step:
+        """See `deform_step`."""
+        return deform_step(self.config, self.extra_losses)
+
+    def total(self, problem: Problem) -> int:
+        """Steps of the warm-up, and those after it."""
+        return self.config.warmup + self.config.iterations
+
+    def between(self, problem: Problem, run: Run, progress: float) -> Run:
+        """Opens the field after the warm-up, chooses the Gaussians that go on moving, and makes the graph."""
+        config, step = self.config, run.step
+        if step == config.warmup and run.params.field is None:
+            scene, moving = with_field(config, problem, run.params)
+            run = run.having(params=scene, state=self.step.init(scene), kept=Kept(moving))
+        moving, graphs = run.kept
+        if step == _gate_from(config) and config.moving_share < 1 and moving is None:
+            moving = farthest_moved(run.params, problem.seen, config.moving_share)
+        if step == _graph_from(config) and graphs is None:
+            graphs = _graphs(config, problem, run.params, moving)
+        return run.having(kept=Kept(moving, graphs))
+
+    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
+        """The frame whose turn it is: in the warm-up perhaps always the first; else all of them in a random
+        order, and then in another."""
+        if run.step < self.config.warmup and self.config.warmup_frames == "first":
+            i = problem.first
+        else:
+            i = shuffled_index(self.config.seed, run.step, len(problem.seen))
+        return batch_of(problem, run, i), (PLAN,)
+
+    def result(self, problem: Problem, run: Run) -> DeformResult:
+        """The scene over time. Its arrays are those of the run: copy what is to be kept."""
+        scene, meaning = run.params, None if problem.lesson is None else problem.lesson.meaning
+        timeline = problem.timeline
+        if scene.twists is not None:
+            learned = times_of(problem.frames)
+            given = timeline.viewmats[:, None]
+            found = refined_viewmats(given, timeline.times, scene.twists, learned, problem.radius)
+            timeline = timeline._replace(viewmats=found[:, 0])
+        still = DeformingScene(scene.gaussians, scene.field)
+        return DeformResult(still, run.kept.moving, meaning, timeline)
 
 
-def begin_deform(
-    looks: Sequence[Look],
-    config: DeformConfig,
-    codebook: Float[np.ndarray, "k channels"] | None = None,
-    first: int | None = None,
-    gaussians: Gaussians | None = None,
-) -> tuple[DeformProblem, DeformState]:
-    """A reconstruction before its first step.
+def batch_of(problem: Problem, run: Run, i: int) -> Batch:
+    """What a step on frame `i` is given."""
+    view = None
+    if run.params.twists is not None:
+        view = jnp.asarray(-1 if i == problem.first else i, jnp.int32)
+    ids = None if problem.ids is None else problem.ids[i]
+    moving, graphs = run.kept
+    graph = None if graphs is None else graphs[i]
+    return Batch(problem.seen[i], view, ids, problem.codebook, moving, graph, problem.radius, run.plans[PLAN])
+
+
+def with_field(
+    config: DeformConfig, problem: Problem, scene: DeformingScene
+) -> tuple[DeformingScene, Moving]:
+    """The scene with a field that moves nothing yet, and where the field is evaluated.
 
     Args:
-        looks: what a camera saw over time, all of one size. Where none has depth, it begins on a plane.
-        config: how.
-        codebook: what the teacher says of the rows that looks name, in `config.channels` numbers.
-        first: the look that the canonical scene is like; unless given the first with depth where a pixel
-            counts, or where one counts if none has depth.
-        gaussians: canonical scene to begin with, less what cannot be drawn; made of depth, or on the plane,
-            unless given.
-
-    Raises:
-        ValueError: looks differ in size, no pixel counts, depth is nowhere known, or the teacher says what
-            the codebook has not.
+        config: of the reconstruction.
+        problem: from `Deform.start`.
+        scene: canonical.
     """
-    _check(looks, config, codebook)
-    if first is None:
-        first = next((i for i, look in enumerate(looks) if begins(look, looks)), 0)
-    if gaussians is None:
-        flat = all(look.depth is None for look in looks)
-        seen = on_plane(looks, first, config.plane_depth) if flat else looks
-        gaussians = start_gaussians(seen, first, config.start_pixels)
-    twists = jnp.zeros((len(looks), 6)) if config.refine_poses else None
-    gaussians, _ = cull_invalid(gaussians)
-    if not gaussians.num:
-        raise ValueError("gaussians: expected some that can be drawn, found none")
-    own = jax.tree.map(jnp.array, gaussians)  # copies, for steps give buffers away
-    scene = DeformingScene(own, None, twists)
-    if codebook is not None:
-        features = jnp.zeros((scene.gaussians.num, config.channels))
-        scene = eqx.tree_at(
-            lambda s: s.gaussians.features, scene, features, is_leaf=lambda leaf: leaf is None
-        )
-    means = np.asarray(scene.gaussians.means)
-    middle = np.median(means, axis=0)
-    radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9))
-    if not radius > 0:
-        raise ValueError("depth: expected a scene of some extent, found all of its points at one place")
-    shared = None if codebook is None else jnp.asarray(codebook, jnp.result_type(float))
-    batches = [_batch(look, shared) for look in looks]
-    if config.refine_poses:
-        rows = (-1 if i == first else i for i in range(len(looks)))
-        batches = [
-            batch._replace(look=jnp.asarray(row, jnp.int32)) for batch, row in zip(batches, rows, strict=True)
-        ]
-    plan = _plan_of(scene.gaussians, batches)
-    low, high = np.quantile(means.astype(np.float64), (_OUTSIDE, 1 - _OUTSIDE), axis=0)
-    room = _MARGIN * np.maximum(high - low, _THIN * radius)
-    bounds = np.stack([low - room, high + room])
-    problem = DeformProblem(looks, codebook, batches, first, config, radius, bounds, plan)
-    state = DeformState(scene, deform_step(config, radius).init(scene), None, None, 0, plan.capacity)
-    return problem, state
+    gaussians = scene.gaussians
+    size = 0 if gaussians.features is None else gaussians.features.shape[1]
+    key = jax.random.fold_in(jax.random.key(config.seed), config.warmup)
+    field = init_deformation(key, config.deformation, problem.bounds, size)
+    moving = nodes_of(gaussians, config.nodes) if config.nodes else None
+    return DeformingScene(gaussians, field, scene.twists), moving
 
 
-def reconstruct(
-    problem: DeformProblem, state: DeformState, *, extra_losses: ExtraLosses = ()
-) -> Iterator[Advanced]:
-    """Step by step, until all is done: the canonical scene alone, then with its deformation. The same state
-    and problem give the same bits, wherever the reconstruction was begun or resumed.
+def farthest_moved(scene: DeformingScene, frames: Sequence[Frame], share: float) -> Int[Array, "M"]:
+    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any frame's time.
 
     Args:
-        problem: from `begin_deform`.
-        state: likewise, or that of an earlier `Advanced`. Its arrays are given away in the first step.
-        extra_losses: functions `loss(scene, rendered, frame)` (`gsjax.losses.extra`) of one's own, whose
-            scene is a `DeformingScene`. `info["extra"]` has their values.
+        scene: canonical, and how it deforms.
+        frames: on the device.
+        share: of the Gaussians, 0 to 1.
     """
-    config = problem.config
-    named_losses(extra_losses)  # before it is a key, which a list cannot be
-    advance = compiled_step(config, problem.radius, extra_losses)
-    key = jax.random.key(config.seed)
-    scene, optimizer, moving, graphs = state.scene, state.optimizer, state.moving, state.graphs
-    plan = problem.plan_for(state)
-    for i in range(state.step, config.warmup + config.iterations):
-        if i == config.warmup and scene.field is None:
-            scene, optimizer, moving = with_field(problem, scene)
-        if i == _gate_from(config) and config.moving_share < 1 and moving is None:
-            moving = farthest_moved(scene, problem.batches, config.moving_share)
-        if i == _graph_from(config) and graphs is None:
-            graphs = _graphs(problem, scene, moving)
-        begun, programs = perf_counter(), advance._cache_size()
-        while True:
-            look = _turn(problem, i)
-            graph = None if graphs is None else graphs[look]
-            batch = problem.batches[look]._replace(moving=moving, graph=graph, plan=plan)
-            scene, optimizer, info = advance(
-                scene, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i)
-            )
-            if not bool(info["overflow"]):
-                break
-            plan = plan.grown(int(info["needed"]), _HEADROOM)
-        seconds, new = perf_counter() - begun, advance._cache_size() > programs
-        now = DeformState(scene, optimizer, moving, graphs, i + 1, plan.capacity)
-        yield Advanced(now, info, 0.0 if new else seconds, seconds if new else 0.0)
+    at = jax.jit(lambda scene, time: jnp.linalg.norm(scene.at(time).means - scene.gaussians.means, axis=-1))
+    farthest = np.max([np.asarray(at(scene, frame.time)) for frame in frames], axis=0)
+    order = np.argsort(-farthest, kind="stable")
+    return jnp.asarray(np.sort(order[: max(1, round(share * len(farthest)))]), jnp.int32)
 
 
-def of_step(problem: DeformProblem, state: DeformState, step: int) -> DeformState:
-    """A state of the form that one after so many steps has, to be filled with what was saved of that.
-
-    Args:
-        state: from `begin_deform`.
-    """
-    if step > problem.config.warmup:
-        scene, optimizer, moving = with_field(problem, state.scene)
-        if step > _gate_from(problem.config) and problem.config.moving_share < 1:
-            moving = jnp.arange(_share(scene.gaussians.num, problem.config.moving_share), dtype=jnp.int32)
-        graphs = _graphs(problem, scene, moving) if step > _graph_from(problem.config) else None
-        state = DeformState(scene, optimizer, moving, graphs, step, state.capacity)
-    return state
+def frame_on_device(frame: Frame) -> Frame:
+    """A frame of one camera on the device, with depth where it is known and counts, and a mask in any case:
+    each kind is a program of its own."""
+    dtype = jnp.result_type(float)
+    masks = np.ones(frame.images.shape[:3], bool) if frame.masks is None else frame.masks
+    depths = None if frame.depths is None else jnp.asarray(known_depth(frame), dtype)[None]
+    time = jnp.asarray(0.0 if frame.time is None else frame.time, dtype)
+    return Frame(jnp.asarray(frame.images), depths, on_device(frame.cameras), jnp.asarray(masks), time)
 
 
 def _graph_from(config: DeformConfig) -> int:
@@ -223,141 +248,74 @@ def _graph_from(config: DeformConfig) -> int:
 
 
 def _gate_from(config: DeformConfig) -> int:
-    """The step before which it is settled who deforms."""
+    """The step before which the Gaussians that go on moving are chosen."""
     return config.warmup + round(_GATE_AFTER * config.iterations)
 
 
-def farthest_moved(scene: DeformingScene, batches: Sequence[Batch], share: float) -> Int[Array, "M"]:
-    """Rows of the Gaussians that are farthest from where the canonical scene has them, at any look's time.
-
-    Args:
-        scene: canonical, and how it deforms.
-        batches: of all looks.
-        share: of the Gaussians, 0 to 1.
-    """
-    at = jax.jit(lambda scene, time: jnp.linalg.norm(scene.at(time).means - scene.gaussians.means, axis=-1))
-    farthest = np.max([np.asarray(at(scene, batch.time)) for batch in batches], axis=0)
-    order = np.argsort(-farthest, kind="stable")
-    return jnp.asarray(np.sort(order[: _share(len(farthest), share)]), jnp.int32)
-
-
-def _share(count: int, share: float) -> int:
-    return max(1, round(share * count))
-
-
-def with_field(problem: DeformProblem, scene: DeformingScene) -> tuple[DeformingScene, Any, Moving]:
-    """The scene with a field that moves nothing yet, an optimizer that knows nothing yet, and what the field
-    is asked about."""
-    config, gaussians = problem.config, scene.gaussians
-    size = 0 if gaussians.features is None else gaussians.features.shape[1]
-    key = jax.random.fold_in(jax.random.key(config.seed), config.warmup)
-    field = init_deformation(key, config.deformation, problem.bounds, size)
-    scene = DeformingScene(gaussians, field, scene.twists)
-    moving = nodes_of(gaussians, config.nodes) if config.nodes else None
-    return scene, deform_step(config, problem.radius).init(scene), moving
-
-
-def _graphs(problem: DeformProblem, scene: DeformingScene, moving: Moving) -> list[FrameGraph] | None:
-    """Of each look, with nodes where the scene has them now."""
-    config = problem.config.graph
-    if config.kind == "none" or problem.codebook is None:
+def _graphs(
+    config: DeformConfig, problem: Problem, scene: DeformingScene, moving: Moving
+) -> list[FrameGraph] | None:
+    """The graph of each frame, with nodes where the scene has them now."""
+    if config.graph.kind == "none" or problem.lesson is None:
         return None
-    nodes = graph_nodes(scene.gaussians.means, config.nodes)
+    nodes = graph_nodes(scene.gaussians.means, config.graph.nodes)
     at = jax.jit(lambda scene, time: scene.at(time, moving).means[nodes])
-    places = np.stack([np.asarray(at(scene, batch.time)) for batch in problem.batches])
-    looks = problem.looks
+    places = np.stack([np.asarray(at(scene, frame.time)) for frame in problem.seen])
+    frames, (ids, codebook, _) = problem.frames, problem.lesson
     if scene.twists is not None:
-        looks = refined_looks(looks, scene.twists, problem.radius)
-    return frame_graphs(places, nodes, looks, problem.codebook, config, problem.radius)
+        frames = refined_frames(frames, scene.twists, problem.radius)
+    return frame_graphs(places, nodes, frames, ids, codebook, config.graph, problem.radius)
 
 
-@lru_cache(maxsize=4)
-def compiled_step(config: DeformConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
-    """The jitted step: scene, optimizer, batch, number, key. Buffers that it replaces are given away.
-
-    Args:
-        config: of the reconstruction.
-        radius: of the scene, metres.
-        extra_losses: of one's own.
-    """
-    step = deform_step(config, radius, extra_losses)
-
-    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
-    def advance(scene, optimizer, batch, i, key):
-        return step.update(scene, optimizer, batch, step=i, key=key)
-
-    return advance
+def _first_scene(gaussians: Gaussians, config: DeformConfig, frames: int, is_taught: bool) -> DeformingScene:
+    """Copies of the Gaussians that can be drawn, for steps give buffers away; features and twists are 0."""
+    gaussians, _ = cull_invalid(gaussians)
+    if not gaussians.num:
+        raise ValueError("gaussians: expected some that can be drawn, found none")
+    twists = jnp.zeros((frames, 6)) if config.refine_poses else None
+    scene = DeformingScene(jax.tree.map(jnp.array, gaussians), None, twists)
+    if not is_taught:
+        return scene
+    features = jnp.zeros((gaussians.num, config.channels))
+    return eqx.tree_at(lambda s: s.gaussians.features, scene, features, is_leaf=lambda leaf: leaf is None)
 
 
-def _turn(problem: DeformProblem, step: int) -> int:
-    """Which look a step has: all of them in a random order, and then in another."""
-    if step < problem.config.warmup and problem.config.warmup_frames == "first":
-        return problem.first
-    return shuffled_index(problem.config.seed, step, len(problem.batches))
-
-
-def counted_ids(look: Look) -> Int[np.ndarray, "h w"]:
-    """What the teacher says of pixels that count, and of cells of its grid of which nearly all do: what is
-    behind a tool is not to learn that it is one."""
-    assert look.ids is not None
-    if look.counts is None:
-        return look.ids
-    high, wide = look.ids.shape
-    share = cv2.resize(look.counts.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
-    return np.where(share > _NEARLY, look.ids, -1)
-
-
-def _batch(look: Look, codebook: Array | None) -> Batch:
-    """A look on the device."""
-    dtype = jnp.result_type(float)
-    height, width = look.image.shape[:2]
-    viewmat, K = (jnp.asarray(a, dtype)[None] for a in (look.viewmat, look.K))
-    counts = np.ones((height, width), bool) if look.counts is None else look.counts
-    ids = None if look.ids is None else counted_ids(look)
-    taught = codebook is not None and ids is not None
-    return Batch(
-        jnp.asarray(look.image)[None],
-        jnp.asarray(counts)[None],
-        None if look.depth is None else jnp.asarray(known_depth(look), dtype)[None],
-        Camera(viewmat, K, width, height, look.near),
-        jnp.asarray(look.time, dtype),
-        jnp.asarray(ids, jnp.int32) if taught else None,
-        codebook if taught else None,
-        None,
-        None,
-        Plan(width, height, 0),
-    )
-
-
-def _plan_of(gaussians: Gaussians, batches: list[Batch]) -> Plan:
+def _plan_for_all(gaussians: Gaussians, frames: Sequence[Frame]) -> Plan:
     """A plan for the scene in all cameras."""
-    cameras = [batch.camera for batch in batches]
+    cameras = [frame.cameras for frame in frames]
     viewmats, Ks = (jnp.concatenate([getattr(c, name) for c in cameras]) for name in ("viewmat", "K"))
-    together = Camera(viewmats, Ks, cameras[0].width, cameras[0].height, cameras[0].near)
-    return plan_render(gaussians, together, headroom=_HEADROOM)
+    together = replace(cameras[0], viewmat=viewmats, K=Ks)
+    return plan_render(gaussians, together, headroom=HEADROOM)
 
 
-def _check(looks: Sequence[Look], config: DeformConfig, codebook: np.ndarray | None) -> None:
-    if not looks:
-        raise ValueError("looks: expected at least one, found none")
-    shape = looks[0].image.shape
-    for i, look in enumerate(looks):
-        if look.image.shape != shape:
+def _check(frames: Sequence[Frame], config: DeformConfig, lesson: Lesson | None) -> None:
+    if not frames:
+        raise ValueError("frames: expected at least one, found none")
+    shape = frames[0].images.shape
+    for i, frame in enumerate(frames):
+        if frame.images.shape != shape or len(frame.images) != 1:
             raise ValueError(
-                f"looks: expected pictures {shape} as the first, found {look.image.shape} in {i}"
+                f"frames: expected one picture {shape[1:]} as the first, found {frame.images.shape} in {i}"
             )
-        for name in ("counts", "depth"):
-            value = getattr(look, name)
-            if value is not None and value.shape != shape[:2]:
+        for name in ("masks", "depths"):
+            value = getattr(frame, name)
+            if value is not None and value.shape != shape[:3]:
                 raise ValueError(
-                    f"looks: expected {name} of {shape[:2]} pixels like pictures, found {value.shape} in {i}"
+                    f"frames: expected {name} of {shape[:3]} pixels like pictures, found {value.shape} in {i}"
                 )
-        if codebook is not None and (look.ids is None or look.ids.max(initial=-1) >= len(codebook)):
-            found = "none" if look.ids is None else f"{look.ids.max()}"
+    if not any(frame.masks is None or frame.masks.any() for frame in frames):
+        raise ValueError("masks: in no frame does any pixel count; are they inverted?")
+    if lesson is None:
+        return
+    if len(lesson.ids) != len(frames):
+        raise ValueError(f"lesson: expected ids of {len(frames)} frames, found those of {len(lesson.ids)}")
+    for i, ids in enumerate(lesson.ids):
+        if ids.max(initial=-1) >= len(lesson.codebook):
             raise ValueError(
-                f"looks: expected ids of {len(codebook)} rows of the codebook, or -1, found {found} in {i}"
+                f"lesson: expected ids of {len(lesson.codebook)} rows of the codebook, or -1, found "
+                f"{ids.max()} in {i}"
             )
-    if not any(look.counts is None or look.counts.any() for look in looks):
-        raise ValueError("masks: in no look does any pixel count; are they inverted?")
-    if codebook is not None and codebook.shape[1] != config.channels:
-        raise ValueError(f"codebook: expected rows of {config.channels} numbers, found {codebook.shape[1]}")
+    if lesson.codebook.shape[1] != config.channels:
+        raise ValueError(
+            f"codebook: expected rows of {config.channels} numbers, found {lesson.codebook.shape[1]}"
+        )

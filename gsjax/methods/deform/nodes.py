@@ -1,4 +1,4 @@
-"""Which places a deformation field is asked about. On the host."""
+"""The places at which a deformation field is evaluated. On the host."""
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,9 @@ def nodes_of(gaussians: Gaussians, count: int, groups: Int[np.ndarray, "n"] | No
 
     Args:
         gaussians: canonical.
-        count: how many nodes, at most; there are no more than Gaussians. With groups, of each of them.
-        groups: what moves as one, as a tracker says: a Gaussian then blends nodes of its own group alone,
-            for what is next to it now may be elsewhere later.
+        count: number of nodes, at most, for there are no more than Gaussians. With groups, that of each.
+        groups: of Gaussians that move as one, by a tracker, say: a Gaussian then blends nodes of its own
+            group alone, for what is next to it now may be elsewhere later.
     """
     if groups is not None:
         return _nodes_of_groups(gaussians, count, groups)

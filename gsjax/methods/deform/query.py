@@ -1,4 +1,4 @@
-"""Which Gaussians of a deforming scene a prompt means (papers/003, section 2.4; papers/004, section 3.4)."""
+"""Gaussians of a deforming scene that a prompt means (SurstSplat, section 2.4; GaussianClin, section 3.4)."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ _LITTLE = 0.5  # of a pixel's light that the scene must send, on average
 
 
 class Prompt(NamedTuple):
-    """What is asked, and what it is told apart from.
+    """A prompt and its alternatives.
 
     Attributes:
         vectors: in the scene's channels, a row a candidate.
-        row: which of them is asked for.
+        row: of the prompt.
     """
 
     vectors: Float[np.ndarray, "k c"]
@@ -26,14 +26,14 @@ class Prompt(NamedTuple):
 def prompt_probabilities(
     features: Float[Array, "*n c"], prompts: Float[Array, "k c"], temperature: float = 0.1
 ) -> Float[Array, "*n k"]:
-    """P(prompt | Gaussian), or of a pixel: a softmax over prompts of cosines (eqs. 16 and 17).
+    """P(prompt | Gaussian), or of a pixel: a softmax over prompts of cosines (SurstSplat, eqs. 16 and 17).
 
     The papers have no temperature, and so for cosines of 1 and 0 a probability of 0.73 at most. What has no
     length is as likely each of them.
 
     Args:
         features: of Gaussians, or rendered.
-        prompts: what is asked and what it is told apart from, in the features' channels; a point's or a box's
+        prompts: the candidates, in the features' channels; a point's or a box's
             is the mean of the features rendered there.
         temperature: of the softmax.
     """
@@ -41,8 +41,8 @@ def prompt_probabilities(
 
 
 def prompt_cosines(features: Float[Array, "*n c"], directions: Float[Array, "k c"]) -> Float[Array, "*n k"]:
-    """Cosines of features, whatever their length, and vectors that have length 1 where they are from; 0 of
-    what has no length."""
+    """Cosines of features, whatever their length, and vectors that have length 1 in the space that they come
+    from; 0 for features without length."""
     return _directions(features) @ directions.T
 
 
@@ -53,7 +53,7 @@ def _directions(features: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
 
 
 def most_likely(probabilities: Float[np.ndarray, "*n k"]) -> Int[np.ndarray, "*n"]:
-    """Without a prompt: the most likely of all; -1 where several are as likely."""
+    """The most likely row; -1 where all are as likely."""
     if probabilities.shape[-1] == 1:
         return np.zeros(probabilities.shape[:-1], int)
     apart = probabilities.max(axis=-1) > probabilities.min(axis=-1)
@@ -93,8 +93,8 @@ def region_feature(
 
 
 def like_feature(feature: Float[np.ndarray, "c"], codebook: Float[np.ndarray, "k c"]) -> Prompt:
-    """A prompt for what has a feature, in place of the code that is the most like it: the others are what it
-    is told apart from."""
+    """A prompt for what has a feature, in place of the code that is the most like it; the other codes are its
+    alternatives."""
     probabilities = np.asarray(prompt_probabilities(jnp.asarray(feature), jnp.asarray(codebook)))
     row, vectors = int(probabilities.argmax()), np.array(codebook)
     vectors[row] = feature

@@ -1,4 +1,4 @@
-"""Questions on a deforming scene in plain English: the ten types that templates understand."""
+"""Questions on a deforming scene in plain English: the ten types that templates parse."""
 
 import re
 from collections.abc import Sequence
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 TOUCH = 2.0
-"""Distance below which two things touch, in the facts' unit: mm, or per cent of the depth."""
+"""Distance below which two things touch, in the unit of the facts: mm, or per cent of the depth."""
 STILL = 1.0
-"""Way below which a thing stands still, in the facts' unit."""
+"""Displacement below which a thing stands still, in the unit of the facts."""
 
 
 class QuestionType(NamedTuple):
-    """One of the types of question that templates understand.
+    """A type of question that templates parse.
 
     Attributes:
         name: of the type.
         example: with X and Y for things, F and G for frames.
-        gives: what kind of value, and its unit.
-        frames: how many frames the question names.
+        gives: the kind of value, and its unit.
+        frames: number of frames that the question names.
         forms: of the question without its frames and articles; x and y are things.
     """
 
@@ -142,13 +142,13 @@ _ALIKE = {"appear": "first seen", "closest": "nearest"}  # events that go by two
 
 @dataclass(frozen=True)
 class Question:
-    """A question that was understood.
+    """A parsed question.
 
     Attributes:
         kind: name of its type.
-        things: rows of the classes that it asks about.
-        frames: numbers that it names, as the recording calls them.
-        event: which of those that `when` knows.
+        things: rows of the classes that it is about.
+        frames: numbers of the frames that it names.
+        event: of a `when` question.
     """
 
     kind: str
@@ -158,7 +158,7 @@ class Question:
 
 
 def parse_question(text: str, names: Sequence[str]) -> Question:
-    """What a question asks.
+    """A question, parsed.
 
     Args:
         text: in plain English; capitals, articles, plurals and the place of the frames do not matter.
@@ -178,10 +178,10 @@ def parse_question(text: str, names: Sequence[str]) -> Question:
             if found is None:
                 continue
             parts = found.groupdict()
-            said = [parts[name] for name in ("x", "y") if parts.get(name)]
-            things = [_thing(one, names) for one in said]
+            called = [parts[name] for name in ("x", "y") if parts.get(name)]
+            things = [_thing(one, names) for one in called]
             if None in things:
-                unknown = unknown or said[things.index(None)]
+                unknown = unknown or called[things.index(None)]
                 continue
             _check(kind, text, things, frames)
             event = parts.get("event", "")
@@ -201,11 +201,11 @@ def plain_words(text: str) -> str:
     return " ".join(_ARTICLES.sub(" ", " ".join(re.findall(r"[^\W_]+", text.lower()))).split())
 
 
-def _thing(said: str, names: Sequence[str]) -> int | None:
-    """The class that is meant."""
+def _thing(called: str, names: Sequence[str]) -> int | None:
+    """The row of the class that is called so; None if there is none."""
     for row, name in enumerate(names):
         plain = plain_words(name)
-        if said in (plain, f"{plain}s", f"{plain}es"):
+        if called in (plain, f"{plain}s", f"{plain}es"):
             return row
     return None
 
@@ -219,7 +219,7 @@ def _check(kind: QuestionType, text: str, things: Sequence[int | None], frames: 
 
 
 def rows_of(question: Question, frames: Sequence[int]) -> list[int]:
-    """Which of a recording's frames a question is about: those it names, or all.
+    """Rows of the frames that a question is about: those it names, or all.
 
     Raises:
         ValueError: it names one that the recording has not.

@@ -1,75 +1,52 @@
 """The first Gaussians of a deforming scene: depth over time where no tool is, or a plane. On the host."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from gsjax.geometry.cameras import NEAR, pixels_of
+from gsjax.geometry.cameras import pixels_of
 from gsjax.geometry.neighbors import voxel_thin
+from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
 _BEHIND = 0.06  # of the depth: farther behind what is seen lies what that hides, not what has moved
-_NEAR_PX = 2.0  # nearer than this to a Gaussian that is there, a point of another look is none of its own
+_NEAR_PX = 2.0  # a point of another frame that is nearer than this to a Gaussian adds nothing to it
 
 
-class Look(NamedTuple):
-    """What a camera saw at a time, on the host.
-
-    Attributes:
-        image: RGB.
-        counts: which pixels are to be reconstructed, the tools left out say; None for all.
-        depth: metres, 0 where unknown; None without.
-        viewmat: world to camera, OpenCV axes.
-        K: intrinsics in pixels.
-        time: 0 to 1 over the recording.
-        ids: which row of the teacher's codebook each pixel has, -1 for none; of any size. None without
-            teacher.
-        near: what is nearer is not drawn, metres.
-    """
-
-    image: UInt8[np.ndarray, "h w 3"]
-    counts: Bool[np.ndarray, "h w"] | None
-    depth: Float[np.ndarray, "h w"] | None
-    viewmat: Float[np.ndarray, "4 4"]
-    K: Float[np.ndarray, "3 3"]
-    time: float
-    ids: Int[np.ndarray, "h_ w_"] | None = None
-    near: float = NEAR
-
-
-def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussians:
-    """Gaussians on what the first look shows, and, from the other looks, on what it does not: there lay a
+def start_gaussians(frames: Sequence[Frame], first: int, pixels: float) -> Gaussians:
+    """Gaussians on what the first frame shows, and, from the other frames, on what it does not: there lay a
     tool that is left out, it lay behind something, or outside.
 
-    A point of another look is new if it falls where the first look shows nothing, or far behind what it
+    A point of another frame is new if it falls where the first frame shows nothing, or far behind what it
     shows, and none of those before lies within two pixels of it; so what has moved in the meantime is not
     doubled.
 
     Args:
-        looks: over time.
-        first: which of them the canonical scene is like.
+        frames: of one camera each, over time; pixels outside their masks do not count.
+        first: index of the frame that the canonical scene is like.
         pixels: edge of the cubes that are thinned to one Gaussian, in pixels.
 
     Raises:
-        ValueError: no look has depth where a pixel counts.
+        ValueError: no frame has depth where a pixel counts.
     """
-    order = [first, *(i for i in range(len(looks)) if i != first)]
+    order = [first, *(i for i in range(len(frames)) if i != first)]
     points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     pixel = 0.0
     for i in order:
-        look = looks[i]
-        known = known_depth(look)
+        frame = frames[i]
+        known = known_depth(frame)
         if not known.any():
             continue
         if pixel == 0.0:
-            pixel = float(np.median(known[known > 0])) / look.K[0, 0]
-        some, shades = points_from_rgbd(look.image, known, look.viewmat, look.K)
+            pixel = float(np.median(known[known > 0])) / frame.cameras.K[0, 0, 0]
+        viewmat, K = frame.cameras.viewmat[0], frame.cameras.K[0]
+        some, shades = points_from_rgbd(frame.images[0], known, viewmat, K)
         if len(points):
-            new = _unseen(some, looks[first])
+            new = _unseen(some, frames[first])
             apart, _ = cKDTree(points).query(some, distance_upper_bound=_NEAR_PX * pixel)
             new &= ~np.isfinite(apart)
             some, shades = some[new], shades[new]
@@ -77,56 +54,53 @@ def start_gaussians(looks: Sequence[Look], first: int, pixels: float) -> Gaussia
         points, colors = np.concatenate([points, some[kept]]), np.concatenate([colors, shades[kept]])
     if not len(points):
         raise ValueError(
-            "depth: no look has any where a pixel counts; are masks inverted, or is depth all 0?"
+            "depth: no frame has any where a pixel counts; are masks inverted, or is depth all 0?"
         )
     return gaussians_from_points(points, colors)
 
 
-def begins(look: Look, looks: Sequence[Look]) -> bool:
-    """Whether a scene can begin with one of the looks: something counts, and has depth where any has."""
-    if all(one.depth is None for one in looks):
-        return look.counts is None or bool(look.counts.any())
-    return bool(known_depth(look).any())
+def can_start_from(frame: Frame, frames: Sequence[Frame]) -> bool:
+    """Whether a scene can begin with one of the frames: a pixel counts, and has depth where any frame has."""
+    if all(one.depths is None for one in frames):
+        return frame.masks is None or bool(frame.masks.any())
+    return bool(known_depth(frame).any())
 
 
-def on_plane(looks: Sequence[Look], first: int, depth: float) -> list[Look]:
-    """The looks as if all that they saw were painted on a plane that the first one faces: something to begin
+def on_plane(frames: Sequence[Frame], first: int, depth: float) -> list[Frame]:
+    """The frames as if all that they saw were painted on a plane that the first one faces: something to begin
     with where depth is not known.
 
     Args:
-        looks: over time.
-        first: which of them faces it.
+        frames: of one camera each, over time.
+        first: index of the frame that faces the plane.
         depth: how far before it the plane lies, in the unit of the poses.
     """
-    facing = looks[first].viewmat
+    facing = frames[first].cameras.viewmat[0]
     normal = facing[2, :3]  # n . x = offset in the world
     offset = depth - facing[2, 3]
 
-    def of(look: Look) -> Look:
-        height, width = look.image.shape[:2]
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(look.K).T
-        rotation, shift = look.viewmat[:3, :3], look.viewmat[:3, 3]
-        towards = rays @ (rotation @ normal)  # how much nearer the plane a ray comes a unit of depth
+    def painted(frame: Frame) -> Frame:
+        camera = frame.cameras
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K[0]).T
+        rotation, shift = camera.viewmat[0, :3, :3], camera.viewmat[0, :3, 3]
+        towards = rays @ (rotation @ normal)  # how much nearer the plane a ray comes per unit of depth
         away = offset + (rotation.T @ shift) @ normal
         reached = np.where(np.abs(towards) > 1e-6, away / np.where(towards == 0, 1.0, towards), 0.0)
-        return look._replace(depth=np.maximum(reached, 0.0).astype(np.float32))
+        depths = np.maximum(reached, 0.0).astype(np.float32)[None]
+        return eqx.tree_at(lambda f: f.depths, frame, depths, is_leaf=lambda leaf: leaf is None)
 
-    return [of(look) for look in looks]
+    return [painted(frame) for frame in frames]
 
 
-def _unseen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
-    """Which points fall outside of a look, where it does not count or has no depth, or far behind that."""
-    known = known_depth(look)
-    height, width = known.shape
-    at = pixels_of(points, look.viewmat, look.K, width, height)
+def known_depth(frame: Frame) -> Float[np.ndarray, "h w"]:
+    """Depth of a frame of one camera where it is known and counts, else 0."""
+    return frame.known_depths[0].astype(np.float32)
+
+
+def _unseen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
+    """Which points fall outside of a frame, where it does not count or has no depth, or far behind that."""
+    known, camera = known_depth(frame), frame.cameras
+    at = pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
     before = known[at.rows, at.columns]
     return ~at.inside | (before == 0) | (at.depths > (1 + _BEHIND) * before)
-
-
-def known_depth(look: Look) -> Float[np.ndarray, "h w"]:
-    """Depth where it is known and counts, else 0."""
-    if look.depth is None:
-        return np.zeros(look.image.shape[:2], np.float32)
-    known = np.isfinite(look.depth) & (look.depth > 0)
-    return np.where(known if look.counts is None else known & look.counts, look.depth, 0).astype(np.float32)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera, perturbed
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
@@ -24,7 +24,7 @@ from gsjax.scene.render import render
 from gsjax.scene.time_encodings import HexPlane
 
 _FINAL_RATE = 0.1
-_DECAY = 1e-5  # of AdamW (papers/003, section 3)
+_DECAY = 1e-5  # of AdamW (SurstSplat, section 3)
 
 
 class DeformingScene(eqx.Module):
@@ -33,16 +33,16 @@ class DeformingScene(eqx.Module):
     Attributes:
         gaussians: canonical; features are semantic.
         field: what moves them; None in the warm-up, and of a static scene.
-        twists: of each look's camera, a turn (radians) and a shift (radii of the scene), in the world's axes;
-            None: cameras stand as given.
+        twists: of each frame's camera, a turn (radians) and a shift (radii of the scene), in the world's
+            axes; None: cameras stand as given.
     """
 
     gaussians: Gaussians
     field: DeformationField | None = None
-    twists: Float[Array, "looks 6"] | None = None
+    twists: Float[Array, "frames 6"] | None = None
 
     def at(self, time: Float[Array, ""], moving: "Moving" = None) -> Gaussians:
-        """The scene at a time, 0 to 1.
+        """The scene at a time.
 
         Args:
             time: 0 to 1.
@@ -57,7 +57,7 @@ class DeformingScene(eqx.Module):
     def features_at(
         self, times: Float[Array, "T"], rows: Int[Array, "n"], moving: "Moving" = None
     ) -> Float[Array, "T n c"]:
-        """Features of some Gaussians at some times, as `at` has them.
+        """Features of some Gaussians at some times, as in `at`.
 
         Args:
             times: 0 to 1.
@@ -72,72 +72,68 @@ class DeformingScene(eqx.Module):
 
 
 Moving = Nodes | Int[Array, "M"] | None
-"""What the field is asked about: nodes, some Gaussians, or all of them."""
+"""Where the field is evaluated: at nodes, at some Gaussians, or at all of them."""
 
 
 class Batch(NamedTuple):
     """What a step is given.
 
     Attributes:
-        image: RGB, 0 to 255.
-        counts: which pixels count.
-        depth: metres, 0 = unknown; None without.
-        camera: one, viewmat [1,4,4] and K [1,3,3].
-        time: 0 to 1.
-        ids: which row of the codebook each of the teacher's pixels has, -1 for none; None without teacher.
-        codebook: what the teacher says, in the scene's channels.
-        moving: what the field is asked about.
-        graph: of the look and those around it; None without.
+        frame: of one camera, RGB in bytes, with the mask of the pixels that count and its time.
+        view: row of the scene's twists that is the camera's; -1 for the camera that stands as given. None
+            where none is refined.
+        ids: row of the codebook of each of the teacher's pixels, -1 for none; None without a teacher.
+        codebook: the teacher's features, in the scene's channels.
+        moving: where the field is evaluated.
+        graph: of the frame and those around it; None without.
+        radius: of the scene, the unit in which means and cameras move and depth counts.
         plan: to draw with.
-        look: which row of the scene's twists the camera has; -1 of the one that stands as given. None where
-            none is refined.
     """
 
-    image: UInt8[Array, "1 height width 3"]
-    counts: Bool[Array, "1 height width"]
-    depth: Float[Array, "1 height width"] | None
-    camera: Camera
-    time: Float[Array, ""]
+    frame: Frame
+    view: Int[Array, ""] | None
     ids: Int[Array, "h w"] | None
     codebook: Float[Array, "k channels"] | None
     moving: Moving
     graph: FrameGraph | None
+    radius: Float[Array, ""] | float
     plan: Plan
-    look: Int[Array, ""] | None = None
 
 
-def deform_loss(config: DeformConfig, radius: float, extra_losses: ExtraLosses = ()) -> Callable:
-    """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of pixels that count (papers/003, eq. 13), depth,
-    features against the teacher's (papers/004, eq. 10), the graph (`graph_loss`), and smoothness of the
+def deform_loss(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Callable:
+    """`loss(scene, batch, *, step, key)`: L1 and D-SSIM of the pixels that count (SurstSplat, eq. 13), depth,
+    features against the teacher's (GaussianClin, eq. 10), the graph (`graph_loss`), and smoothness of the
     field's planes (4DGS).
 
     Args:
         config: its weights.
-        radius: of the scene, in which depth counts and cameras move.
         extra_losses: given the `DeformingScene`, with its Gaussians where they are at this time, how it was
-            drawn, and the picture; what does not count is drawn as photographed.
+            drawn, and the frame; what does not count is drawn as photographed.
     """
     weights = config.weights
 
     def loss(scene: DeformingScene, batch: Batch, *, step: Any, key: Any):
-        there, camera = scene.at(batch.time, batch.moving), _seen_from(scene, batch, radius)
+        frame, radius = batch.frame, batch.radius
+        assert frame.masks is not None
+        assert frame.time is not None
+        there, camera = scene.at(jnp.asarray(frame.time), batch.moving), _refined_camera(scene, batch)
         drawn = render(there, camera, batch.plan)
-        target = batch.image.astype(drawn.colors.dtype) / 255
+        target = frame.colors
         # What does not count is as it was photographed: no slope, no edge.
-        image = jnp.where(batch.counts[..., None], drawn.colors, target)
-        counts = batch.counts.astype(image.dtype)
+        image = jnp.where(frame.masks[..., None], drawn.colors, target)
+        counts = frame.masks.astype(image.dtype)
         area = jnp.maximum(counts.mean(), 1e-6)
         terms = {"rgb": photometric_loss(image, target, weights.dssim) / area}
-        if weights.depth and batch.depth is not None:
-            known = counts * (batch.depth > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
-            off = jnp.abs(drawn.depths - jnp.where(batch.depth > 0, batch.depth, 0.0))
+        if weights.depth and frame.depths is not None:
+            known = counts * (frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
+            off = jnp.abs(drawn.depths - jnp.where(frame.depths > 0, frame.depths, 0.0))
             terms["depth"] = weights.depth * weighted_mean(off, known) / radius
         if weights.feature and batch.ids is not None and batch.codebook is not None:
             assert drawn.features is not None
             terms["feature"] = weights.feature * feature_loss(drawn.features[0], batch.codebook, batch.ids)
         if batch.graph is not None and scene.gaussians.features is not None:
-            meanings = scene.features_at(batch.graph.times, batch.graph.nodes, batch.moving)
-            terms |= graph_loss(meanings, batch.graph, config.graph)
+            features = scene.features_at(batch.graph.times, batch.graph.nodes, batch.moving)
+            terms |= graph_loss(features, batch.graph, config.graph)
         if scene.field is not None and isinstance(scene.field.encoding, HexPlane):
             space, time = scene.field.encoding.space, scene.field.encoding.time
             terms["planes"] = (
@@ -147,35 +143,37 @@ def deform_loss(config: DeformConfig, radius: float, extra_losses: ExtraLosses =
             )
         mse = jnp.square(image - target).mean() / area
         meta = drawn.meta
-        told = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
+        info = {"psnr": -10 * jnp.log10(mse), "overflow": meta.overflow.any(), "needed": meta.needed.max()}
         if extra_losses:
             now = eqx.tree_at(lambda s: s.gaussians, scene, there)
             rendered = drawn._replace(colors=image)
-            told["extra"] = extra_terms(extra_losses, now, rendered, Frame(target, batch.depth, camera))
-            return sum(terms.values()) + sum(told["extra"].values()), terms | told
-        return sum(terms.values()), terms | told
+            seen = Frame(target, frame.depths, camera, frame.masks, frame.time)
+            info["extra"] = extra_terms(extra_losses, now, rendered, seen)
+            return sum(terms.values()) + sum(info["extra"].values()), terms | info
+        return sum(terms.values()), terms | info
 
     return loss
 
 
-def _seen_from(scene: DeformingScene, batch: Batch, radius: float) -> Camera:
-    """The look's camera, refined where cameras are."""
-    if scene.twists is None or batch.look is None:
-        return batch.camera
-    twist = jnp.where(batch.look >= 0, scene.twists[batch.look], 0.0)
-    return eqx.tree_at(lambda c: c.viewmat, batch.camera, perturbed(batch.camera.viewmat, twist, radius))
+def _refined_camera(scene: DeformingScene, batch: Batch) -> Camera:
+    """The frame's camera, refined where cameras are."""
+    camera = batch.frame.cameras
+    if scene.twists is None or batch.view is None:
+        return camera
+    twist = jnp.where(batch.view >= 0, scene.twists[batch.view], 0.0)
+    return eqx.tree_at(lambda c: c.viewmat, camera, perturbed(camera.viewmat, twist, batch.radius))
 
 
 def feature_loss(
     drawn: Float[Array, "height width c"], codebook: Float[Array, "k c"], ids: Int[Array, "h w"]
 ) -> Float[Array, ""]:
     """|F_t - F_s|_1, a mean over channels and the teacher's pixels, to whose grid F_s is brought bilinearly
-    (papers/004, eq. 10).
+    (GaussianClin, eq. 10).
 
     Args:
         drawn: F_t, the scene's features.
-        codebook: what the teacher may say.
-        ids: which of it, of each of its pixels; -1 where it says nothing.
+        codebook: the teacher's features.
+        ids: row of the codebook of each of the teacher's pixels; -1 where it has none.
     """
     known = (ids >= 0).astype(drawn.dtype)
     off = jnp.abs(on_grid(drawn, ids.shape) - codebook[jnp.maximum(ids, 0)])
@@ -188,13 +186,15 @@ def on_grid(drawn: Float[Array, "height width c"], shape: tuple[int, int]) -> Fl
     return jax.image.resize(drawn, (*shape, drawn.shape[2]), "linear", antialias=True)
 
 
-def deform_step(config: DeformConfig, radius: float, extra_losses: ExtraLosses = ()) -> Step:
-    """Adam or AdamW on a `DeformingScene`. `batch` is a `Batch`, `step` counts from 0.
+def deform_step(config: DeformConfig, extra_losses: ExtraLosses = ()) -> Step:
+    """Adam or AdamW on a `DeformingScene`.
+
+    `batch` is a `Batch`; `key` and `step` are not used, for rates fall with the optimizer's own count of
+    steps. `info` has `psnr` and each loss by its name beside what every step reports.
 
     Args:
         config: of the reconstruction.
-        radius: of the scene, the unit in which means move.
-        extra_losses: of one's own (`gsjax.losses.extra`), beside those of the method.
+        extra_losses: custom losses (`gsjax.losses.extra`) beside those of the method.
     """
     named_losses(extra_losses)
     total = max(1, config.warmup + config.iterations)
@@ -202,30 +202,32 @@ def deform_step(config: DeformConfig, radius: float, extra_losses: ExtraLosses =
         fall = optax.cosine_decay_schedule(1.0, total)
     else:
         fall = optax.exponential_decay(1.0, total, _FINAL_RATE)
-    told = vars(config.rates)
-    loss = deform_loss(config, radius, extra_losses)
+    settings = vars(config.rates)
+    loss = deform_loss(config, extra_losses)
 
-    def of(scene: DeformingScene) -> Step:
-        rates = {name: told[name] for name in ("quats", "log_scales", "logit_opacities", "sh0")}
-        rates["means"] = told["means"] * radius
+    def of(scene: DeformingScene, radius: Float[Array, ""] | float) -> Step:
+        rates: dict[str, Any] = {
+            name: settings[name] for name in ("quats", "log_scales", "logit_opacities", "sh0")
+        }
+        rates["means"] = settings["means"] * radius
         if scene.gaussians.features is not None:
-            rates["features"] = told["features"]
+            rates["features"] = settings["features"]
         if scene.field is not None:
             inner = {"hexplane": ("space", "time"), "mlp": (), "voxels": ("grid",)}
-            rates |= dict.fromkeys(inner[scene.field.config.kind], told["planes"])
-            rates["layers"] = told["layers"]
+            rates |= dict.fromkeys(inner[scene.field.config.kind], settings["planes"])
+            rates["layers"] = settings["layers"]
         if scene.twists is not None:
-            rates["twists"] = told["twists"]
+            rates["twists"] = settings["twists"]
         made = 0 if scene.field is None else config.warmup  # by the optimizer before this one
         falling = {name: _falling(rate, fall, made) for name, rate in rates.items()}
         decay = _DECAY if config.optimizer == "adamw" else 0.0
         return gradient_step(loss, per_field_adam(falling, decay=decay))
 
     def update(params: DeformingScene, state, batch: Batch, *, step, key):
-        return of(params).update(params, state, batch, step=step, key=key)
+        return of(params, batch.radius).update(params, state, batch, step=step, key=key)
 
-    return Step(lambda params: of(params).init(params), update)
+    return Step(lambda params: of(params, 1.0).init(params), update)
 
 
-def _falling(rate: float, fall: Callable, made: int) -> Callable:
+def _falling(rate: Any, fall: Callable, made: int) -> Callable:
     return lambda count: rate * fall(count + made)

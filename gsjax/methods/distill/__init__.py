@@ -1,37 +1,30 @@
-"""A semantic field for a scene that somebody else has fitted, asked in 3D (FD-3DGS, papers/002).
+"""A semantic field for a static scene, which answers queries in 3D (FD-3DGS).
 
 teacher = teacher_of_objects(masks, embeddings)
-problem, state = begin_distill(gaussians, cameras, teacher, config)
-for distilled in distill(problem, state): ...
-scores = relevancy(gaussian_cosines(field, located, queries))
+method = Distill(config)
+problem, run = method.start(gaussians, cameras, teacher)
+for now in drive(method, problem, run): ...
+scores = now.result.scores(vectors)
 
-config.py    what can be set              distill.py   the losses, and one step
-teacher.py   what pixels are to say       training.py  the loop on the host
-field.py     hash grid and convolution    query.py     what a query means
-inverse.py   from the teacher's channels back to the field's
-votes.py     labels by majority, to be held against
+config.py   what can be set                 update.py  the loss, and one step
+teacher.py  features of pixels to learn     method.py  what the loop has to know
+field.py    hash grid and convolution       result.py  the field with its queries
+query.py    scores of Gaussians and pixels
+inverse.py  from the teacher's channels back to the field's
+votes.py    labels by majority, the baseline
 """
 
 from gsjax.methods.distill.config import DistillConfig, DistillRatesConfig, DistillWeightsConfig
 from gsjax.methods.distill.field import (
     FeatureField,
-    carried,
+    active_table,
     features_of,
+    full_table,
     init_field,
-    used_part,
-    whole,
+    rendered_features,
 )
 from gsjax.methods.distill.inverse import learned_inverse, pseudo_inverse
-from gsjax.methods.distill.method import (
-    Distilled,
-    DistillProblem,
-    DistillState,
-    begin_distill,
-    compiled_step,
-    distill,
-    finished,
-    frozen_views,
-)
+from gsjax.methods.distill.method import Distill, Problem, frozen_views
 from gsjax.methods.distill.query import (
     Threshold,
     back_projected_cosines,
@@ -44,31 +37,29 @@ from gsjax.methods.distill.query import (
     selection_mask,
     threshold_for,
 )
+from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, teacher_of_maps, teacher_of_objects, with_maps
-from gsjax.methods.distill.update import DistillBatch, distill_loss, distill_step
+from gsjax.methods.distill.update import Batch, distill_loss
+from gsjax.methods.distill.update import distill_step as step
 from gsjax.methods.distill.votes import label_votes, majority_labels
 
 __all__ = [
-    "DistillBatch",
+    "Batch",
+    "Distill",
     "DistillConfig",
-    "DistillProblem",
     "DistillRatesConfig",
-    "DistillState",
+    "DistillResult",
     "DistillWeightsConfig",
-    "Distilled",
     "FeatureField",
+    "Problem",
     "Teacher",
     "Threshold",
+    "active_table",
     "back_projected_cosines",
-    "begin_distill",
-    "carried",
-    "compiled_step",
-    "distill",
     "distill_loss",
-    "distill_step",
     "features_of",
-    "finished",
     "frozen_views",
+    "full_table",
     "gaussian_cosines",
     "init_field",
     "label_votes",
@@ -80,11 +71,11 @@ __all__ = [
     "pixel_mask",
     "pseudo_inverse",
     "relevancy",
+    "rendered_features",
     "selection_mask",
+    "step",
     "teacher_of_maps",
     "teacher_of_objects",
     "threshold_for",
-    "used_part",
-    "whole",
     "with_maps",
 ]

@@ -1,4 +1,4 @@
-"""What can be set of a feature field; the defaults are the paper's (section 4) where it says."""
+"""Settings of a feature field; the defaults are those of FD-3DGS, section 4, where it gives them."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,15 +13,15 @@ POOLS = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class DistillRatesConfig:
-    """Rates of Adam, which fall to a tenth over the iterations. The paper names none: at 0.4 times these
-    small things are learned later, at three times these it diverges."""
+    """Learning rates of Adam, which fall to a tenth over the iterations. The paper gives none: at 0.4 times
+    these small things are learned later, at three times these training diverges."""
 
     table: float = 2.5e-2
-    """Of the entries of the hash grid, or of the Gaussians' own vectors."""
+    """Learning rate of the entries of the hash grid, or of the vectors per Gaussian."""
     layers: float = 5e-3
-    """Of the network behind the grid."""
+    """Learning rate of the network behind the grid."""
     lift: float = 5e-3
-    """Of the 1x1 convolution to the teacher's channels."""
+    """Learning rate of the 1x1 convolution to the teacher's channels."""
 
     def __post_init__(self):
         expect(self, "rates.", table=(0, np.inf), layers=(0, np.inf), lift=(0, np.inf))
@@ -29,18 +29,18 @@ class DistillRatesConfig:
 
 @dataclass(frozen=True)
 class DistillWeightsConfig:
-    """What each loss counts in the sum (eq. 8)."""
+    """Weights of the losses (FD-3DGS, eq. 8)."""
 
     rec: float = 1000.0
-    """Of the squared difference, a mean over the teacher's channels."""
+    """Weight of the squared difference, a mean over the teacher's channels."""
     cos: float = 1.0
-    """Of the angle."""
+    """Weight of 1 - cosine."""
     contrast: float = 1.0
-    """Of what pulls pixels of one thing together and those of others apart."""
+    """Weight of the contrast: pixels of one thing are pulled together, those of different things apart."""
     tv: float = 1.0
-    """Of differences between neighbouring pixels."""
+    """Weight of the total variation: differences between neighbouring pixels."""
     map: float = 1.0
-    """Of a pixel of a map beside one of a mask, where there are both."""
+    """Weight of a pixel of a map relative to one of a mask, where there are both."""
 
     def __post_init__(self):
         expect(self, "weights.", **dict.fromkeys(("rec", "cos", "contrast", "tv", "map"), (0, np.inf)))
@@ -48,31 +48,33 @@ class DistillWeightsConfig:
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How a feature field is distilled."""
+    """Settings of a distillation."""
 
     iterations: int = 1500
-    """Steps, of one view each."""
+    """Number of steps, of one view each."""
     channels: int = 256
-    """Numbers of a Gaussian's feature, which are rendered; the convolution makes the teacher's of them."""
+    """Channels of a Gaussian's feature; the convolution takes them to the teacher's channels."""
     encoding: Literal["grid", "table"] = "grid"
-    """A hash grid over the scene, or a vector of its own for each Gaussian."""
+    """A hash grid over the scene, or a separate vector for each Gaussian (table)."""
     grid: FeatureGridConfig = field(default_factory=FeatureGridConfig)
     """Sizes of the hash grid and its network."""
     rates: DistillRatesConfig = field(default_factory=DistillRatesConfig)
+    """Learning rates."""
     weights: DistillWeightsConfig = field(default_factory=DistillWeightsConfig)
+    """Weights of the losses."""
     contrast_after: float = 800 / 1500
-    """Share of the iterations after which the contrast counts; before, features would be scattered."""
+    """Share of the iterations after which the contrast is on; earlier it would scatter the features."""
     contrast_gamma: float = 1.0
-    """Of its kernel exp(-gamma |A - B|^2)."""
+    """Gamma of the contrast's kernel exp(-gamma |A - B|^2)."""
     contrast_pool: int = 4
-    """Edge of the windows whose largest values it compares, pixels: 1, 2, 4 or 8."""
+    """Edge of the contrast's max-pooling windows, pixels: 1, 2, 4 or 8."""
     contrast_patch: int = 32
-    """Edge of the patch of such windows that a step looks at, 64 at most: each is held against each."""
+    """Edge of the patch of windows in a step, 64 at most: each window is compared with each."""
     strip_megabytes: float = 256.0
-    """Memory of a strip of features; larger images are drawn strip by strip, to the same result, and once
-    more on the way back."""
+    """Memory of a strip of features. Larger images are drawn strip by strip, with the same result, and once
+    more in the backward pass."""
     seed: int = 0
-    """Of first values, of the order of views, and of patches."""
+    """Seed of the first values, the order of views, and the patches."""
 
     def __post_init__(self):
         expect(

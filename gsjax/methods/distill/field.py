@@ -1,12 +1,12 @@
-"""The field itself: a feature for each place, and the convolution that makes the teacher's numbers of it
-(papers/002, section 3.3).
+"""The field itself: a feature for each place, and the convolution that turns it into the teacher's channels
+(FD-3DGS, section 3.3).
 
-The last layer of the network is linear, and so is rendering. With h_i what that layer is given at Gaussian i,
+The last layer of the network is linear, and so is rendering. With h_i the input of that layer at Gaussian i,
 f_i = A h_i + b, and alpha the rendered alpha,
 
     F' = sum_i w_i f_i = A (sum_i w_i h_i) + alpha b,
 
-so that h is rendered, 128 numbers by default, and not f with 256. The result is the same, and so is
+so h is rendered, with 128 channels by default, and not f with 256. The result is the same, and so is
 everything that is linear in F' after it.
 """
 
@@ -21,16 +21,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from gsjax.methods.distill.config import DistillConfig
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
-_MARGIN = 0.02  # of the box, beyond the outermost Gaussians, in its own size
-_MOST = 0.01  # of the Gaussians, that may lie far out to either side of an axis
-_FAR_OUT = 0.5  # of the size of what holds all others
+_MARGIN = 0.02  # of the box beyond the outermost Gaussians, as a share of its size
+_OUTLIERS = 0.01  # share of the Gaussians that may lie far out on either side of an axis
+_FAR_OUT = 0.5  # how far the box reaches beyond all others, as a share of their size
 
 
 class FeatureField(eqx.Module):
-    """Features of a scene's places or Gaussians, and how the teacher's are made of them.
+    """Features of a scene's places or Gaussians, and the convolution that turns them into the teacher's.
 
     Attributes:
-        encoding: a grid over the scene, with `channels` outputs; or a vector for each Gaussian.
+        encoding: a grid over the scene with `channels` outputs, or a vector for each Gaussian.
         lift: the 1x1 convolution, without bias.
     """
 
@@ -39,17 +39,17 @@ class FeatureField(eqx.Module):
 
     @property
     def channels(self) -> int:
-        """How many numbers the field has for each Gaussian."""
+        """Number of channels of a Gaussian's feature."""
         return self.lift.shape[1]
 
     @property
     def dimension(self) -> int:
-        """D, of the teacher's features."""
+        """Number of channels of the teacher's features, D."""
         return self.lift.shape[0]
 
 
-class Carried(NamedTuple):
-    """What is rendered of a field, and what makes its channels of that.
+class RenderedFeatures(NamedTuple):
+    """What is rendered of a field, and the linear map from there to its channels.
 
     Attributes:
         values: h of each Gaussian.
@@ -60,34 +60,34 @@ class Carried(NamedTuple):
     head: Float[Array, "channels hidden+1"] | None
 
     def channels_of(self, rendered: Float[Array, "*pixels r"]) -> Float[Array, "*pixels channels"]:
-        """F' of what was rendered."""
+        """F' from the output of `joined`."""
         if self.head is None:
             return rendered
         return jnp.matmul(rendered, self.head.T, precision="highest")
 
     def joined(self, image: Float[Array, "*pixels hidden"], alphas: Float[Array, "*pixels"]):
-        """What `channels_of` wants of a rendered image and its alphas."""
+        """A rendered image and its alphas as the input of `channels_of`."""
         return image if self.head is None else jnp.concatenate([image, alphas[..., None]], axis=-1)
 
     def lifted(self, lift: Float[Array, "d channels"]) -> Float[Array, "d r"]:
-        """The convolution and what is before it, as one matrix, of what was rendered."""
+        """The convolution and `head` as one matrix, which applies to the output of `joined`."""
         return lift if self.head is None else jnp.matmul(lift, self.head, precision="highest")
 
 
 def init_field(
     key: PRNGKeyArray, config: DistillConfig, means: Float[Array, "n 3"], dimension: int
 ) -> tuple[FeatureField, Located | None]:
-    """A field before it has learned, and where the Gaussians lie in its grid.
+    """A field before training, and where the Gaussians lie in its grid.
 
     Args:
-        key: of first values.
-        config: its sizes.
-        means: of the scene's Gaussians, metres; the grid is over the box of those that are finite, and of a
-            few that lie far out the features are those of its surface.
-        dimension: D, of the teacher's features.
+        key: random key for the first values.
+        config: sizes of the field.
+        means: centres of the scene's Gaussians, metres. The grid covers the box of those that are finite; the
+            few that lie far outside have the features of its surface.
+        dimension: number of channels of the teacher's features, D.
 
     Raises:
-        ValueError: no Gaussian has a place.
+        ValueError: no Gaussian has a finite centre.
     """
     first, second = jax.random.split(key)
     bound = np.sqrt(1 / config.channels)
@@ -97,7 +97,9 @@ def init_field(
     points = np.asarray(means)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
-        raise ValueError(f"means: expected Gaussians with a place, found {len(means)}, none of them finite")
+        raise ValueError(
+            f"means: expected finite centres of Gaussians, found {len(means)}, none of them finite"
+        )
     low, high = _box(points)
     room = _MARGIN * max((high - low).max(), 1e-3)
     grid = init_feature_grid(first, config.grid, config.channels, np.stack([low - room, high + room]))
@@ -105,43 +107,46 @@ def init_field(
 
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"]:
-    """Around all points, but for those of a few that would make its cells much larger for all others."""
-    low, high = np.quantile(points, [_MOST, 1 - _MOST], axis=0).astype(np.float32)
+    """The box around all points but a few outliers, which would make the cells much larger for all others."""
+    low, high = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0).astype(np.float32)
     room = _FAR_OUT * max((high - low).max(), 1e-3)
     return np.stack([np.maximum(points.min(0), low - room), np.minimum(points.max(0), high + room)])
 
 
-def carried(field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None) -> Carried:
-    """What to render of a field: of all Gaussians, or of some.
+def rendered_features(
+    field: FeatureField, located: Located | None, rows: Int[Array, "some"] | None = None
+) -> RenderedFeatures:
+    """What to render of a field, for all Gaussians or some.
 
     Args:
         field: of all Gaussians.
-        located: where they lie in its grid; None for a table.
-        rows: of which Gaussians; of all unless given.
+        located: where they lie in its grid; None for a vector per Gaussian.
+        rows: indices of Gaussians (default: all).
     """
     if not isinstance(field.encoding, FeatureGrid):
-        return Carried(field.encoding if rows is None else field.encoding[rows], None)
+        return RenderedFeatures(field.encoding if rows is None else field.encoding[rows], None)
     assert located is not None
     if rows is not None:
         located = Located(*(a[rows] for a in located))
     last = field.encoding.layers[-1]
     assert last.bias is not None
     head = jnp.concatenate([last.weight, last.bias[:, None]], axis=1)
-    return Carried(field.encoding.hidden_at(located), head)
+    return RenderedFeatures(field.encoding.hidden_at(located), head)
 
 
 def features_of(field: FeatureField, located: Located | None) -> Float[Array, "n channels"]:
-    """f of each Gaussian."""
+    """The feature f of each Gaussian."""
     return field.encoding.at(located) if isinstance(field.encoding, FeatureGrid) else field.encoding
 
 
-def used_part(
+def active_table(
     field: FeatureField, located: Located | None
-) -> tuple[FeatureField, Located | None, Int[np.ndarray, "used"] | None]:
-    """The field with only those entries of its table that some Gaussian lies between, and which they are.
+) -> tuple[FeatureField, Located | None, Int[np.ndarray, "active"] | None]:
+    """The field with only those entries of its table that surround a Gaussian; where the Gaussians lie in
+    it; and which entries these are. The latter two are None for a vector per Gaussian.
 
-    The others get no gradient, and Adam leaves alone what never had one; a fine grid has millions. On the
-    host.
+    The other entries get no gradient, and Adam does not change what never had one; a fine grid has millions
+    of them. On the host.
     """
     if not isinstance(field.encoding, FeatureGrid):
         return field, None, None
@@ -152,10 +157,42 @@ def used_part(
     return FeatureField(grid, field.lift), located._replace(indices=indices), rows
 
 
-def whole(field: FeatureField, rows: Int[np.ndarray, "used"] | None) -> FeatureField:
-    """The field of a `used_part`, for any place; entries that no Gaussian of the scene lies between are 0."""
+def full_table(field: FeatureField, rows: Int[np.ndarray, "active"] | None) -> FeatureField:
+    """The inverse of `active_table`: the field for any place. Entries that surround no Gaussian of the scene
+    are 0."""
     if rows is None or not isinstance(field.encoding, FeatureGrid):
         return field
     table = field.encoding.table
     full = jnp.zeros((sum(field.encoding.config.entries), table.shape[1]), table.dtype).at[rows].set(table)
     return eqx.tree_at(lambda f: f.encoding.table, field, full)
+
+
+def at_means(
+    field: FeatureField, rows: Int[np.ndarray, "active"] | None, means: Float[Array, "n 3"]
+) -> tuple[FeatureField, Located | None]:
+    """The field of an `active_table`, and where Gaussians lie in it, which need not be those that it was
+    trained with. On the host.
+
+    Args:
+        field: with the active entries of its table.
+        rows: which entries these are; None for a vector per Gaussian.
+        means: centres of the Gaussians, metres.
+
+    Raises:
+        ValueError: the field has a vector for each Gaussian, and there are more or fewer of them.
+    """
+    if not isinstance(field.encoding, FeatureGrid):
+        count = len(field.encoding)
+        if count != len(means):
+            raise ValueError(f"this field has a vector for each of {count} Gaussians, found {len(means)}")
+        return field, None
+    assert rows is not None
+    located = locate(field.encoding, means)
+    indices = np.asarray(located.indices)
+    place = np.minimum(np.searchsorted(rows, indices), len(rows) - 1)
+    # An entry that surrounds no Gaussian of the scene was never trained: the row of zeros at the end.
+    place = np.where(rows[place] == indices, place, len(rows))
+    table = field.encoding.table
+    table = jnp.concatenate([table, jnp.zeros((1, table.shape[1]), table.dtype)])
+    field = eqx.tree_at(lambda f: f.encoding.table, field, table)
+    return field, located._replace(indices=jnp.asarray(place, jnp.int32))

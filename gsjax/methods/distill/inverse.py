@@ -1,8 +1,8 @@
-"""The way back from the teacher's channels to the field's (papers/002, eq. 9): the pseudo-inverse, or
-learned by the cycle loss (`gsjax.losses.features.cycle_error`).
+"""The way back from the teacher's channels to the field's (FD-3DGS, eq. 9): the pseudo-inverse, or one
+learned with the cycle loss (`gsjax.losses.features.cycle_error`).
 
-With W fixed, as the paper has it, and F = W F'_low, the second of its terms is 0, and what is left is linear
-regression in L1 on features as they occur: the learned inverse need not be one elsewhere.
+With W fixed, as in the paper, and F = W F'_low, the second term of the loss is 0. What remains is linear
+regression in L1 on the features that occur, so the learned inverse need not be an inverse elsewhere.
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ _RATE = 3e-3
 
 
 def pseudo_inverse(lift: Float[Array, "d channels"]) -> Float[Array, "channels d"]:
-    """Moore and Penrose's, by singular values."""
+    """The Moore-Penrose inverse, by singular values."""
     return jnp.linalg.pinv(lift)
 
 
@@ -33,11 +33,11 @@ def learned_inverse(
     """An inverse of a fixed convolution, by Adam on the cycle loss; and the loss over the iterations.
 
     Args:
-        lift: W.
-        features: F'_low as they occur, of pixels or of Gaussians.
-        key: one key, of shape [], of first values, and of what each step looks at.
-        iterations: steps.
-        batch: features that a step looks at.
+        lift: the convolution, W.
+        features: features F'_low of pixels or of Gaussians.
+        key: one key, of shape [], for the first values and the batches.
+        iterations: number of steps.
+        batch: number of features in a step.
     """
     optimizer = optax.adam(optax.exponential_decay(_RATE, iterations, 0.03))
 

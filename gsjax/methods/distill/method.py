@@ -1,135 +1,121 @@
-"""The host loop of a distillation: which view is next, what goes to the device, what comes back."""
+"""The distillation as one value: which views teach, which is next, and what comes of it."""
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
-from time import perf_counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import Camera
 from gsjax.methods.distill.config import DistillConfig
-from gsjax.methods.distill.field import FeatureField, init_field, used_part, whole
+from gsjax.methods.distill.field import active_table, init_field
+from gsjax.methods.distill.result import DistillResult
 from gsjax.methods.distill.teacher import Teacher, most_rows, of_view
-from gsjax.methods.distill.update import DistillBatch, distill_step
+from gsjax.methods.distill.update import Batch, distill_step
 from gsjax.methods.sampling import shuffled_index
-from gsjax.optim.compiler import host_options
+from gsjax.optim.method import Run
+from gsjax.optim.step import Step
 from gsjax.rasterize.frozen import FrozenView, freeze_views
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.gaussians import Gaussians
 
-_PATCHES = 1  # what keys are for, beside first values
 
-
-class DistillProblem(NamedTuple):
+class Problem(NamedTuple):
     """What does not change during a distillation.
 
     Attributes:
-        config: how.
-        views: batches, one a view that teaches something.
-        rows: of the grid's table that train; None without a grid.
+        views: a batch for each view that teaches something.
+        rows: entries of the grid's table that train; None without a grid.
+        means: centres of the scene's Gaussians, metres.
+        source: the encoder of the teacher's features; see `DistillResult`.
+        scene: the scene, as far as it is known; see `DistillResult`.
     """
 
-    config: DistillConfig
-    views: list[DistillBatch]
-    rows: Int[np.ndarray, "used"] | None
+    views: list[Batch]
+    rows: Int[np.ndarray, "active"] | None
+    means: Float[Array, "n 3"]
+    source: Any
+    scene: Mapping[str, Any]
 
 
-class DistillState(eqx.Module):
-    """What a distillation goes on from, to the same bits.
+@dataclass(frozen=True)
+class Distill:
+    """A semantic field for a static scene (`gsjax.optim.method.Method`).
 
     Attributes:
-        field: what is learned; of a grid, the entries that train.
-        optimizer: what the step carries along.
-        step: how many steps were made.
+        config: settings of the field and its training.
     """
 
-    field: FeatureField
-    optimizer: Any
-    step: int
+    config: DistillConfig = field(default_factory=DistillConfig)
 
+    def start(
+        self,
+        gaussians: Gaussians,
+        cameras: Sequence[Camera],
+        teacher: Teacher,
+        rasterize_mode: str = "classic",
+        *,
+        source: Any = None,
+        scene: Mapping[str, Any] | None = None,
+    ) -> tuple[Problem, Run]:
+        """A distillation before its first step.
 
-class Distilled(NamedTuple):
-    """A distillation after one more step.
+        Args:
+            gaussians: the scene, which does not change.
+            cameras: one for each view, viewmat [4,4] and K [3,3], of any sizes.
+            teacher: of the same views.
+            rasterize_mode: "antialiased" for a scene that was fitted with it.
+            source: the encoder of the teacher's features; see `DistillResult`.
+            scene: what is known of the scene; see `DistillResult`.
 
-    Attributes:
-        state: to go on from. Its arrays are given away in the next step: copy what is to be kept.
-        info: losses of this step, on the device.
-        seconds: that it took, without what compiled.
-        compile_seconds: that compiling took in it.
-    """
+        Raises:
+            ValueError: the teacher has other views, or of other sizes, or no Gaussian has a finite centre.
+        """
+        _check(cameras, teacher)
+        config = self.config
+        found, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
+        found, located, rows = active_table(found, located)
+        most, views = most_rows(teacher), []
+        for v, (view, plan) in enumerate(frozen_views(gaussians, cameras, rasterize_mode)):
+            if teacher.maps is None and not (teacher.ids[v] >= 0).any():
+                continue  # it teaches nothing
+            ids, codebook = of_view(teacher, v, most)
+            codebook = None if codebook is None else jnp.asarray(codebook)
+            of_pixels = None if teacher.maps is None else teacher.maps[v]
+            views.append(Batch(view, located, jnp.asarray(ids), codebook, of_pixels, plan))
+        about = {"num_gaussians": gaussians.num, "rasterize_mode": rasterize_mode} | dict(scene or {})
+        problem = Problem(views, rows, jnp.asarray(gaussians.means), source, about)
+        return problem, Run(found, self.step.init(found))
 
-    state: DistillState
-    info: dict[str, Array]
-    seconds: float
-    compile_seconds: float
+    @property
+    def step(self) -> Step:
+        """See `distill_step`."""
+        return distill_step(self.config)
 
+    def total(self, problem: Problem) -> int:
+        """The iterations of the configuration."""
+        return self.config.iterations
 
-def begin_distill(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    teacher: Teacher,
-    config: DistillConfig,
-    rasterize_mode: str = "classic",
-) -> tuple[DistillProblem, DistillState]:
-    """A distillation before its first step.
+    def between(self, problem: Problem, run: Run, progress: float) -> Run:
+        """The run as it is: shapes never change, and views are frozen. Arguments as for `Method.between`."""
+        return run
 
-    Args:
-        gaussians: the scene, which stays as it is.
-        cameras: one a view, viewmat [4,4] and K [3,3], of any sizes.
-        teacher: of the same views.
-        config: how.
-        rasterize_mode: "antialiased" for a scene that was fitted so.
+    def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
+        """The view whose turn it is, which has its own plan. Arguments as for `Method.batch`."""
+        return problem.views[shuffled_index(self.config.seed, run.step, len(problem.views))], ()
 
-    Raises:
-        ValueError: the teacher has other views, or of other sizes, or the scene no Gaussian with a place.
-    """
-    _check(cameras, teacher)
-    field, located = init_field(jax.random.key(config.seed), config, gaussians.means, teacher.dimension)
-    field, located, rows = used_part(field, located)
-    frozen, views = frozen_views(gaussians, cameras, rasterize_mode), []
-    most = most_rows(teacher)
-    for v, (view, plan) in enumerate(frozen):
-        if teacher.maps is None and not (teacher.ids[v] >= 0).any():
-            continue  # it teaches nothing
-        ids, codebook = of_view(teacher, v, most)
-        codebook = None if codebook is None else jnp.asarray(codebook)
-        of_pixels = None if teacher.maps is None else teacher.maps[v]
-        views.append(DistillBatch(view, located, jnp.asarray(ids), codebook, of_pixels, plan))
-    state = DistillState(field, distill_step(config).init(field), 0)
-    return DistillProblem(config, views, rows), state
-
-
-def distill(problem: DistillProblem, state: DistillState) -> Iterator[Distilled]:
-    """Step by step, until all is done. The same state and problem give the same bits, wherever the
-    distillation was begun or resumed."""
-    config = problem.config
-    advance = compiled_step(config)
-    key = jax.random.fold_in(jax.random.key(config.seed), _PATCHES)
-    field, optimizer = state.field, state.optimizer
-    for i in range(state.step, config.iterations):
-        begun, programs = perf_counter(), advance._cache_size()
-        batch = problem.views[shuffled_index(config.seed, i, len(problem.views))]
-        field, optimizer, info = advance(field, optimizer, batch, jnp.asarray(i), jax.random.fold_in(key, i))
-        jax.block_until_ready(info)
-        seconds, new = perf_counter() - begun, advance._cache_size() > programs
-        now = DistillState(field, optimizer, i + 1)
-        yield Distilled(now, info, 0.0 if new else seconds, seconds if new else 0.0)
-
-
-def finished(problem: DistillProblem, state: DistillState) -> FeatureField:
-    """The field for any place, not only where the scene's Gaussians are."""
-    return whole(state.field, problem.rows)
+    def result(self, problem: Problem, run: Run) -> DistillResult:
+        """The field. Its arrays are those of the run: copy what is to be kept."""
+        return DistillResult(run.params, problem.rows, problem.source, problem.scene, problem.means)
 
 
 def frozen_views(
     gaussians: Gaussians, cameras: Sequence[Camera], rasterize_mode: str = "classic"
 ) -> list[tuple[FrozenView, Plan]]:
-    """The scene in each camera. Those of one size share their plan and the lengths of their lists.
+    """The scene in each camera. Views of one size share their plan and the lengths of their lists.
 
     Args:
         gaussians: the scene.
@@ -148,18 +134,6 @@ def frozen_views(
         for place, v in enumerate(which):
             found[v] = (jax.tree.map(lambda a, place=place: a[place], views), plan)
     return [found[v] for v in range(len(cameras))]
-
-
-@lru_cache(maxsize=2)
-def compiled_step(config: DistillConfig) -> Callable:
-    """The jitted step: field, optimizer, batch, number, key. Buffers that it replaces are given away."""
-    step = distill_step(config)
-
-    @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
-    def advance(field, optimizer, batch, i, key):
-        return step.update(field, optimizer, batch, step=i, key=key)
-
-    return advance
 
 
 def _check(cameras: Sequence[Camera], teacher: Teacher) -> None:

@@ -1,13 +1,12 @@
-"""What of a scene a query means: per Gaussian, directly in 3D, or per pixel of a view (papers/002, section
-3.5).
+"""Scores of a query: per Gaussian, directly in 3D, or per pixel of a view (FD-3DGS, section 3.5).
 
 The score is the cosine; the quotient that the paper prints, F'.q / |F'.q|, is +-1. It is exact in 3D as in
-2D: W f_i is held against q, through W^T q and W^T W. The paper's way back, an inverse of the convolution that
-takes q to the field's own channels, is there to compare with: the pseudo-inverse, or one that was learned
+2D: W f_i is compared with q, through W^T q and W^T W. The paper's way back, an inverse of the convolution
+that takes q to the field's own channels, is there for comparison: the pseudo-inverse, or a learned one
 (`gsjax.methods.distill.inverse`).
 
 Against negatives a score is the share of the query in a softmax of two, with the negative that takes most of
-it (Kerr et al. 2023, "LERF", section 3.4): 1/2 where both fit alike.
+it (Kerr et al. 2023, "LERF", section 3.4): 1/2 where both fit equally well.
 """
 
 from typing import NamedTuple
@@ -16,9 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from skimage.filters import threshold_otsu
 
-from gsjax.methods.distill.field import Carried, FeatureField, carried
+from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
 from gsjax.rasterize.frozen import FrozenView, paint, paint_shown
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.feature_grid import Located
@@ -27,11 +25,11 @@ TEMPERATURE = 0.1
 EVEN = 0.5
 """The threshold against negatives: the query fits better than each of them."""
 _LEAST_NORM = 1e-12
-_OPAQUE = 0.5  # a pixel in which less of the scene shows is of nothing
+_OPAQUE = 0.5  # a pixel to which the scene sends less of its light shows nothing
 
 
 class Threshold(NamedTuple):
-    """From which score on something is meant, and by which rule."""
+    """Score above which something is selected, and the rule that it comes from."""
 
     value: float
     rule: str
@@ -44,10 +42,10 @@ def gaussian_cosines(
 
     Args:
         field: of all Gaussians.
-        located: where they lie in its grid; None for a table.
+        located: where they lie in its grid; None for a vector per Gaussian.
         queries: vectors in the teacher's channels.
     """
-    parts = carried(field, located)
+    parts = rendered_features(field, located)
     rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
     return _cosines(rendered, parts.lifted(field.lift), queries)
 
@@ -66,18 +64,18 @@ def pixel_cosines(
         view, plan: from `gsjax.rasterize.frozen.freeze_views`.
         queries: vectors in the teacher's channels.
     """
-    return painted_cosines(field, carried(field, located, view.rows), view, plan, queries)
+    return painted_cosines(field, rendered_features(field, located, view.rows), view, plan, queries)
 
 
 def painted_cosines(
-    field: FeatureField, parts: Carried, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
+    field: FeatureField, parts: RenderedFeatures, view: FrozenView, plan: Plan, queries: Float[Array, "q d"]
 ) -> tuple[Float[Array, "height width q"], Float[Array, "height width"]]:
-    """`pixel_cosines` where it is known what the view's Gaussians carry: of several strips of it, say.
+    """`pixel_cosines` with given rendered features of the view's Gaussians, for several strips of it, say.
 
     Args:
         field: of all Gaussians.
-        parts: from `carried`, with the rows of the view.
-        view, plan: of the view, or of a strip of it.
+        parts: from `rendered_features`, with the rows of the view.
+        view, plan: the view, or a strip of it.
         queries: vectors in the teacher's channels.
     """
     image, alphas = paint_shown(view, parts.values, plan)
@@ -94,7 +92,7 @@ def pixel_features(
     pixels: Int[Array, "p 2"],
 ) -> tuple[Float[Array, "p d"], Float[Array, "p"]]:
     """W F' at some pixels (x, y) of a view, in the teacher's channels, and the alphas there."""
-    parts = carried(field, located)
+    parts = rendered_features(field, located)
     image, alphas = paint(view, parts.values, plan)
     x, y = pixels[:, 0], pixels[:, 1]
     rendered = parts.joined(image[y, x], alphas[y, x])
@@ -112,9 +110,9 @@ def back_projected_cosines(
     Args:
         field, located: as for `gaussian_cosines`.
         queries: vectors in the teacher's channels.
-        inverse: W', from `learned_inverse`, say.
+        inverse: W', for example from `learned_inverse`.
     """
-    parts = carried(field, located)
+    parts = rendered_features(field, located)
     rendered = parts.joined(parts.values, jnp.ones(len(parts.values), parts.values.dtype))
     features = parts.channels_of(rendered)
     back = jnp.matmul(queries, inverse.T, precision="highest")
@@ -125,8 +123,8 @@ def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -
     """The first query's score: its cosine where it is alone, else its least share against one of the others.
 
     Args:
-        cosines: of the query, and then of negatives.
-        temperature: difference of cosines by which shares are e : 1.
+        cosines: those of the query, then those of negatives.
+        temperature: difference of cosines at which the shares are e : 1.
     """
     if cosines.shape[-1] == 1:
         return cosines[..., 0]
@@ -137,8 +135,14 @@ def relevancy(cosines: Float[Array, "*n q"], temperature: float = TEMPERATURE) -
 def threshold_for(
     scores: Float[np.ndarray, "n"], against_negatives: bool, given: float | None = None
 ) -> Threshold:
-    """The threshold that was given; 1/2 against negatives; else Otsu's, which parts the scores into two kinds
-    such that each varies least within itself. On the host."""
+    """The given threshold; 1/2 against negatives; else Otsu's, which divides the scores into two classes with
+    the least variance within each. On the host.
+
+    Args:
+        scores: of Gaussians.
+        against_negatives: whether the scores are shares against negatives.
+        given: threshold to use (default: by the rules above).
+    """
     if given is not None:
         return Threshold(float(given), "given")
     if against_negatives:
@@ -146,11 +150,13 @@ def threshold_for(
     scores = scores[np.isfinite(scores)]
     if not len(scores) or scores.max() - scores.min() < 1e-6:
         return Threshold(float("inf"), "Otsu; all scores are alike")
+    from skimage.filters import threshold_otsu  # slow to import
+
     return Threshold(float(threshold_otsu(scores)), "Otsu")
 
 
 def selection_mask(view: FrozenView, plan: Plan, selected: Bool[Array, "n"]) -> Bool[Array, "height width"]:
-    """Where selected Gaussians send more than half of a pixel's light: what stands before them hides them."""
+    """Where selected Gaussians send more than half of a pixel's light; others in front of them hide them."""
     share, _ = paint(view, selected.astype(view.opacities.dtype)[:, None], plan)
     return share[..., 0] > _OPAQUE
 
@@ -162,8 +168,8 @@ def pixel_mask(
 
     Args:
         scores: of pixels.
-        alphas: of the same.
-        threshold: of scores.
+        alphas: of the same pixels.
+        threshold: score above which a pixel is selected.
     """
     return (scores > threshold) & (alphas > _OPAQUE)
 

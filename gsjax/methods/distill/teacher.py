@@ -1,5 +1,5 @@
-"""What pixels are to say: masks with an embedding each (papers/002, section 3.2), or a feature a pixel. On
-the host.
+"""The features that pixels are to have: masks with an embedding each (FD-3DGS, section 3.2), or a feature a
+pixel. On the host.
 """
 
 import warnings
@@ -9,23 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Shapes stand in the docstrings: the functions check them, and say more than an annotation could.
+# Shapes are in the docstrings: the functions check them, with better messages than annotations would give.
 
 UNKNOWN_ID = -1
 
 
 class Teacher(NamedTuple):
-    """Of V views.
+    """Features of the pixels of V views.
 
     Attributes:
-        ids: which row of the codebook each pixel shows, [H,W] a view; -1 where nobody knows. Pixels of one id
-            are of one thing, which is what the contrast goes by. Without a codebook they say no more.
-        codebook: the embeddings, [K, D], no two alike; None where there are maps only.
+        ids: row of the codebook of each pixel, [H,W] a view; -1 where unknown. Pixels with the same id are of
+            one thing, for the contrast; without a codebook that is all they mean.
+        codebook: the distinct embeddings, [K, D]; None where there are maps only.
         maps: a feature a pixel of a picture of any size, [h,w,D] a view, stretched over the view; None where
             there are none.
 
-    Embeddings, and features of maps, have a mean length of 1, whatever the encoder's had: cosines do not
-    depend on it, but how fast a field learns would.
+    Embeddings and features of maps are scaled to a mean length of 1: cosines do not depend on their length,
+    but the speed of training would.
     """
 
     ids: list[np.ndarray]
@@ -34,7 +34,7 @@ class Teacher(NamedTuple):
 
     @property
     def dimension(self) -> int:
-        """D, how many numbers the teacher says of a pixel."""
+        """Number of channels of a feature, D."""
         if self.codebook is not None:
             return self.codebook.shape[1]
         assert self.maps is not None
@@ -42,18 +42,18 @@ class Teacher(NamedTuple):
 
 
 def teacher_of_objects(masks: Sequence[np.ndarray], embeddings: Sequence[np.ndarray]) -> Teacher:
-    """One that says of each pixel the embedding of the object whose mask it lies in.
+    """A teacher whose pixels have the embedding of the object whose mask they lie in.
 
-    Objects with the same embedding are one thing, in one view as over all of them.
+    Objects with the same embedding are one thing, within a view and across views.
 
     Args:
-        masks: labels of each view, integers [H,W], 0 to n; negative where nobody knows.
-        embeddings: of the labels 0 to n of each view, [n+1, D]; a row of zeros is a label of which nothing is
-            known.
+        masks: labels of each view, integers [H,W], 0 to n; negative where unknown.
+        embeddings: embeddings of the labels 0 to n of each view, [n+1, D]; a row of zeros for a label that is
+            unknown.
 
     Raises:
-        ValueError: there is no view, or one says nothing of its labels; dimensions differ; numbers are not
-            finite; or nothing is said anywhere.
+        ValueError: there is no view, or a label has no embedding; dimensions differ; numbers are not finite;
+            or no label of any view is known.
     """
     if len(masks) != len(embeddings):
         raise ValueError(f"embeddings: expected those of {len(masks)} views, found {len(embeddings)}")
@@ -93,15 +93,15 @@ def teacher_of_maps(
     sizes: Sequence[tuple[int, int]],
     ids: Sequence[np.ndarray] | None = None,
 ) -> Teacher:
-    """One that says a feature of its own of each pixel.
+    """A teacher with a feature for each pixel.
 
     Args:
         maps: [h,w,D] of each view, of any size.
         sizes: (height, width) of each view.
-        ids: [H,W], what is one thing, for the contrast; without them there is none.
+        ids: [H,W] of each view, equal for pixels of one thing (default: no contrast).
 
     Raises:
-        ValueError: dimensions differ, or numbers are not finite, or a map is of another shape than its view.
+        ValueError: dimensions differ, numbers are not finite, or a map has not the shape of its view.
     """
     if len(maps) != len(sizes) or not len(maps):
         raise ValueError(f"maps: expected those of {len(sizes)} views, found {len(maps)}")
@@ -126,17 +126,17 @@ def teacher_of_maps(
 
 
 def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
-    """One that says of each pixel both what its object's embedding is and what a map has there.
+    """A teacher with both the embeddings of objects and maps.
 
-    The maps are a second opinion: what no mask holds has a feature by them, and what they are worth beside
-    the masks is `DistillWeightsConfig.map`.
+    The maps also give features to what lies in no mask. Their weight relative to the masks is
+    `DistillWeightsConfig.map`.
 
     Args:
         objects: a teacher of masks.
         dense: a teacher of maps, of the same views, by the same encoder.
 
     Raises:
-        ValueError: views or dimensions differ, or one of them is not of its kind.
+        ValueError: views or dimensions differ, or a teacher is of the other kind.
     """
     if objects.codebook is None or dense.maps is None:
         raise ValueError("teachers: expected one of objects and one of maps, found others")
@@ -151,8 +151,14 @@ def with_maps(objects: Teacher, dense: Teacher) -> Teacher:
 
 
 def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """What pixels of a view show, as rows of a small codebook of its own, which zeros fill up to `rows`; the
-    ids as they are, and None, where there are maps only."""
+    """Ids of a view as rows of its own small codebook, and this, padded with zeros; the ids as they are, and
+    None, where there are maps only.
+
+    Args:
+        teacher: of all views.
+        v: index of the view.
+        rows: number of rows to pad to.
+    """
     ids = np.asarray(teacher.ids[v], np.int32)
     if teacher.codebook is None:
         return ids, None
@@ -164,12 +170,12 @@ def of_view(teacher: Teacher, v: int, rows: int) -> tuple[np.ndarray, np.ndarray
 
 
 def most_rows(teacher: Teacher) -> int:
-    """How many rows of the codebook a view shows at most, and at least 1."""
+    """The largest number of rows of the codebook that any view shows, at least 1."""
     return max(1, *(len(np.unique(ids[ids >= 0])) for ids in teacher.ids))
 
 
 def _mean_length(features: Sequence[np.ndarray]) -> np.float32:
-    """Of all features; 1 where all are zeros."""
+    """Mean length of all features; 1 where all are zeros."""
     lengths = [np.linalg.norm(np.asarray(one, np.float64), axis=-1).ravel() for one in features]
     return np.float32(np.concatenate(lengths).mean() or 1.0)
 

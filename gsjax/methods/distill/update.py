@@ -1,4 +1,6 @@
-"""Distillation: a view a step is drawn in features and held against its teacher (papers/002, section 3.4)."""
+"""One step of a distillation: draw the features of a view, compare them with its teacher, descend
+(FD-3DGS, section 3.4).
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,7 +21,7 @@ from gsjax.losses.features import (
 )
 from gsjax.losses.regularization import total_variation
 from gsjax.methods.distill.config import DistillConfig
-from gsjax.methods.distill.field import Carried, FeatureField, carried
+from gsjax.methods.distill.field import FeatureField, RenderedFeatures, rendered_features
 from gsjax.optim.step import Step, gradient_step
 from gsjax.rasterize.frozen import FrozenView, paint_shown, rows_within, strip_of
 from gsjax.rasterize.plan import Plan
@@ -28,16 +30,17 @@ from gsjax.scene.feature_grid import Located
 _FINAL_RATE = 0.1
 
 
-class DistillBatch(NamedTuple):
-    """A view and what its teacher says.
+class Batch(NamedTuple):
+    """A view and the teacher's features of it.
 
     Attributes:
-        view: of the scene, which stands still.
+        view: the static scene in the view's camera.
         located: where its Gaussians lie in the grid; None without one.
-        ids: rows of the codebook, or things; -1 unknown.
-        codebook: of the teacher, what this view shows of it; None where there are maps only.
-        map: of the teacher, of any size; None where there is none. It stays on the host until its step.
-        plan: of the view.
+        ids: row of the codebook that each pixel shows, or which thing; -1 where unknown.
+        codebook: the teacher's features that occur in this view; None where there are maps only.
+        map: the teacher's feature of each pixel, of any size; None where there is none. It stays on the host
+            until its step.
+        plan: the capacity of the view, which never grows: the view is frozen.
     """
 
     view: FrozenView
@@ -49,7 +52,7 @@ class DistillBatch(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Of the pixels of a strip."""
+    """Losses summed over the pixels of a strip, and the number of pixels that have a teacher."""
 
     rec: Float[Array, ""]
     cos: Float[Array, ""]
@@ -58,9 +61,13 @@ class _Sums(NamedTuple):
 
 
 def distill_step(config: DistillConfig) -> Step:
-    """Adam on a `FeatureField`; `batch` is a `DistillBatch`, `step` the number of the step, `key` is needed.
+    """Adam on a `FeatureField`.
 
-    `info` has each loss by name, unweighted.
+    `batch` is a `Batch`; `step` says when the contrast begins, and `key` chooses its patch. `info` has each
+    loss by name, unweighted, beside what every step reports.
+
+    Args:
+        config: of the distillation.
     """
     rates = config.rates
     fall = optax.exponential_decay(1.0, config.iterations, _FINAL_RATE)
@@ -80,10 +87,14 @@ def distill_step(config: DistillConfig) -> Step:
 
 
 def distill_loss(config: DistillConfig) -> Callable:
-    """`loss(field, batch, *, step, key)`: eq. 8, of one view."""
+    """`loss(field, batch, *, step, key)` of one view (FD-3DGS, eq. 8).
+
+    Args:
+        config: weights and the contrast's settings.
+    """
     weights, edge = config.weights, config.contrast_pool
 
-    def loss(field: FeatureField, batch: DistillBatch, *, step: Any, key: Any):
+    def loss(field: FeatureField, batch: Batch, *, step: Any, key: Any):
         corner = _corner(key, batch.ids.shape, config) if weights.contrast else None
         sums, pooled = _drawn(field, batch, corner, config)
         channels = field.channels
@@ -107,30 +118,30 @@ def distill_loss(config: DistillConfig) -> Callable:
     return loss
 
 
-def strip_rows(config: DistillConfig, hidden: int, batch: DistillBatch) -> int:
-    """Rows of tiles in a strip whose pixels' numbers take no more memory than they may.
+def strip_rows(config: DistillConfig, hidden: int, batch: Batch) -> int:
+    """Number of rows of tiles in a strip, within the memory that the configuration allows.
 
     Args:
-        config: with the megabytes that a strip may take.
-        hidden: channels of what is rendered.
+        config: with the megabytes of a strip.
+        hidden: number of rendered channels.
         batch: of one view.
     """
     numbers = hidden + config.channels
     numbers += 0 if batch.codebook is None else len(batch.codebook)
-    numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # what it says, and what the field does
+    numbers += 0 if batch.map is None else 2 * batch.map.shape[-1]  # the teacher's features and the field's
     return rows_within(config.strip_megabytes, numbers, batch.plan)
 
 
 def _drawn(
-    field: FeatureField, batch: DistillBatch, corner: Any, config: DistillConfig
+    field: FeatureField, batch: Batch, corner: Any, config: DistillConfig
 ) -> tuple[_Sums, Float[Array, "h_ patch channels"] | None]:
-    """What losses there are in a view, and pooled features of the columns that the contrast looks at.
+    """The losses of a view, and pooled features of the columns from which the contrast takes its patch.
 
-    The image is worked through strip by strip, each of which forgets its pixels and is drawn once more on the
-    way back. So the memory is that of a strip.
+    The image is processed strip by strip. A strip does not keep its pixels and is drawn once more in the
+    backward pass, so the memory is that of one strip.
     """
-    # Of the Gaussians that the view shows; those behind others need no features.
-    parts, plan = carried(field, batch.located, batch.view.rows), batch.plan
+    # Only for Gaussians that the view shows: those behind others need no features.
+    parts, plan = rendered_features(field, batch.located, batch.view.rows), batch.plan
     rows = strip_rows(config, parts.values.shape[1], batch)
     strips = -(-plan.tiles_y // rows)
     high = rows * plan.tile_size
@@ -152,21 +163,21 @@ def _drawn(
 
 def _strip(
     field: FeatureField,
-    parts: Carried,
-    batch: DistillBatch,
+    parts: RenderedFeatures,
+    batch: Batch,
     above: Float[Array, "width channels"],
     number: Int[Array, ""] | int,
     rows: int,
     corner: Any,
     config: DistillConfig,
 ):
-    """One strip: its last row, its sums, and pooled features of some of its columns."""
+    """The last row of a strip, its sums, and pooled features of some of its columns."""
     plan, weights = batch.plan, config.weights
     high = rows * plan.tile_size
     view, strip_plan = strip_of(batch.view, plan, number * rows, rows)
     image, alphas = paint_shown(view, parts.values, strip_plan)
-    # Pixels on one axis: a matmul over two of them, as in the slope by the weights, XLA:CPU does ten times as
-    # slowly.
+    # Pixels on one axis: XLA:CPU takes ten times as long for a matmul over two axes, as in the gradient of
+    # the weights.
     alphas = alphas.ravel()
     rendered = parts.joined(image.reshape(len(alphas), -1), alphas)
     inside = number * high + jnp.arange(high) < plan.height
@@ -189,16 +200,16 @@ def _strip(
 
 def _teacher_sums(
     field: FeatureField,
-    parts: Carried,
-    batch: DistillBatch,
+    parts: RenderedFeatures,
+    batch: Batch,
     rendered,
     alphas,
     first_row,
     inside,
     beside_masks: float,
 ) -> _Sums:
-    """By how much a strip's pixels, in one row, differ from what the teacher says of them. A pixel of a map
-    counts `beside_masks` where there are masks too."""
+    """How far a strip's pixels, on one axis, are from the teacher's features. A pixel of a map has the weight
+    `beside_masks` where there are masks too."""
     lifted = parts.lifted(field.lift)
     zero = jnp.zeros((), rendered.dtype)
     rec, cos, pixels = zero, zero, zero
@@ -209,8 +220,8 @@ def _teacher_sums(
         cos += jnp.where(known, cosine_error(like), 0.0).sum()
         pixels += known.sum(dtype=zero.dtype)
     if batch.map is not None:
-        said = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
-        like = likeness_to_map(rendered, lifted, said.reshape(len(alphas), -1))
+        wanted = _stretched(jnp.asarray(batch.map), first_row, len(inside), batch.plan)
+        like = likeness_to_map(rendered, lifted, wanted.reshape(len(alphas), -1))
         known = jnp.repeat(inside, batch.plan.width)
         weight = jnp.where(known, 1.0 if batch.codebook is None else beside_masks, 0.0)
         rec += (weight * feature_error(like, alphas, field.dimension)).sum()
@@ -222,7 +233,7 @@ def _teacher_sums(
 def _stretched(
     teacher: Float[Array, "h w d"], first: Int[Array, ""] | int, rows: int, plan: Plan
 ) -> Float[Array, "rows width d"]:
-    """Rows of a teacher's map as large as the view, linear between the centres of its pixels."""
+    """Rows of a teacher's map at the size of the view, interpolated linearly between its pixel centres."""
     high, wide = teacher.shape[:2]
 
     def places(centres, have: int, want: int):
@@ -237,13 +248,13 @@ def _stretched(
 
 
 def _patch_shape(shape: tuple[int, ...], config: DistillConfig) -> tuple[int, int]:
-    """Windows, down and across, of a patch in a view of so many pixels."""
+    """Number of windows, down and across, of a patch in a view of this shape."""
     high, wide = (min(config.contrast_patch, side // config.contrast_pool) for side in shape)
     return high, wide
 
 
 def _corner(key: Any, shape: tuple[int, ...], config: DistillConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The first window, down and across, of the patch that a key chooses."""
+    """The first window, down and across, of the patch that the key chooses."""
     (first, second), size = jax.random.split(key), _patch_shape(shape, config)
     down, across = (side // config.contrast_pool - some for side, some in zip(shape, size, strict=True))
     return jax.random.randint(first, (), 0, down + 1), jax.random.randint(second, (), 0, across + 1)
@@ -252,7 +263,7 @@ def _corner(key: Any, shape: tuple[int, ...], config: DistillConfig) -> tuple[In
 def _contrast(
     columns: Float[Array, "h patch channels"], ids: Int[Array, "h w"], corner: Any, config: DistillConfig
 ) -> Float[Array, ""]:
-    """The contrast within a patch of pooled features, of which the columns are cut out already."""
+    """The contrast within a patch of pooled features; `columns` are those of the patch, in all rows."""
     high, wide = min(config.contrast_patch, ids.shape[0]), columns.shape[1]
     patch = jax.lax.dynamic_slice_in_dim(columns, corner[0], high)
     seen = jax.lax.dynamic_slice(ids, corner, (high, wide))

@@ -1,8 +1,8 @@
-"""Labels of pixels lifted to Gaussians by majority: what a field is held against, and the least that lifting
-can be.
+"""Labels of pixels lifted to Gaussians by majority: the baseline of a field, and the simplest way of lifting.
 
 A pixel's vote for a Gaussian is the share of its light that the Gaussian sends. So the votes of a view are
-the slope of sum over pixels p of F(p)[label of p] by the Gaussians' values, F being linear in these.
+the gradient of sum over pixels p of F(p)[label of p] with respect to the Gaussians' values, in which F is
+linear.
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ def label_votes(
     """How much light each Gaussian that a view shows, `view.rows`, sends to the pixels of each label.
 
     Args:
-        view, plan: of the scene.
-        ids: 0 to count - 1 of each pixel; with -1 it has no vote.
-        count: of labels.
+        view, plan: the frozen view and its plan.
+        ids: label of each pixel, 0 to count - 1; a pixel with -1 has no vote.
+        count: number of labels.
     """
     ballots = jax.nn.one_hot(ids, count)  # a row of zeros for -1
     nothing = jnp.zeros((view.opacities.shape[0], count), ballots.dtype)
@@ -37,14 +37,14 @@ def label_votes(
 def majority_labels(
     views: Sequence[tuple[FrozenView, Plan]], ids: Sequence[np.ndarray], count: int, num: int
 ) -> Int[np.ndarray, "n"]:
-    """The label with most votes of all views, of each of `num` Gaussians; -1 for one that sends no light to a
-    pixel with a label.
+    """The label with most votes over all views, for each of `num` Gaussians; -1 for one that sends no light
+    to a pixel with a label.
 
     Args:
-        views: frozen, with their plans.
+        views: frozen views with their plans.
         ids: label of each pixel of each view, [H,W]; -1 for none.
-        count: how many labels there are.
-        num: how many Gaussians.
+        count: number of labels.
+        num: number of Gaussians.
     """
     votes = np.zeros((num, count))
     for (view, plan), one in zip(views, ids, strict=True):

@@ -1,19 +1,21 @@
-"""MotionSplicer (papers/001): parts of a moving scene, found by their motion without annotation, and edited.
+"""Parts of a moving scene, found by their motion without annotation, and edited (MotionSplicer).
 
-anchor = choose_anchor(views.image, views.num_frames, views.num_cameras)
-moved = moved_pixels(views.image, anchor, views.num_cameras)
-start = begin(views, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
-for followed in follow(views, start, first_parts(start, views.num_frames, config), config): ...
-parts, _ = without_needless(views, followed.parts, config)
-for refined in refine(views, parts, config): parts = refined.parts
-scene, trajectory = outcome(start, parts, times)
+anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras)
+moved = moved_pixels(sequence.image, anchor, sequence.num_cameras)
+start = begin(sequence, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
+method = Parts(config)
+problem, run = method.start(sequence, start)
+for now in drive(method, problem, run): ...
+now.result.weights, now.result.poses(t), now.result.joints()
 
-config.py    what can be set              stream.py   one step of the optimisation
-anchor.py    which frame is canonical     unify.py    which parts are one
-masks.py     what moves in every view     follow.py   the loop over frames
-lift.py      from masks to Gaussians      finish.py   what no picture needs is given up
-weights.py   the grid of weights          trajectory.py  what comes of it, and what edits work on
-discover.py  all that, before any motion  refine.py   all frames together, in the end
+config.py    what can be set              method.py     what the loop has to know
+anchor.py    which frame is canonical     pictures.py   what steps see
+masks.py     what moves in every view     stream.py     one step of a frame
+lift.py      from masks to Gaussians      refine.py     one step of all frames together
+weights.py   the field of weights         update.py     the two as one step
+discover.py  all that, before any motion  discovery.py  from frame to frame; parts become one or two
+unify.py     which parts are one          finish.py     what no picture needs is given up
+joints.py    what explains a motion       result.py     the outcome, which edits work on
 """
 
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, moved_pixels
@@ -24,12 +26,23 @@ from gsjax.methods.parts.config import (
     StreamConfig,
     UnifyConfig,
 )
-from gsjax.methods.parts.discover import Start, Views, begin
+from gsjax.methods.parts.discover import Start, begin
+from gsjax.methods.parts.discovery import Discovery, order_of_frames
 from gsjax.methods.parts.finish import outcome, without_needless
-from gsjax.methods.parts.follow import Followed, Parts, first_parts, follow
+from gsjax.methods.parts.joints import joints_of, motions_in_world
 from gsjax.methods.parts.masks import masks_of_labels
-from gsjax.methods.parts.refine import Refined, refine
-from gsjax.methods.parts.stream import Canonical, StreamBatch, StreamParams, stream_loss, stream_step
+from gsjax.methods.parts.method import Parts
+from gsjax.methods.parts.pictures import Problem
+from gsjax.methods.parts.refine import RefineBatch, RefineParams, refine_step
+from gsjax.methods.parts.result import PartsResult
+from gsjax.methods.parts.stream import (
+    Canonical,
+    PosedScene,
+    StreamBatch,
+    StreamParams,
+    stream_loss,
+    stream_step,
+)
 from gsjax.methods.parts.trajectory import (
     BACKGROUND,
     Moment,
@@ -40,36 +53,42 @@ from gsjax.methods.parts.trajectory import (
     still,
     trajectory_of,
 )
+from gsjax.methods.parts.update import parts_step as step
 
 __all__ = [
     "BACKGROUND",
     "Anchor",
     "Canonical",
     "DiscoverConfig",
-    "Followed",
+    "Discovery",
     "Moment",
     "PartScene",
     "Parts",
     "PartsConfig",
+    "PartsResult",
+    "PosedScene",
+    "Problem",
+    "RefineBatch",
     "RefineConfig",
-    "Refined",
+    "RefineParams",
     "Start",
     "StreamBatch",
     "StreamConfig",
     "StreamParams",
     "Trajectory",
     "UnifyConfig",
-    "Views",
     "begin",
     "choose_anchor",
-    "first_parts",
-    "follow",
     "gaussians_at",
+    "joints_of",
     "masks_of_labels",
     "moment",
+    "motions_in_world",
     "moved_pixels",
+    "order_of_frames",
     "outcome",
-    "refine",
+    "refine_step",
+    "step",
     "still",
     "stream_loss",
     "stream_step",

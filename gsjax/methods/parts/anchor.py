@@ -1,4 +1,4 @@
-"""Which frame is canonical, and what differs from it: the difference image I_d (papers/001, section 3.2)."""
+"""The canonical frame, and what differs from it: the difference image I_d (MotionSplicer, section 3.2)."""
 
 import warnings
 from collections.abc import Callable
@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float
 Load = Callable[[int, int], np.ndarray]
 """(frame, camera) -> RGB picture, uint8."""
 
-_WIDTH = 96  # of the pictures by which frames are compared, pixels
+_WIDTH = 96  # width of the pictures by which frames are compared, pixels
 _BLUR = 1.0  # pixels; what a camera's noise and a hard edge's aliasing make is no motion
-_NOISE_FACTOR = 4.0  # a difference of so many times the noise is none of noise's
-_MOST_FRAMES = 16  # compared with the anchor at full size
+_NOISE_FACTOR = 4.0  # times the noise; a larger difference is not noise
+_MOST_FRAMES = 16  # that are compared with the anchor at full size
 LEAST_MOVED = 1e-3
 """Share of the pixels that must change for anything to have moved."""
 
@@ -76,7 +76,7 @@ def moved_pixels(
         anchor: from `choose_anchor`.
         cameras: how many there are.
         frames: how many other frames are compared, spread over all; 1 is the one that differs most, as in
-            the paper, in which what comes back to where it was is not seen to move. 16 unless given.
+            the paper, in which what comes back to where it was is not seen to move. Default: 16.
         threshold: of colours from 0 to 1.
 
     Raises:

@@ -1,6 +1,6 @@
 """From a canonical scene and synchronised views to pieces that may move: how a discovery begins."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,52 +15,29 @@ from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import order_of_views, propagated_masks
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
-from gsjax.methods.parts.weights import Field, new_field, saying
-from gsjax.methods.protocols import Segmenter
+from gsjax.methods.parts.weights import Field, fit_field_to_weights, new_field
+from gsjax.methods.protocols import Segmenter, SequenceLike
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
-_SURELY_FIXED = 0.9  # share of the background above which a Gaussian is not asked again ...
+_SURELY_FIXED = 0.9  # share of the background above which a Gaussian stays fixed ...
 _NEAR = 3.0  # ... unless something that moves is this near, in typical distances between Gaussians
 _NEIGHBORS = 8
-_LEAST_SHOWN = 0.3  # of a pixel, by what earlier views have named, for the name to be told
-
-
-@runtime_checkable
-class Views(Protocol):
-    """Synchronised cameras over time; `gsjax.data.Sequence` is one."""
-
-    @property
-    def num_frames(self) -> int:
-        """T."""
-        ...
-
-    @property
-    def num_cameras(self) -> int:
-        """C."""
-        ...
-
-    def image(self, t: int, c: int) -> np.ndarray:
-        """RGB of camera `c` in frame `t`, [H,W,3] uint8."""
-        ...
-
-    def frame(self, t: int) -> Frame:
-        """All cameras of frame `t` as arrays."""
-        ...
+_LEAST_SHOWN = 0.3  # share of a pixel that shows one label of earlier views, for it to take that label
 
 
 class Start(NamedTuple):
     """What is known before anything is followed.
 
     Attributes:
-        anchor: the canonical frame, which `gaussians` shows.
+        anchor: the canonical frame.
         order: rows of the given Gaussians, those that may move first.
         canonical: the scene in that order.
-        field: of skinning weights, warmed up.
+        field: of skinning weights, fitted to what was lifted.
         masks: pieces that changed, in every view of the anchor frame, [C,H,W].
-        losses: of lifting and of the warm-up.
+        losses: of lifting the masks (`lifting`) and of fitting the field (`warming`).
     """
 
     anchor: Anchor
@@ -72,7 +49,7 @@ class Start(NamedTuple):
 
 
 def begin(
-    views: Views,
+    sequence: SequenceLike,
     gaussians: Gaussians,
     anchor: Anchor,
     moved: Bool[np.ndarray, "C H W"],
@@ -84,33 +61,33 @@ def begin(
     """Pieces that may move: what changed against the anchor's pictures, lifted to the scene's Gaussians.
 
     Args:
-        views: what the cameras saw.
+        sequence: what synchronised cameras saw.
         gaussians: the scene at the anchor frame, as `gsjax.methods.fit` fits it.
         anchor: from `choose_anchor`.
         moved: from `moved_pixels`.
-        config: how.
-        segmenter: what belongs together in a picture; not asked where masks are given.
-        key: of the field.
-        masks: of the pieces in every view, where they are known.
+        config: settings.
+        segmenter: finds what belongs together in a picture; not used where masks are given.
+        key: random key of the field's first values.
+        masks: labels of the pieces in every view, where they are known.
 
     Raises:
         ValueError: there is one camera only, next to no Gaussian, or nothing that may move.
     """
-    if views.num_cameras < 2:
+    if sequence.num_cameras < 2:
         raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in space")
     if gaussians.num <= _NEIGHBORS:
         raise ValueError(
             f"gaussians: expected a scene of more than {_NEIGHBORS}, found {gaussians.num}; fit one to the "
             "anchor frame"
         )
-    frame = views.frame(anchor.frame)
+    frame = sequence.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
     if masks is None:
         if not config.discover.difference:
             moved = np.ones_like(moved)
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
-        masks = find_masks(views, gaussians, frame, plan, anchor, moved, config, segmenter)
+        masks = find_masks(sequence, gaussians, frame, plan, anchor, moved, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
             "masks: expected a piece of which a third changed in other frames, found none; choose another "
@@ -134,7 +111,7 @@ def begin(
     weights = np.where(alive, weights, 0)
     weights /= weights.sum(-1, keepdims=True)
     field, located = new_field(key, config, movable.means, slots)
-    field, warming = saying(field, located, jnp.asarray(weights), jnp.asarray(alive))
+    field, warming = fit_field_to_weights(field, located, jnp.asarray(weights), jnp.asarray(alive))
     means = np.asarray(gaussians.means)[order]
     centers = centers_of(means[:count], labels, slots)
     canonical = Canonical(
@@ -152,7 +129,7 @@ def begin(
 
 
 def find_masks(
-    views: Views,
+    sequence: SequenceLike,
     gaussians: Gaussians,
     frame: Frame,
     plan: Plan,
@@ -161,29 +138,29 @@ def find_masks(
     config: PartsConfig,
     segmenter: Segmenter,
 ) -> Int[np.ndarray, "C H W"]:
-    """Masks of what changed, by the same numbers in all views; see `masks`.
+    """Labels of what changed, the same ones in all views; see `gsjax.methods.parts.masks`.
 
     Args:
-        views: the recording.
-        gaussians, plan: the canonical scene, and what it is drawn with.
-        frame: the anchor's.
+        sequence: the recording.
+        gaussians, plan: the canonical scene, and the plan that it is drawn with.
+        frame: the anchor's pictures.
         anchor: which frame that is.
         moved: pixels that changed.
-        config: how.
+        config: settings.
         segmenter: finds masks in one picture.
     """
-    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(views.num_cameras)]
+    drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(sequence.num_cameras)]
     depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
-    pictures = [views.image(anchor.frame, c) for c in range(views.num_cameras)]
+    pictures = [sequence.image(anchor.frame, c) for c in range(sequence.num_cameras)]
     first = int(moved.mean((1, 2)).argmax())
     order = order_of_views(
         np.asarray(frame.cameras.viewmat), first, np.median(np.asarray(gaussians.means), 0)
     )
-    room = 4 * config.discover.most_parts  # pieces that views name before the smallest are dropped
+    room = 4 * config.discover.most_parts  # labels that views use before the smallest are dropped
     total = np.zeros((gaussians.num, room), np.float32)
 
     def known(c: int, last: int, mask: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "H W"]:
-        """What earlier views, of which the last is new, tell of view c."""
+        """Labels of view c by what earlier views have named, of which the last is new."""
         nonlocal total
         total += label_votes(gaussians, one_camera(frame.cameras, last), plan, mask[None], room)
         sums = total.sum(-1, keepdims=True)

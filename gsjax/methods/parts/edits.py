@@ -8,7 +8,7 @@ Each takes the parts that it concerns and leaves all others as they are, to the 
   `share`, 0 to 1: one number, or one for each moment, such as `during` gives.
 
 Times are the trajectory's own, which it keeps: what an edit puts after its last moment is not seen. So
-lengthen it first (`at_times`). After MotionSplicer (papers/001, section 4.2), which names the edits but does
+lengthen it first (`at_times`). After MotionSplicer, section 4.2, which names the edits but does
 not say how they are made.
 """
 
@@ -80,7 +80,7 @@ def speed(
     The stretch then takes (end - begin) / |factor| seconds; what follows comes so much sooner or later.
 
     Args:
-        begin, end: seconds; the whole unless given.
+        begin, end: seconds; default: the whole.
         stay: nothing follows, and parts stay as they then are; so it is too if no `end` is given.
 
     Raises:
@@ -110,8 +110,8 @@ def loop(
     """What parts do from `begin` to `end` is done again and again.
 
     Args:
-        begin, end: seconds; the whole unless given.
-        times: how often it is done before what follows goes on; without end unless given.
+        begin, end: seconds; default: the whole.
+        times: number of repetitions before what follows goes on; default: without end.
         bounce: there and back each time, so that there is no seam.
         stay: nothing follows, and parts stay as they then are; so it is too if no `end` is given.
 
@@ -143,9 +143,9 @@ def freeze(
     """Parts stand still from `begin` to `end`, as they were at `at`, and then go on from there.
 
     Args:
-        at: seconds; `begin` unless given.
-        begin: seconds; `at` unless given, the first moment if neither is.
-        end: seconds; they never go on unless given.
+        at: seconds; default: `begin`.
+        begin: seconds; default: `at`, or the first moment.
+        end: seconds; by default they never go on.
 
     Raises:
         ValueError: `end` is not after `begin`.
@@ -180,7 +180,7 @@ def during(
 
     Args:
         times: seconds.
-        begin, end: seconds; without bound unless given.
+        begin, end: seconds; default: without bound.
         ease: seconds within the bounds in which it comes and goes smoothly; at once if 0.
     """
     since = times - (-jnp.inf if begin is None else begin)
@@ -235,7 +235,7 @@ def redirect(
     Args:
         turn: axis of the world times angle, radians.
         arm: from the handle to the point about which the path is turned, in the canonical scene, metres.
-        at: when the part stays where it is, seconds; the first moment unless given.
+        at: when the part stays where it is, seconds; default: the first moment.
     """
     since, first, share = *_since(trajectory, parts, at), _over_time(trajectory, share)
     around = turned_about(first.apply(jnp.zeros(3) if arm is None else arm), share, turn)
@@ -253,7 +253,7 @@ def amplify(
 
     Args:
         factor: more than 1 makes subtle motion visible, less calms it, 0 stops it, less goes the other way.
-        at: when the parts stay where they are, seconds; the first moment unless given. They must turn by less
+        at: when the parts stay where they are, seconds; default: the first moment. They must turn by less
             than a full turn from there.
     """
     by = 1 + _over_time(trajectory, share) * (factor - 1)
@@ -325,7 +325,7 @@ def _checked(trajectory: Trajectory, parts: Sequence[int]) -> Integer[np.ndarray
 
 
 def _stretch(trajectory: Trajectory, begin: float | None, end: float | None) -> tuple[Scalar, Scalar]:
-    """Both ends of a stretch, the trajectory's own unless given."""
+    """Both ends of a stretch; default: those of the trajectory."""
     if begin is not None and end is not None and not begin < end:
         raise ValueError(f"end: expected a time after begin, {begin:g} s, found {end:g}")
     begin = trajectory.times[0] if begin is None else begin

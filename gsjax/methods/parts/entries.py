@@ -1,6 +1,6 @@
 """Entries of a script: frozen dataclasses whose fields' metadata say how values are checked.
 
-`metadata["check"]` returns a value as it is kept, or raises a ValueError that says what was expected and what
+`metadata["check"]` returns a value as it is kept, or raises a ValueError with what was expected and what
 was found. `metadata["wanted"]` says what that is, `metadata["key"]` is the field's name in scripts where that
 is another one, and `metadata["example"]` a value to begin with where there is no default.
 """
@@ -49,7 +49,7 @@ def read(kind: type[Kind], found: Any) -> Kind:
     """
     keys = {key_of(f): f for f in fields(kind)}
     if not isinstance(found, dict):
-        raise ValueError(f"expected the keys {', '.join(keys)}, found {told(found)}")
+        raise ValueError(f"expected the keys {', '.join(keys)}, found {shown(found)}")
     for key in found:
         if key not in keys:
             raise ValueError(f"{key}: expected the keys {', '.join(keys)}, found {did_you_mean(key, keys)}")
@@ -68,7 +68,7 @@ def _checked(f: Field, value: Any) -> Any:
         raise ValueError(f"{key_of(f)}: {error}") from None
 
 
-def told(found: Any) -> str:
+def shown(found: Any) -> str:
     """What was found, in a message."""
     text = "nothing" if found is None else repr(found)
     return text if len(text) <= _LONG else f"{text[:_LONG]} ..."
@@ -86,7 +86,7 @@ def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = f
     Args:
         wanted: what is expected, for messages.
         low, high: the range.
-        of: what of the number has to be in it; the number itself unless given.
+        of: what of the number has to be in it; default: the number itself.
     """
 
     def check(value: Any) -> float:
@@ -95,7 +95,7 @@ def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = f
         except (TypeError, ValueError, OverflowError):  # that of a whole number of hundreds of digits
             found = math.nan
         if not low <= of(found) <= high:
-            raise ValueError(f"expected {wanted}, found {told(value)}")
+            raise ValueError(f"expected {wanted}, found {shown(value)}")
         return found
 
     return {"check": check, "wanted": wanted}
@@ -107,7 +107,7 @@ def whole(low: int, high: int) -> Checked:
 
     def check(value: Any) -> int:
         if type(value) is not int or not low <= value <= high:
-            raise ValueError(f"expected {wanted}, found {told(value)}")
+            raise ValueError(f"expected {wanted}, found {shown(value)}")
         return value
 
     return {"check": check, "wanted": wanted}
@@ -124,7 +124,7 @@ def vector(wanted: str, least: float = 0.0) -> Checked:
                 return x, y, z
         except (TypeError, ValueError):
             pass
-        raise ValueError(f"expected {wanted}, found {told(value)}")
+        raise ValueError(f"expected {wanted}, found {shown(value)}")
 
     return {"check": check, "wanted": wanted}
 
@@ -134,7 +134,7 @@ def instance(kind: type, wanted: str) -> Checked:
 
     def check(value: Any) -> Any:
         if not isinstance(value, kind) or value == "":
-            raise ValueError(f"expected {wanted}, found {told(value)}")
+            raise ValueError(f"expected {wanted}, found {shown(value)}")
         return value
 
     return {"check": check, "wanted": wanted}
@@ -149,5 +149,5 @@ def part_list(value: Any) -> tuple[str | int, ...]:
     listed = [value] if isinstance(value, (str, int)) else value
     sound = isinstance(listed, (list, tuple)) and len(listed) > 0
     if not sound or any(isinstance(part, bool) or not isinstance(part, (str, int)) for part in listed):
-        raise ValueError(f"expected names or numbers of parts, or {ALL}, found {told(value)}")
+        raise ValueError(f"expected names or numbers of parts, or {ALL}, found {shown(value)}")
     return tuple(listed)

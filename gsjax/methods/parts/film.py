@@ -78,8 +78,8 @@ def placed(
     Args:
         turn: axis times angle, radians.
         shift: metres.
-        factor: so many times as large, more than 0.
-        about: the point that the turn and the factor leave in place, metres; the origin unless given.
+        factor: of the size, more than 0.
+        about: the point that the turn and the factor leave in place, metres; default: the origin.
 
     Raises:
         ValueError: `factor` is not more than 0.

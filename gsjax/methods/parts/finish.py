@@ -1,22 +1,27 @@
-"""The end of a discovery: parts that no picture needs are given up, and the others are what edits work on."""
+"""The end of a discovery: parts that no picture needs are given up, the scene and the poses of all frames are
+what is refined, and the outcome is what edits work on."""
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
-from gsjax.methods.parts.discover import Start, Views, centers_of
-from gsjax.methods.parts.follow import Parts, joined, seen_at
+from gsjax.methods.parts.discover import centers_of
+from gsjax.methods.parts.discovery import Discovery, joined, weights_of_run
+from gsjax.methods.parts.pictures import where_parts_are
+from gsjax.methods.parts.refine import RefineParams, refine_step
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
-from gsjax.methods.parts.weights import SimplexTable
+from gsjax.methods.protocols import SequenceLike
 from gsjax.optim.compiler import host_options
-from gsjax.scene.frame import one_camera, part_of
+from gsjax.optim.method import Run
+from gsjax.rasterize.plan import with_room
+from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.gaussians import take
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.region import TILE
@@ -28,37 +33,62 @@ _LEAST_WEIGHT = 0.02
 _SHRINK = 2
 
 
-def without_needless(views: Views, parts: Parts, config: PartsConfig) -> tuple[Parts, list[tuple[int, int]]]:
-    """Parts that pictures need: from the smallest on, each joins the part that it touches, or the background,
-    with which pictures get worst by least, if that is less than `unify.least_gain`; and who joined whom.
+def finished(sequence: SequenceLike, run: Run, config: PartsConfig) -> Run:
+    """The run before the first step over all frames together, of which all frames were found: without
+    needless parts, with weights that stay.
+
+    Args:
+        sequence: what the cameras saw.
+        run: that followed parts to the last frame.
+        config: settings.
+    """
+    discovery = without_needless(sequence, run.kept, np.asarray(weights_of_run(run)), config)
+    poses = HandlePose(jnp.asarray(discovery.quats), jnp.asarray(discovery.translations))
+    # Steps give away what they replace; what is kept stays whole.
+    scene = discovery.canonical.movable, discovery.canonical.fixed
+    params = RefineParams(*jax.tree.map(jnp.copy, scene), jax.tree.map(jnp.copy, poses))
+    return run.having(params=params, state=refine_step(config).init(params), kept=discovery)
+
+
+def without_needless(
+    sequence: SequenceLike, discovery: Discovery, weights: Float[np.ndarray, "M P"], config: PartsConfig
+) -> Discovery:
+    """The parts that pictures need: from the smallest on, each joins the part that it touches, or the
+    background, with which pictures get worse by least, if that is less than `unify.least_gain`.
 
     What a scene does not require is not modelled. It is decided by what is seen, and not by how motions
     compare: the motion of a thin piece is badly known, and matters little for the same reason.
 
-    The weights that are left are a table from here on, without those below 2 %: a softmax gives every part a
+    The weights that are left are fixed from here on, without those below 2 %: a softmax gives every part a
     little of everything, and to move a part would move all others a little.
+
+    Args:
+        sequence: what the cameras saw.
+        discovery: all frames that were found.
+        weights: of the movable Gaussians.
+        config: settings.
     """
-    judge = _Judge(views, parts, config)
-    weights, into = np.asarray(parts.weights), np.arange(len(parts.canonical.alive))
-    here, before = judge(parts, weights), None
+    judge = _Judge(sequence, discovery, weights, config)
+    found, into = weights, np.arange(len(discovery.canonical.alive))
+    here, before = judge(weights), None
     while before is None or (into != before).any():
         before = into.copy()
         for part in _smallest_first(weights.argmax(-1)):
-            ways = {q: given(weights, part, q) for q in touching(parts, weights.argmax(-1), part)}
-            losses = {q: judge(parts, changed) for q, changed in ways.items()}
+            ways = {q: given(weights, part, q) for q in touching(discovery, weights.argmax(-1), part)}
+            losses = {q: judge(changed) for q, changed in ways.items()}
             best = min(losses, key=losses.__getitem__)
             if losses[best] <= (1 + config.unify.least_gain) * here:
                 weights, here = ways[best], losses[best]
                 into[into == part] = best
-    parts, pairs = joined(parts, into)
-    return settled(parts, weights), pairs
+    discovery, _ = joined(discovery, found, into)
+    kept = settled(weights, np.asarray(discovery.canonical.alive))
+    return discovery._replace(weights=jnp.asarray(kept))
 
 
-def settled(parts: Parts, weights: Float[np.ndarray, "M P"]) -> Parts:
-    """With a table of weights, without those so small that they only tie parts to each other."""
-    kept = np.where((weights < _LEAST_WEIGHT) | ~np.asarray(parts.canonical.alive), 0.0, weights)
-    table = SimplexTable(jnp.asarray(kept / kept.sum(-1, keepdims=True), weights.dtype))
-    return parts._replace(params=parts.params._replace(field=table))
+def settled(weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
+    """The weights without those so small that they only tie parts to each other."""
+    kept = np.where((weights < _LEAST_WEIGHT) | ~alive, 0.0, weights)
+    return (kept / kept.sum(-1, keepdims=True)).astype(weights.dtype)
 
 
 def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
@@ -69,16 +99,16 @@ def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.nda
     return changed
 
 
-def touching(parts: Parts, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
+def touching(discovery: Discovery, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
     """The parts to which a share of a part's neighbours belongs, and the background.
 
     Args:
-        parts: with the neighbours of each Gaussian.
+        discovery: with the neighbours of each Gaussian.
         labels: the part of each movable Gaussian.
         part: whose neighbours are counted.
     """
-    neighbors = np.asarray(parts.canonical.neighbors)[labels == part].ravel()
-    all_ = np.concatenate([labels, np.full(parts.canonical.fixed.num, BACKGROUND)])
+    neighbors = np.asarray(discovery.canonical.neighbors)[labels == part].ravel()
+    all_ = np.concatenate([labels, np.full(discovery.canonical.fixed.num, BACKGROUND)])
     names, counts = np.unique(all_[neighbors], return_counts=True)
     near = names[counts >= _LEAST_CONTACT * len(neighbors)]
     return sorted({BACKGROUND, *near.tolist()} - {part})
@@ -90,73 +120,87 @@ def _smallest_first(labels: Int[np.ndarray, "M"]) -> list[int]:
 
 
 class _Judge:
-    """How well parts explain some pictures, spread over frames and cameras."""
+    """How well weights explain some pictures, spread over frames and cameras."""
 
-    def __init__(self, views: Views, parts: Parts, config: PartsConfig):
+    def __init__(
+        self,
+        sequence: SequenceLike,
+        discovery: Discovery,
+        weights: Float[np.ndarray, "M P"],
+        config: PartsConfig,
+    ):
         self._loss = _compiled(config.stream)
-        done = np.flatnonzero(parts.done)
+        self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
+        done = np.flatnonzero(discovery.done)
         frames = done[np.linspace(0, len(done) - 1, min(_FRAMES, len(done))).round().astype(int)]
-        self._seen = []
+        self._seen: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
-            frame = part_of(views.frame(t), (), _SHRINK)
-            cameras = [(i + k * views.num_cameras // _CAMERAS) % views.num_cameras for k in range(_CAMERAS)]
-            at = parts.canonical, parts.weights, parts.pose(t)
-            seen = seen_at(frame, *at, TILE // _SHRINK, blend=config.stream.blend)
-            self._seen += [(t, one_camera(seen, c)) for c in sorted(set(cameras))]
-        scene = posed(parts.canonical, parts.weights, parts.pose(int(done[0])))
-        self._headroom = 2 * config.headroom
+            frame = part_of(sequence.frame(t), (), _SHRINK)
+            count = sequence.num_cameras
+            cameras = {(i + k * count // _CAMERAS) % count for k in range(_CAMERAS)}
+            place = self._canonical, jnp.asarray(weights), discovery.pose(t)
+            seen = where_parts_are(frame, *place, TILE // _SHRINK, blend=config.stream.blend)
+            self._seen += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]
+        scene = posed(self._canonical, jnp.asarray(weights), discovery.pose(int(done[0])))
         self._plan = plan_render(scene, frame.cameras, headroom=self._headroom)
 
-    def __call__(self, parts: Parts, weights: Float[np.ndarray, "M P"]) -> float:
-        arguments = parts.canonical, jnp.asarray(weights)
-        return float(np.mean([self._of(*arguments, parts.pose(t), seen) for t, seen in self._seen]))
+    def __call__(self, weights: Float[np.ndarray, "M P"]) -> float:
+        """The mean loss over the pictures."""
+        losses = [self._of(jnp.asarray(weights), pose, frame) for pose, frame in self._seen]
+        return float(np.mean(losses))
 
-    def _of(self, *arguments: Any) -> float:
+    def _of(self, weights: Float[Array, "M P"], pose: HandlePose, frame: Frame) -> float:
         """The loss in one picture, by a plan that holds it."""
-        while True:
-            loss, overflow, needed = self._loss(*arguments, self._plan)
-            if not bool(overflow):
-                return float(loss)
-            self._plan = self._plan.grown(int(needed), self._headroom)
+        draw = partial(self._loss, self._canonical, weights, pose, frame)
+        loss, self._plan = with_room(draw, self._plan, self._headroom)
+        return float(loss)
+
+
+class _Room(NamedTuple):
+    """Whether a plan was too small, and what it should have held."""
+
+    overflow: Bool[Array, ""]
+    needed: Int[Array, ""]
 
 
 @lru_cache(maxsize=2)
 def _compiled(config: StreamConfig):
     @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
-    def loss(canonical: Canonical, weights, pose, seen, plan):
+    def loss(canonical: Canonical, weights, pose, frame, plan):
         scene = posed(canonical, weights, pose, config.blend)
-        drawn = render(scene, seen.frame.cameras, plan, roi=seen.counts)
-        return picture_loss(drawn, seen, config), drawn.meta.overflow.any(), drawn.meta.needed.max()
+        drawn = render(scene, frame.cameras, plan, roi=frame.masks)
+        room = _Room(drawn.meta.overflow.any(), drawn.meta.needed.max())
+        return picture_loss(drawn, frame, config), room
 
     return loss
 
 
-def outcome(start: Start, parts: Parts, times: Float[np.ndarray, "T"]) -> tuple[PartScene, Trajectory]:
+def outcome(
+    discovery: Discovery, weights: Float[np.ndarray, "M P"], times: Float[np.ndarray, "T"]
+) -> tuple[PartScene, Trajectory]:
     """The scene with its parts, all Gaussians in the order in which they were given, and where parts were.
 
     Handles that nothing follows are left out, and the others stand in the middle of what follows them.
 
     Args:
-        start: where all began.
-        parts: that were followed.
+        discovery: how far it is.
+        weights: of the movable Gaussians.
         times: of the frames, seconds.
     """
-    weights = np.asarray(parts.weights)
     labels = weights.argmax(-1)
     kept = [BACKGROUND, *(p for p in np.unique(labels).tolist() if p != BACKGROUND)]
-    count = len(start.order)
+    count = len(discovery.order)
     full = np.zeros((count, len(kept)), np.float32)
     full[:, BACKGROUND] = 1
-    full[start.order[: len(weights)]] = weights[:, kept] / weights[:, kept].sum(-1, keepdims=True)
-    before = np.asarray(parts.canonical.centers)[kept]
-    means = np.asarray(parts.canonical.movable.means)
+    full[discovery.order[: len(weights)]] = weights[:, kept] / weights[:, kept].sum(-1, keepdims=True)
+    canonical = discovery.canonical
+    before = np.asarray(canonical.centers)[kept]
+    means = np.asarray(canonical.movable.means)
     after = centers_of(means, labels, weights.shape[1])[kept]
-    quats = jnp.asarray(parts.quats[:, kept])
+    quats = jnp.asarray(discovery.quats[:, kept])
     # x -> R (x - c) + c + T is the same motion about any c: T' = T + (R - I)(c' - c) .
     turned = jnp.einsum("tpij,pj->tpi", quats_to_matrices(quats), jnp.asarray(after - before))
-    translations = jnp.asarray(parts.translations[:, kept]) + turned - (after - before)
-    everything = jax.tree.map(
-        lambda a, b: jnp.concatenate([a, b]), parts.canonical.movable, parts.canonical.fixed
-    )
-    scene = PartScene(take(everything, np.argsort(start.order)), jnp.asarray(full), jnp.asarray(after))
+    translations = jnp.asarray(discovery.translations[:, kept]) + turned - (after - before)
+    everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), canonical.movable, canonical.fixed)
+    scene = PartScene(take(everything, np.argsort(discovery.order)), jnp.asarray(full), jnp.asarray(after))
     return scene, trajectory_of(jnp.asarray(times, quats.dtype), HandlePose(quats, translations))

@@ -1,4 +1,5 @@
-"""From masks to Gaussians: a logit for each part on each Gaussian, learned by rendering (papers/001, 3.2)."""
+"""From masks to Gaussians: a logit for each part on each Gaussian, learned by rendering (MotionSplicer,
+section 3.2)."""
 
 from functools import partial
 

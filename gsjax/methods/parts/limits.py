@@ -79,7 +79,7 @@ def describe_beyond(
 
     Args:
         times: of the edited trajectory, seconds.
-        names: of parts, with their numbers; a part without a name is told by its number.
+        names: of parts, with their numbers; a part without a name goes by its number.
         least_m, least_rad: what is nearer than both is within the limits.
     """
     metres, radians = np.asarray(beyond.metres), np.asarray(beyond.radians)

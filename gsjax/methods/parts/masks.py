@@ -1,9 +1,9 @@
 """Masks of what moves in every view of the anchor frame, by the same numbers in all of them.
 
-In each view a segmenter says what belongs together, and of its segments those that changed count (I_d). Views
-are taken in an order in which neighbours look from near; what earlier ones found is drawn into the next, and
-a segment that shows mostly one part takes its number. So numbers pass from view to view over the scene's own
-geometry, where SAM2 passes them over its memory of pictures (papers/001, section 3.2).
+In each view a segmenter finds what belongs together, and of its segments those that changed count (I_d).
+Views are taken in an order in which neighbours look from near; what earlier ones found is drawn into the
+next, and a segment that shows mostly one part takes its number. So numbers pass from view to view over the
+scene's own geometry, where SAM2 passes them over its memory of pictures (MotionSplicer, section 3.2).
 """
 
 from collections.abc import Callable, Sequence
@@ -80,11 +80,11 @@ def propagated_masks(
     count, last = 0, None
     for c in order:
         segments = moving_segments(segmenter(pictures[c], depths[c], Ks[c]), moved[c])
-        told = np.full(segments.shape, -1) if last is None else known(c, last, masks[last])
+        labels = np.full(segments.shape, -1) if last is None else known(c, last, masks[last])
         mask = np.zeros(segments.shape, np.int32)
         for segment in np.unique(segments[segments > 0]):
             inside = segments == segment
-            seen = told[inside]
+            seen = labels[inside]
             names, pixels = np.unique(seen[seen > 0], return_counts=True)
             if len(names) and pixels.max() >= _LEAST_KNOWN * len(seen):
                 mask[inside] = names[pixels.argmax()]

@@ -63,15 +63,15 @@ class Edit(Entry):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeEdit(Edit):
-    """What comes after `to` follows on, sooner or later; `to` is where a part's motion ends unless given."""
+    """What comes after `to` follows on, sooner or later; by default `to` is where a part's motion ends."""
 
     def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
         """Those that still move at `from`: what is over stands still, whatever is done to all."""
         begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
         moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
         if not moving:
-            told = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
-            expected = f"a time before {last:g}, where the motion of {told} ends"
+            parts = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
+            expected = f"a time before {last:g}, where the motion of {parts} ends"
             raise ValueError(f"from: expected {expected}, found {begin:g}")
         return moving
 

@@ -20,7 +20,7 @@ from gsjax.methods.parts.entries import (
     instance,
     number,
     read,
-    told,
+    shown,
     vector,
     whole,
 )
@@ -52,7 +52,7 @@ class Speed(TimeEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Loop(TimeEdit):
-    """Parts do the same again and again; without end unless told how many times."""
+    """Parts do the same again and again, `times` times or without end."""
 
     times: int | None = field(default=None, metadata=whole(1, 1000))
     bounce: bool = field(default=False, metadata=instance(bool, "true or false"))
@@ -104,7 +104,7 @@ class Isolate(Freeze):
 
 @dataclass(frozen=True, kw_only=True)
 class Fade(LookEdit):
-    """Parts become translucent; they vanish unless told how far."""
+    """Parts become translucent; by default they vanish."""
 
     opacity: float = field(default=0.0, metadata=_OPACITY)
 
@@ -132,7 +132,7 @@ class Scale(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Move(LookEdit):
-    """Parts are elsewhere, `by` so many metres along the axes of the world."""
+    """Parts are elsewhere, `by` metres along the axes of the world."""
 
     by: Vector = field(metadata=vector("metres") | {"example": (0, 0, 0.1)})
 
@@ -169,7 +169,7 @@ class Redirect(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Amplify(LookEdit):
-    """Parts go so many times as far from where they were `at` a time, the film's start unless given."""
+    """Parts go `factor` times as far from where they were `at` a time, by default the film's start."""
 
     factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
     at: float | None = field(default=None, metadata=SECONDS)
@@ -203,7 +203,7 @@ class Place(Entry):
     """Where parts of another scene are put.
 
     Attributes:
-        to: where the middle of their handles comes to be at the start; where it is there unless given.
+        to: where the middle of their handles comes to be at the start; default: where it is there.
         axis, degrees, scale: how they are turned and how much larger they are, about that middle.
     """
 
@@ -265,7 +265,7 @@ def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
         ValueError: an entry is not as expected; the message begins with its number and operation.
     """
     if not isinstance(found, (list, tuple)):
-        raise ValueError(f"expected a list of edits, found {told(found)}")
+        raise ValueError(f"expected a list of edits, found {shown(found)}")
     return tuple(_read_edit(entry, number) for number, entry in enumerate(found, first))
 
 
@@ -278,7 +278,7 @@ def _read_edit(found: Any, number: int) -> Edit:
     if isinstance(found, Edit):
         return found
     if not isinstance(found, dict) or "op" not in found:
-        raise ValueError(f"edit {number}: expected a mapping with the key op, found {told(found)}")
+        raise ValueError(f"edit {number}: expected a mapping with the key op, found {shown(found)}")
     name, rest = found["op"], {k: value for k, value in found.items() if k != "op"}
     if not isinstance(name, str) or name not in OPERATIONS:
         known = f"one of {', '.join(OPERATIONS)}"

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from gsjax.methods.parts.config import StreamConfig
 from gsjax.methods.parts.screws import pose_of
-from gsjax.methods.parts.stream import FINAL_TEAR, StreamBatch, gaps_between, posed
+from gsjax.methods.parts.stream import FINAL_TEAR, StreamBatch, counted, gaps_between, posed
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.optim.residuals import block_residual
 from gsjax.scene.handles import HandlePose
@@ -35,9 +35,8 @@ def pose_residual(
     Args:
         motions: of all P handles, `screws.motions_of` their pose; the background's stays.
         batch: with a plan whose derivative is "forward", for the Jacobian is made by columns, 6 P of them.
-            Its weights are taken as they are, and the past tells nothing of a pose.
-        step: share of the iterations that is done, which `tear_weight` falls over.
-        key: not used; it is part of the residual's form.
+            Its weights are taken as they are, and its past is not used.
+        step, key: not used; they are part of the residual's form.
         block, softness: of `block_residual`.
     """
     free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]
@@ -45,16 +44,16 @@ def pose_residual(
     pose = jax.tree.map(lambda a: jnp.where(free, a, jax.lax.stop_gradient(a)), pose)
     drawn = render(
         posed(batch.canonical, batch.weights, pose, config.blend),
-        batch.now.frame.cameras,
+        batch.now.cameras,
         batch.plan,
-        roi=batch.now.counts,
+        roi=batch.now.masks,
     )
-    frame, counts = batch.now.frame, batch.now.counts.astype(drawn.colors.dtype)[..., None]
+    frame, counts = batch.now, counted(batch.now).astype(drawn.colors.dtype)[..., None]
     pixels = counts.sum()
     residual = partial(block_residual, block=block, softness=softness)
     residuals = {
-        "color": residual(drawn.colors - frame.images, config.l1_weight / 3 * counts, _LIMIT),
-        "tear": _torn(batch, pose, config) * jnp.sqrt(pixels * FINAL_TEAR**step),
+        "color": residual(drawn.colors - frame.colors, config.l1_weight / 3 * counts, _LIMIT),
+        "tear": _torn(batch, pose, config) * jnp.sqrt(pixels * FINAL_TEAR**batch.progress),
     }
     if frame.depths is not None and config.depth_weight:
         known = counts[..., 0] * (frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)

@@ -9,7 +9,7 @@ from gsjax.scene.handles import HandlePose
 
 
 def motions_of(poses: HandlePose) -> jaxlie.SE3:
-    """What handles do to points, told from their own places in the canonical scene: x -> R x + T."""
+    """The rigid motions of points relative to the handles' places in the canonical scene: x -> R x + T."""
     rotation = jaxlie.SO3(normalize_quats(poses.quats))
     return jaxlie.SE3.from_rotation_and_translation(rotation, poses.translations)
 
@@ -29,7 +29,7 @@ def turned_about(
 
 def unwound(since: jaxlie.SE3) -> Float[Array, "T P 6"]:
     """Twists of motions that follow one another, one of which is next to none. More than half a turn from
-    there, up to a full one, is told as such, and not as less the other way round."""
+    there, up to a full one, stays as such, and is not less the other way round."""
     quats = since.rotation().wxyz
     flips = jnp.where(jnp.sum(quats[1:] * quats[:-1], axis=-1) < 0, -1.0, 1.0)
     real = quats[..., 0] * jnp.concatenate([jnp.ones_like(flips[:1]), jnp.cumprod(flips, axis=0)])

@@ -15,8 +15,8 @@ def first_line(operation: str, parts: str) -> str:
     """A line that `parse_op` takes, such as `echo:parts=drawer,copies=3,every=0.2,fade=0.5`: with the keys
     that are the operation's own, as far as they have a plain value."""
     values = {key_of(f): _value(f) for f in fields(OPERATIONS[operation]) if f.name not in _COMMON}
-    told = {key: value for key, value in values.items() if _plain(value)}
-    return ",".join([f"{operation}:parts={parts}", *(f"{key}={_written(told[key])}" for key in told)])
+    plain = {key: value for key, value in values.items() if _plain(value)}
+    return ",".join([f"{operation}:parts={parts}", *(f"{key}={_written(plain[key])}" for key in plain)])
 
 
 def explained(operation: str) -> list[str]:

@@ -1,8 +1,9 @@
-"""One step of the streaming optimisation (papers/001, sections 3.3 and 3.4): the handles' pose at this frame
-and the skinning weights, which all frames share, go down the gradient of what one camera sees now, and
+"""One step of the streaming optimisation (MotionSplicer, sections 3.3 and 3.4): the handles' pose at this
+frame and the skinning weights, which all frames share, go down the gradient of what one camera sees now, and
 another saw in a frame of the past, whose pose is frozen.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,10 +36,10 @@ class Canonical(NamedTuple):
     Attributes:
         movable: M Gaussians that handles may move.
         fixed: all others.
-        located: where the movable ones lie in the grid.
+        located: where the movable ones lie in the grid; None where weights are a table.
         centers: the handles' places, metres.
         radii: how far from its handle each part reaches, metres.
-        pixel: what a pixel is wide where things move, metres.
+        pixel: width of a pixel where things move, metres.
         alive: which of the P slots hold a handle; the background's is one.
         neighbors: of each movable Gaussian, rows of all Gaussians, the movable ones first.
     """
@@ -54,17 +55,18 @@ class Canonical(NamedTuple):
 
 
 class StreamParams(NamedTuple):
-    """What a frame changes: where handles are, and what weights are made of."""
+    """What a frame changes.
+
+    Attributes:
+        pose: where handles are.
+        field: what weights are made of.
+        nudges: added to the movable means, metres; always 0, their gradient says where pictures would have
+            each Gaussian go.
+    """
 
     pose: HandlePose
     field: Field
-
-
-class Seen(NamedTuple):
-    """What cameras saw at one moment, and which pixels count."""
-
-    frame: Frame
-    counts: Bool[Array, "C H W"]
+    nudges: Float[Array, "M 3"]
 
 
 class PosedScene(NamedTuple):
@@ -86,7 +88,8 @@ class StreamBatch(NamedTuple):
 
     Attributes:
         canonical: the scene.
-        now: this frame.
+        now: this frame; its masks say which pixels count.
+        progress: share of the frame's steps that were made, 0 to 1, over which rates and `tear_weight` fall.
         plan: for its pictures.
         weights: before this frame, which are held unless pictures tell otherwise.
         past: frames of the past and their poses.
@@ -94,10 +97,11 @@ class StreamBatch(NamedTuple):
     """
 
     canonical: Canonical
-    now: Seen
+    now: Frame
+    progress: Float[Array, ""] | float
     plan: Plan
     weights: Float[Array, "M P"]
-    past: tuple[tuple[Seen, HandlePose], ...] = ()
+    past: tuple[tuple[Frame, HandlePose], ...] = ()
     past_plan: Plan | None = None
 
 
@@ -113,14 +117,14 @@ def posed(
     blend: Blend = "quaternion",
     nudges: Float[Array, "M 3"] | None = None,
 ) -> Gaussians:
-    """The whole scene with its handles at a pose, the movable Gaussians first, and these perhaps nudged.
+    """The whole scene with its handles at a pose, the movable Gaussians first.
 
     Args:
         canonical: the scene at rest.
         weights: of its movable Gaussians; rows sum to 1.
         pose: where handles are.
         blend: of rotations.
-        nudges: added to the movable means, metres; none unless given.
+        nudges: added to the movable means, metres.
     """
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend)
     if nudges is not None:
@@ -128,24 +132,30 @@ def posed(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moved, canonical.fixed)
 
 
-def picture_loss(drawn: Rendered, seen: Seen, config: StreamConfig) -> Float[Array, ""]:
+def counted(frame: Frame) -> Bool[Array, "C H W"]:
+    """Which pixels of a frame count."""
+    return jnp.ones(frame.images.shape[:-1], bool) if frame.masks is None else jnp.asarray(frame.masks)
+
+
+def picture_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[Array, ""]:
     """lambda L1 + (1 - lambda)(1 - SSIM) on the pixels that count; and where cameras measured depth, its
     difference, which beyond a limit is that of another thing.
 
     Args:
         drawn: the scene.
-        seen: the frame, and which of its pixels count.
+        frame: what was seen; its masks say which pixels count.
         config: with lambda, the depth's weight and its limit.
     """
-    counts = seen.counts.astype(drawn.colors.dtype)
-    image = jnp.where(seen.counts[..., None], drawn.colors, seen.frame.images)
-    share = jnp.maximum(counts.mean(), 1e-3)  # a step as long where little moves
-    loss = config.l1_weight * l1_loss(image, seen.frame.images)
-    loss += (1 - config.l1_weight) * (1 - ssim(image, seen.frame.images))
+    target, masks = frame.colors, counted(frame)
+    counts = masks.astype(drawn.colors.dtype)
+    image = jnp.where(masks[..., None], drawn.colors, target)
+    share = jnp.maximum(counts.mean(), 1e-3)  # a step is as long where little moves
+    loss = config.l1_weight * l1_loss(image, target)
+    loss += (1 - config.l1_weight) * (1 - ssim(image, target))
     loss = loss / share
-    if seen.frame.depths is not None and config.depth_weight:
-        known = counts * (seen.frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
-        off = jnp.minimum(jnp.abs(drawn.depths - seen.frame.depths), config.depth_limit)
+    if frame.depths is not None and config.depth_weight:
+        known = counts * (frame.depths > 0) * jax.lax.stop_gradient(drawn.alphas > 0.5)
+        off = jnp.minimum(jnp.abs(drawn.depths - frame.depths), config.depth_limit)
         loss += config.depth_weight * weighted_mean(off, known) / config.depth_limit
     return loss
 
@@ -187,40 +197,48 @@ def gaps_between(
     return jnp.einsum("nkij,nj->nki", apart[..., :3], at) + apart[..., 3]
 
 
-def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()):
-    """`loss(params, batch, *, step, key, nudges=None)`: of this frame by pose and field, and of past ones, in
-    the mean, by the field alone. `nudges` [M,3] are added to where Gaussians are now, for who asks where each
-    would go. Extra losses are given this frame's `PosedScene`, its picture and the frame.
+def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callable:
+    """`loss(params, batch, *, step, key)`: of this frame by pose and field, and of past ones, in the mean, by
+    the field alone. Neither `step` nor `key` is used.
+
+    Args:
+        config: of the stream.
+        extra_losses: given this frame's `PosedScene`, its picture and the frame.
     """
 
-    def loss(params: StreamParams, batch: StreamBatch, *, step: Any, key: Any, nudges: Array | None = None):
+    def loss(params: StreamParams, batch: StreamBatch, *, step: Any, key: Any):
         weights = skinning_weights(params.field, batch.canonical)
-        gaussians = posed(batch.canonical, weights, params.pose, config.blend, nudges)
-        drawn = render(gaussians, batch.now.frame.cameras, batch.plan, roi=batch.now.counts)
+        gaussians = posed(batch.canonical, weights, params.pose, config.blend, params.nudges)
+        drawn = render(gaussians, batch.now.cameras, batch.plan, roi=batch.now.masks)
         value = picture_loss(drawn, batch.now, config)
         fixed = jax.lax.stop_gradient(weights)  # what stands still in all frames so far tears at no part
         scale = config.tear_scale * batch.canonical.pixel
-        told = {"now": value, "torn": tearing(batch.canonical, fixed, params.pose, scale)}
+        info: dict[str, Any] = {
+            "now": value,
+            "torn": tearing(batch.canonical, fixed, params.pose, scale),
+            "overflow": drawn.meta.overflow.any(),
+            "needed": drawn.meta.needed.max(),
+        }
         changed = -jnp.sum(batch.weights * jnp.log(jnp.maximum(weights, 1e-6)), axis=-1).mean()
-        tear = config.tear_weight * FINAL_TEAR**step
-        value += tear * told["torn"] + config.hold_weight * changed
-        told |= {"overflow": drawn.meta.overflow.any(), "needed": drawn.meta.needed.max()}
+        tear = config.tear_weight * FINAL_TEAR**batch.progress
+        value += tear * info["torn"] + config.hold_weight * changed
         if batch.past:
             past, overflow, needed = [], [], []
-            for seen, pose in batch.past:
+            for frame, pose in batch.past:
                 then = posed(batch.canonical, weights, jax.lax.stop_gradient(pose), config.blend)
-                before = render(then, seen.frame.cameras, batch.past_plan, roi=seen.counts)
-                past.append(picture_loss(before, seen, config))
+                before = render(then, frame.cameras, batch.past_plan, roi=frame.masks)
+                past.append(picture_loss(before, frame, config))
                 overflow.append(before.meta.overflow.any())
                 needed.append(before.meta.needed.max())
-            told["past"] = jnp.stack(past).mean()
-            told |= {"past_overflow": jnp.stack(overflow).any(), "past_needed": jnp.stack(needed).max()}
-            value += told["past"]
+            info["past"] = jnp.stack(past).mean()
+            info["overflow"] |= jnp.stack(overflow).any()
+            info["needed"] = info["needed"], jnp.stack(needed).max()
+            value += info["past"]
         if extra_losses:
             scene = PosedScene(gaussians, weights, params.pose)
-            told["extra"] = extra_terms(extra_losses, scene, drawn, batch.now.frame)
-            value += sum(told["extra"].values())
-        return value, told
+            info["extra"] = extra_terms(extra_losses, scene, drawn, batch.now)
+            value += sum(info["extra"].values())
+        return value, info
 
     return loss
 
@@ -229,8 +247,8 @@ class StreamState(NamedTuple):
     """What a step carries along.
 
     Attributes:
-        pose: of Adam; begun anew each frame.
-        field: of Adam.
+        pose: Adam's moments of the pose, begun anew each frame.
+        field: the optimizer's state of the field.
         pulls: where pictures would have each movable Gaussian go: the sum of the downward gradients by its
             place over the later half of each frame's steps, where those of a rigid part are balanced.
     """
@@ -240,9 +258,8 @@ class StreamState(NamedTuple):
     pulls: Float[Array, "M 3"]
 
     def in_new_frame(self) -> "StreamState":
-        """The state before a frame's first step; its arrays are new."""
-        pose = jax.tree.map(jnp.zeros_like, self.pose)
-        return StreamState(pose, *jax.tree.map(jnp.copy, (self.field, self.pulls)))
+        """The state before a frame's first step."""
+        return self._replace(pose=jax.tree.map(jnp.zeros_like, self.pose))
 
 
 def moved_on(
@@ -264,14 +281,16 @@ def moved_on(
 
 
 def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
-    """Adam on `StreamParams`; `step` is the share of the frame's iterations that is done, 0 to 1.
+    """Adam on `StreamParams`, given a `StreamBatch`; neither `step` nor `key` is used.
 
-    The background's handle does not move. A step whose loss or gradient is not finite, or whose plan
-    overflowed, changes nothing, and `info["skipped"]` says so. `info` is what the loss tells, with `loss`.
+    The background's handle does not move. A step whose loss or gradient is not finite, or that overflowed a
+    plan, changes nothing, and `info["skipped"]` reports it. `info` has the loss of this frame's picture
+    (`now`), of those of the past (`past`) and how much is torn (`torn`), beside what every step reports;
+    where there is a past, `needed` is what both plans needed.
 
     Args:
         config: of the stream.
-        extra_losses: of one's own (`gsjax.losses.extra`), beside that of pictures.
+        extra_losses: custom losses (`gsjax.losses.extra`) beside that of pictures.
     """
     named_losses(extra_losses)
     loss = stream_loss(config, extra_losses)
@@ -282,28 +301,24 @@ def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
             return simplex_descent(config.field_rate)
         return optax.with_extra_args_support(optax.adam(config.field_rate, eps=1e-12))
 
-    def init(params: StreamParams, count: int) -> StreamState:
+    def init(params: StreamParams) -> StreamState:
         field = fields(params.field).init(params.field)
-        return StreamState(poses.init(params.pose), field, jnp.zeros((count, 3)))
+        return StreamState(poses.init(params.pose), field, jnp.zeros_like(params.nudges))
 
     def update(params: StreamParams, state: StreamState, batch: StreamBatch, *, step, key):
-        def of(params, nudges):
-            return loss(params, batch, step=step, key=key, nudges=nudges)
-
-        at_rest = jnp.zeros_like(state.pulls)
-        (value, told), (slope, push) = jax.value_and_grad(of, (0, 1), has_aux=True)(params, at_rest)
+        at = params._replace(nudges=jnp.zeros_like(params.nudges))  # a constant costs the program nothing
+        (value, info), slope = jax.value_and_grad(loss, has_aux=True)(at, batch, step=step, key=key)
         moves, pose_state = poses.update(slope.pose, state.pose)
-        unit = batch.canonical.pixel * config.final_rate**step
+        unit = batch.canonical.pixel * config.final_rate**batch.progress
         pose = moved_on(params.pose, moves, batch.canonical, config.rate * unit, config.turn_rate * unit)
         changes, field_state = fields(params.field).update(
             slope.field, state.field, params.field, allowed=batch.canonical.alive
         )
         field = eqx.apply_updates(params.field, changes)
-        overflow = told["overflow"] | told.get("past_overflow", False)
-        sound = all_finite((value, slope, pose, eqx.filter(field, eqx.is_array))) & ~overflow
-        pulls = state.pulls - jnp.where(step >= 0.5, push, 0.0)
-        new = StreamParams(pose, field), StreamState(pose_state, field_state, pulls)
+        sound = all_finite((value, slope, pose, eqx.filter(field, eqx.is_array))) & ~info["overflow"]
+        pulls = state.pulls - jnp.where(batch.progress >= 0.5, slope.nudges, 0.0)
+        new = StreamParams(pose, field, params.nudges), StreamState(pose_state, field_state, pulls)
         params, state = keep_if(sound, new, (params, state))
-        return params, state, {**told, "loss": value, "skipped": ~sound}
+        return params, state, {**info, "loss": value, "skipped": ~sound}
 
     return Step(init, update)

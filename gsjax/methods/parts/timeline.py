@@ -1,7 +1,7 @@
 """Edit scripts: a list of operations on named parts, as YAML, and the film that they make of a scene.
 
-    fps: 15           # frames a second; the recording's own unless given
-    length: 8         # seconds; as long as the recording and what the edits need unless given
+    fps: 15           # frames a second; default: the recording's own
+    length: 8         # seconds; default: as long as the recording and what the edits need
     edits:            # one after the other
       - {op: speed, parts: [drawer], factor: 2}
       - {op: echo, parts: [3], copies: 3, every: 0.2, fade: 0.5}
@@ -99,8 +99,8 @@ def apply(script: Script, layer: Layer, names: Names, load_scene: LoadScene | No
         load_scene: reads other runs; needed where parts of one are brought in.
 
     Raises:
-        ValueError: a part is not known, an edit finds nothing where it looks, or the film would be too long;
-            the message names the edit by its number and operation.
+        ValueError: a part is not known, there is nothing for an edit to change, or the film would be too
+            long; the message names the edit by its number and operation.
     """
     recorded = np.asarray(layer.trajectory.times, np.float64)
     recorded = recorded - recorded[0]
@@ -116,7 +116,7 @@ class _Step:
     """One edit of a plan.
 
     Attributes:
-        edit: what is asked for.
+        edit: the edit.
         parts: that it changes, or brings in.
         lasts: when the motion of each part of the scene ends before it, seconds.
         brought: what it brings in, if that is what it does.
@@ -153,7 +153,7 @@ def _planned(edits: Sequence[Edit], layer: Layer, names: Names, load_scene: Load
     num, times = layer.scene.num_parts, layer.trajectory.times
     lasts, steps, added = [float(times[-1] - times[0])] * num, [], 0.0
     for place, edit in enumerate(edits):
-        with _said_of(place, edit):
+        with _naming(place, edit):
             if isinstance(edit, Composite):
                 parts, brought = _brought(edit, load_scene)
                 steps.append(_Step(edit, parts, lasts, brought))
@@ -187,7 +187,7 @@ def _edited(plan: _Plan, times: Float[np.ndarray, "T"], step: float) -> Film:
     )
     film: Film = (Layer(layer.scene, at_times(recorded, jnp.asarray(longer, dtype))),)
     for place, at in enumerate(plan.steps):
-        with _said_of(place, at.edit):
+        with _naming(place, at.edit):
             if isinstance(at.edit, Composite) and at.brought is not None:
                 film = at.edit.joined(film, _edited(at.brought, longer, step), at.parts)
             else:
@@ -207,8 +207,8 @@ def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
         if part == ALL:
             numbers += range(num)
         elif isinstance(part, str) and part not in known:
-            told = ", ".join(f"{name} ({p})" for name, p in known.items())
-            raise ValueError(f"parts: expected one of {told}, found {did_you_mean(part, known)}")
+            names = ", ".join(f"{name} ({p})" for name, p in known.items())
+            raise ValueError(f"parts: expected one of {names}, found {did_you_mean(part, known)}")
         else:
             numbers.append(known[part] if isinstance(part, str) else part)
     wrong = [p for p in numbers if not 0 <= p < num]
@@ -254,15 +254,15 @@ def _yaml(text: str) -> Any:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        said = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
-        raise ValueError(f"expected YAML, found {said}") from None
+        fault = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
+        raise ValueError(f"expected YAML, found {fault}") from None
     except (ValueError, OverflowError) as error:  # of a date that is none, a number too long to read
         raise ValueError(f"expected YAML, found a value that cannot be read: {error}") from None
 
 
 @contextmanager
 def _not_too_deep() -> Iterator[None]:
-    """What is nested deeper than Python can follow is said to be."""
+    """A ValueError where something is nested deeper than Python can follow."""
     try:
         yield
     except RecursionError:
@@ -270,8 +270,8 @@ def _not_too_deep() -> Iterator[None]:
 
 
 @contextmanager
-def _said_of(place: int, edit: Edit) -> Iterator[None]:
-    """What is wrong is said of the edit in this place."""
+def _naming(place: int, edit: Edit) -> Iterator[None]:
+    """Errors name the edit in this place."""
     try:
         yield
     except ValueError as error:

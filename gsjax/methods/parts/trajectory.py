@@ -1,4 +1,4 @@
-"""What part discovery comes to and edits work on: Gaussians with weights, and handles over time."""
+"""What a discovery comes to and edits work on: Gaussians with weights, and handles over time."""
 
 from typing import NamedTuple
 
@@ -46,7 +46,7 @@ class Trajectory(eqx.Module):
         times: seconds, increasing.
         poses: of the handles against the canonical scene.
         opacities: factors on the opacities of each part's Gaussians, 0 to 1; 0 hides it.
-        scales: each part is so many times as large, about its handle.
+        scales: factors on the size of each part, about its handle.
     """
 
     times: Float[Array, "T"]

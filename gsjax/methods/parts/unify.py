@@ -1,4 +1,5 @@
-"""Unify and split: parts that move alike become one, and one that moves as two is divided (papers/001, 3.2).
+"""Unify and split: parts that move alike become one, and one that moves as two is divided (MotionSplicer,
+section 3.2).
 
 Two parts are compared by where they would take the points of both, over all frames in which both were there:
 a translation alone depends on the pivot. They are compared only if both have moved in these beyond what
@@ -96,7 +97,7 @@ def unified(
         labels: the part of each point.
         alive: which parts there are; the background's never joins here.
         since: from which of the frames on a part's motion is its own: before, it was part of another.
-        noise_m: what tracking errs by: what moved less is not compared, a smaller gap is none.
+        noise_m: error of tracking, metres: what moved less is not compared, a smaller gap is none.
         tolerance: gap that is none, as a share of the lesser of the two motions.
     """
     into = np.arange(len(alive))

@@ -1,5 +1,5 @@
-"""What skinning weights are made of: a feature grid over the scene, warmed up on what was lifted (papers/001,
-3.3), or a table."""
+"""What skinning weights are made of: a feature grid over the scene, fitted at first to what was lifted
+(MotionSplicer, section 3.3), or a table."""
 
 from functools import partial
 
@@ -15,7 +15,7 @@ from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, lo
 
 _RATE = 1e-2
 _MARGIN = 0.05  # of the box, beyond the outermost Gaussians, in its own size
-_LEAST = 1e-4  # weight of which a logit is made
+_LEAST = 1e-4  # weight; smaller ones count as this large where they become logits
 
 
 class SimplexTable(eqx.Module):
@@ -31,10 +31,10 @@ Field = FeatureGrid | SimplexTable | Float[Array, "M P"]
 def new_field(
     key: PRNGKeyArray, config: PartsConfig, means: Float[Array, "M 3"], parts: int
 ) -> tuple[Field, Located | None]:
-    """What `config.weights` says, and where the Gaussians lie in it; a grid is over the box of these.
+    """The field that `config.weights` names, and where the Gaussians lie in it; a grid is over their box.
 
     Args:
-        key: of a grid's first values.
+        key: random key of a grid's first values.
         config: with the kind of weights.
         means: of the movable Gaussians, metres.
         parts: how many columns weights have.
@@ -49,27 +49,27 @@ def new_field(
 
 
 def weights_of(field: Field, located: Located | None, alive: Bool[Array, "P"]) -> Float[Array, "M P"]:
-    """What it says: weights that sum to 1, and 0 for slots that are not alive."""
+    """Weights that sum to 1, and 0 for slots that are not alive."""
     if isinstance(field, SimplexTable):
         return field.weights
     logits = field.at(located) if isinstance(field, FeatureGrid) else field
     return jax.nn.softmax(jnp.where(alive, logits, -jnp.inf))
 
 
-def saying(
+def fit_field_to_weights(
     field: Field,
     located: Located | None,
     weights: Float[Array, "M P"],
     alive: Bool[Array, "P"],
     iterations: int = 100,
 ) -> tuple[Field, Float[np.ndarray, "iterations"]]:
-    """The field that says these weights: a table at once, a grid as far as it can after so many steps, of
-    which the losses come back too.
+    """The field that has these weights, and the losses of its fit: a table has them at once, a grid as far as
+    it comes in the given number of steps.
 
     Args:
-        field: of the kind that is wanted.
+        field: of the kind that is wanted; a grid begins with its values.
         located: where Gaussians lie in a grid.
-        weights: what it is to say; rows sum to 1.
+        weights: targets; rows sum to 1.
         alive: parts that there are.
         iterations: steps of a grid.
     """
@@ -90,12 +90,12 @@ def warmed_up(
     alive: Bool[Array, "P"],
     iterations: int = 100,
 ) -> tuple[FeatureGrid, Float[Array, "iterations"]]:
-    """The grid that says these weights, as far as it can, by cross-entropy; and the loss over the iterations.
+    """The grid fitted to these weights by cross-entropy, and the loss over the iterations.
 
     Args:
         grid: to begin with.
         located: where the Gaussians lie in it.
-        weights: to learn.
+        weights: targets.
         alive: which slots hold a handle; the others get no weight.
         iterations: steps of Adam.
     """

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.engine.deform.file import NAME, StoredDeformation, write_deformation
-from gsjax.engine.deform.teacher import Meaning
+from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.distill.source import Source
 from gsjax.geometry.cameras import intrinsics
-from gsjax.methods.deform import QUESTIONS, DeformingScene
+from gsjax.methods.deform import QUESTIONS, DeformingScene, DeformResult, Meaning, Timeline
 from gsjax.scene.initialize import gaussians_from_points
 
 WIDTH, HEIGHT, FRAMES = 48, 40, 3
@@ -37,10 +36,7 @@ def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
         gaussians = eqx.tree_at(lambda g: g.features, gaussians, values, is_leaf=lambda leaf: leaf is None)
     viewmats = np.tile(np.eye(4), (FRAMES, 1, 1))
     viewmats[1:, 2, 3] = -nearer
-    stored = StoredDeformation(
-        DeformingScene(gaussians),
-        None,
-        meaning,
+    timeline = Timeline(
         times=np.linspace(0, 1, FRAMES),
         frame_ids=np.arange(FRAMES) + 5,
         seconds=1.0,
@@ -52,7 +48,7 @@ def written(run, names=("tissue", "tool"), metric=True, nearer=0.0):
         metric=metric,
     )
     run.mkdir()
-    write_deformation(run / NAME, stored)
+    write_deformation(run / NAME, DeformResult(DeformingScene(gaussians), None, meaning, timeline))
     return run
 
 

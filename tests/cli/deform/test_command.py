@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsjax.cli import main
-from gsjax.engine import learning
+from gsjax.engine import progress
 from gsjax.engine.deform.file import read_deformation
 from gsjax.engine.deform.scores import OVER_TIME
 from gsjax.io.ply import read_ply
@@ -82,7 +82,7 @@ def test_resumed_it_is_the_same_scene(gsjax, deformed, monkeypatch, tmp_path):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
         code, said = gsjax(*told)
     assert code == 130, said
     assert metrics(tmp_path / "run")["complete"] is False

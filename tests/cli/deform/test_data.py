@@ -37,19 +37,19 @@ def read(sequence, tools="leave-out", tool_values=(), features="auto"):
 def test_tools_are_left_out_by_name_and_other_classes_are_learned():
     data, said = read(recording())
     assert data.names == ("background-tissue", "kidney-parenchyma")
-    look = data.looks[0]
-    np.testing.assert_array_equal(look.counts[:8], False)
-    np.testing.assert_array_equal(look.counts[8:], True)
-    np.testing.assert_array_equal(np.unique(look.ids[8:, :24]), [1])
-    np.testing.assert_array_equal(np.unique(look.ids[8:, 24:]), [0])
+    (mask,), ids = data.frames[0].masks, data.lesson.ids[0]
+    np.testing.assert_array_equal(mask[:8], False)
+    np.testing.assert_array_equal(mask[8:], True)
+    np.testing.assert_array_equal(np.unique(ids[8:, :24]), [1])
+    np.testing.assert_array_equal(np.unique(ids[8:, 24:]), [0])
     assert "instrument-shaft; kept: background-tissue, kidney-parenchyma" in said
 
 
 def test_tools_may_be_named_by_value():
     data, _ = read(recording(), tool_values=(KIDNEY,))
     assert data.names == ("background-tissue", "instrument-shaft")
-    np.testing.assert_array_equal(data.looks[0].counts[8:, :24], False)
-    np.testing.assert_array_equal(data.looks[0].counts[:8], True)
+    np.testing.assert_array_equal(data.frames[0].masks[0, 8:, :24], False)
+    np.testing.assert_array_equal(data.frames[0].masks[0, :8], True)
 
 
 def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
@@ -58,7 +58,7 @@ def test_frames_without_a_mask_are_left_out_with_the_tools_and_said():
     assert "frames 2, 5, 6, 7, 8, 9 have no mask" in said
     data, _ = read(recording(masked=[0, 3, 4]), tools="draw")
     assert data.train == [0, 2, 3, 4, 5, 6, 7, 8]
-    assert (data.looks[1].ids == -1).all()  # nobody says what frame 2 shows
+    assert (data.lesson.ids[1] == -1).all()  # nobody says what frame 2 shows
     with pytest.raises(ValueError, match="expected masks of frames to learn from"):
         read(recording(masked=[1]))
 

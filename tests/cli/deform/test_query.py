@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from gsjax.cli import main
-from gsjax.cli.deform import Options, write_scene
+from gsjax.cli.deform import Options
 from gsjax.data import open_sequence
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.file import read_deformation, write_deformation
@@ -22,9 +22,9 @@ from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.viewables import open_viewable
-from gsjax.io.ply import read_ply
+from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames
-from gsjax.methods.deform import DeformConfig, DeformState, begin_deform, with_field
+from gsjax.methods.deform import Deform, DeformConfig, Kept, with_field
 from gsjax.methods.deform.query import (
     like_feature,
     most_likely,
@@ -45,16 +45,17 @@ def taught(tmp_path_factory):
     data = deform_data(open_sequence(SCENE), 8, *told, Notes(console), console)
     moves = DeformationConfig(resolution=8, time_resolution=4, levels=1)
     config = DeformConfig(channels=4, nodes=48, start_pixels=1.5, deformation=moves)
-    problem, state = begin_deform(data.looks, config, data.codes)
-    scene, _, moving = with_field(problem, state.scene)
+    method = Deform(config)
+    problem, first = method.start(data.frames, data.lesson, timeline=data.timeline())
+    scene, moving = with_field(config, problem, first.params)
     layers = jax.tree.map(
         lambda leaf: leaf + 0.02 * jax.random.normal(jax.random.key(1), leaf.shape), scene.field.layers
     )
     scene = eqx.tree_at(lambda s: s.field.layers, scene, layers)
     folder = RunFolder(run)
     folder.write_config(Options(dataset=SCENE, out=run, tools="draw"))
-    write_scene(folder, DeformState(scene, None, moving, None, 0, 0), data)
-    stored = read_deformation(run / "deformation.npz")
+    stored = method.result(problem, first.having(params=scene, kept=Kept(moving)))
+    write_ply(folder.scene, stored.at(0.0))
     rows = in_corner(stored, 1).astype(int)
     features = jnp.asarray(FAINT * stored.meaning.codebook[rows], jnp.float32)
     scene = eqx.tree_at(lambda s: s.gaussians.features, stored.scene, features)
@@ -64,8 +65,8 @@ def taught(tmp_path_factory):
 
 def in_corner(stored, t):
     """Which Gaussians lie in the lower left quarter of a frame's picture."""
-    viewmat, K = stored.viewmats[t], stored.Ks[t]
-    local = np.asarray(stored.at(stored.times[t]).means) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    viewmat, K = stored.viewmats[t], stored.timeline.Ks[t]
+    local = np.asarray(stored.at(stored.timeline.times[t]).means) @ viewmat[:3, :3].T + viewmat[:3, 3]
     x, y = (local @ K.T)[:, :2].T / local[:, 2]
     return (x < 32) & (y > 26)
 
@@ -192,7 +193,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
     assert not notes.all
     assert (scene.num_frames, scene.num_moving) == (10, len(corner))
     np.testing.assert_allclose(scene.times, np.arange(10) / 15, atol=1e-9)
-    np.testing.assert_array_equal(scene.at(7).means, stored.at(stored.times[7]).means)
+    np.testing.assert_array_equal(scene.at(7).means, stored.at(stored.timeline.times[7]).means)
     assert [scene.name_of(int(np.flatnonzero(rows)[0])) for rows in (corner, ~corner)] == ["tool", "tissue"]
     np.testing.assert_array_equal(scene.shots.load_image(3, 0), open_sequence(SCENE).image(3, 0))
     np.testing.assert_array_equal(scene.shots.viewmats[3, 0], stored.viewmats[3])
@@ -202,7 +203,7 @@ def test_a_run_is_seen_over_time_and_asked(run):
         asking.ask("spoon", 0)
     path = asking.save(corner, "tool object", 4)
     assert path == run / "extracted" / "tool_object_frame_4.ply"
-    np.testing.assert_allclose(read_ply(path)[0].means, stored.at(stored.times[4]).means[corner])
+    np.testing.assert_allclose(read_ply(path)[0].means, stored.at(stored.timeline.times[4]).means[corner])
 
 
 def test_a_run_whose_recording_is_gone(run):

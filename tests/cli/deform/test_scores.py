@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from gsjax.engine.deform.scores import OVER_TIME, classes_of_pixels, over_time
-from gsjax.methods.deform import Look
+from tests.methods.tissue import one_frame
 
 HEIGHT, WIDTH = 40, 48
 
 
-def frame(shift=0.0):
+def picture(shift=0.0):
     rows, columns = np.indices((HEIGHT, WIDTH))
     waves = np.sin((columns - shift) / 3) * np.cos(rows / 4)
     return np.stack(
@@ -18,14 +18,14 @@ def frame(shift=0.0):
     )
 
 
-def look(shift, counts=None):
-    bytes_ = np.round(255 * frame(shift)).astype(np.uint8)
-    return Look(bytes_, counts, None, np.eye(4), np.eye(3), 0.0)
+def seen(shift, mask=None):
+    image = np.round(255 * picture(shift)).astype(np.uint8)
+    return one_frame(image, np.eye(4), np.eye(3), 0.0, mask=mask)
 
 
 def test_the_recording_is_as_steady_as_itself():
-    looks = [look(0.0), look(1.0)]
-    row = over_time([(one.image / 255.0, one) for one in looks])
+    frames = [seen(0.0), seen(1.0)]
+    row = over_time([(one.images[0] / 255.0, one) for one in frames])
     for name in OVER_TIME:
         assert row[name] == row[f"{name}_true"]
     assert row["t_ssim"] < 0.97
@@ -34,7 +34,7 @@ def test_the_recording_is_as_steady_as_itself():
 
 
 def test_a_frozen_scene_is_steadier_than_the_recording():
-    row = over_time([(frame(0.5), look(0.0)), (frame(0.5), look(1.0))])
+    row = over_time([(picture(0.5), seen(0.0)), (picture(0.5), seen(1.0))])
     assert row["t_ssim"] == pytest.approx(1)
     assert row["flow_warp_error"] == pytest.approx(0, abs=1e-6)
     assert row["t_ssim_true"] < 0.97
@@ -43,14 +43,14 @@ def test_a_frozen_scene_is_steadier_than_the_recording():
 def test_what_does_not_count_changes_nothing():
     counts = np.ones((HEIGHT, WIDTH), bool)
     counts[10:20, 10:24] = False
-    looks = [look(0.0, counts), look(1.0, counts)]
-    odd = [np.where(counts[..., None], frame(i + 0.3), i) for i in (0, 1)]
-    plain = [np.where(counts[..., None], frame(i + 0.3), 0.5) for i in (0, 1)]
-    assert over_time(list(zip(odd, looks, strict=True))) == over_time(list(zip(plain, looks, strict=True)))
+    frames = [seen(0.0, counts), seen(1.0, counts)]
+    odd = [np.where(counts[..., None], picture(i + 0.3), i) for i in (0, 1)]
+    plain = [np.where(counts[..., None], picture(i + 0.3), 0.5) for i in (0, 1)]
+    assert over_time(list(zip(odd, frames, strict=True))) == over_time(list(zip(plain, frames, strict=True)))
 
 
 def test_too_small_pictures_have_none():
-    small = Look(np.zeros((11, 11, 3), np.uint8), None, None, np.eye(4), np.eye(3), 0.0)
+    small = one_frame(np.zeros((11, 11, 3), np.uint8), np.eye(4), np.eye(3), 0.0)
     assert over_time([(np.zeros((11, 11, 3)), small)] * 2) == {}
 
 

@@ -73,17 +73,17 @@ def test_a_clip_begins_on_a_plane(gsjax, clip, tmp_path):
 
 def test_what_is_known_in_metres_does_not_judge_a_plane():
     notes = Notes(Console(quiet=True))
-    deep = with_depth(open_sequence(EYES), "plane", 0.1, notes)
-    assert (deep.sequence.has_depth, deep.sequence.truth, deep.sequence.num_cameras) == (False, None, 1)
+    alone, _ = with_depth(open_sequence(EYES), "plane", 0.1, notes)
+    assert (alone.has_depth, alone.truth, alone.num_cameras) == (False, None, 1)
     assert any("tell about how far with --deform.plane-depth (now 0.1)" in note for note in notes.all)
 
 
 def test_what_there_is_is_taken_first():
     notes, both = Notes(Console(quiet=True)), open_sequence(EYES)
-    assert with_depth(both, "auto", 1.0, notes).source == "data"
+    assert with_depth(both, "auto", 1.0, notes)[1] == "data"
     blind = replace(both, load_depth=None)
-    assert with_depth(blind, "auto", 1.0, notes).source == "stereo"
-    assert with_depth(blind.select(cameras=[0]), "auto", 1.0, notes).source == "plane"
+    assert with_depth(blind, "auto", 1.0, notes)[1] == "stereo"
+    assert with_depth(blind.select(cameras=[0]), "auto", 1.0, notes)[1] == "plane"
     dark = replace(blind, load_image=lambda t, c: np.full((80, 96, 3), 9 + c, np.uint8))
     with pytest.warns(DataWarning, match="all of one colour"):
         with_depth(dark, "auto", 1.0, notes)

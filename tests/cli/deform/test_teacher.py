@@ -15,15 +15,14 @@ from rich.console import Console
 
 from gsjax.cli import main
 from gsjax.data import open_sequence
-from gsjax.engine import learning
+from gsjax.engine import progress
 from gsjax.engine.deform.data import deform_data
 from gsjax.engine.deform.file import read_deformation, write_deformation
-from gsjax.engine.deform.prompts import wanted_like, wanted_text
-from gsjax.engine.deform.teacher import GROUPS, Meaning, basis_of, groups_of
+from gsjax.engine.deform.teacher import GROUPS, basis_of, groups_of
 from gsjax.engine.distill.choice import TeacherChoice
 from gsjax.engine.distill.source import Source
 from gsjax.engine.messages import Notes
-from gsjax.methods.deform import DeformConfig, begin_deform, counted_ids
+from gsjax.methods.deform import Deform, DeformConfig, Meaning, counted_ids, wanted_like, wanted_text
 from tests.cli.deform.test_command import SCENE, SMALL
 from tests.perception.test_foundation import clip_folder, needs_foundation  # noqa: F401
 
@@ -94,7 +93,7 @@ def test_what_files_taught_is_asked_by_place_and_without_a_prompt(learned):
 def test_nobody_reads_a_text_in_the_space_of_files(learned, capsys):
     assert main(["query", str(learned), "tool"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert re.search("nobody here reads texts.*--point.*or by a name: group 1, group 2", said)
+    assert re.search("no encoder of their texts.*--point.*or by a name: group 1, group 2", said)
 
 
 def test_masks_with_embeddings_are_rows_of_one_codebook(tmp_path):
@@ -102,11 +101,11 @@ def test_masks_with_embeddings_are_rows_of_one_codebook(tmp_path):
         ids = (open_sequence(SCENE).mask(t, 0) > 0).astype(np.int32)
         np.savez(tmp_path / f"{t:06d}.npz", ids=ids, codebook=np.stack([OF_TISSUE, OF_TOOL]))
     data, said = data_of(tmp_path, tmp_path)
-    assert len(data.codes) == 2
+    assert len(data.lesson.codebook) == 2
     assert data.names == ("group 1", "group 2")
     assert "4 channels keep 100.0% of its 24 numbers" in said
     cosine = OF_TISSUE @ OF_TOOL / np.linalg.norm(OF_TISSUE) / np.linalg.norm(OF_TOOL)
-    ours = data.codes / np.linalg.norm(data.codes, axis=1, keepdims=True)
+    ours = data.lesson.codebook / np.linalg.norm(data.lesson.codebook, axis=1, keepdims=True)
     np.testing.assert_allclose(ours[0] @ ours[1], cosine, atol=1e-6)  # the basis keeps angles
 
 
@@ -116,7 +115,7 @@ def test_a_map_is_learned_where_it_counts_and_a_held_out_frame_may_lack_one(file
     data, said = data_of(tmp_path, tmp_path)
     assert sorted(data.held_out) == [1]
     assert "not compared with the teacher: frames 9 (" in said
-    ids, codes = data.said(data.train[3])
+    ids, codes = data.labels(data.train[3])
     t = data.train[3]
     scale = np.linalg.norm([feature_map(i) for i in data.train], axis=-1).mean()
     np.testing.assert_allclose(codes[ids], feature_map(t) / scale @ data.meaning.basis, atol=1e-5)
@@ -158,10 +157,10 @@ def test_the_closed_vocabulary_teaches_and_reads(tmp_path):
     data, said = data_of("closed", tmp_path, 16)
     assert "no foundation model" in said
     wanted = wanted_text(data.meaning, "grey")
-    scores = np.asarray(wanted.scores(jnp.asarray(data.codes, jnp.float32)))
+    scores = np.asarray(wanted.scores(jnp.asarray(data.lesson.codebook, jnp.float32)))
     threshold = wanted.threshold(scores)
     assert threshold.rule == "the encoder's own"
-    ids, mask = data.said(0).ids, open_sequence(SCENE).mask(0, 0)
+    ids, mask = data.labels(0).ids, open_sequence(SCENE).mask(0, 0)
     assert (scores[ids[mask > 0]] > threshold.value).all()
     assert (scores[ids[mask == 0]] < threshold.value).all()
     with pytest.raises(ValueError, match="--weights"):
@@ -184,11 +183,11 @@ def test_cells_of_which_a_tool_has_a_part_do_not_count(files):
     data = deform_data(seen, 8, *given)
     mask = seen.mask(data.train[0], 0) > 0
     cells = mask.reshape(13, 4, 16, 4).any(axis=(1, 3))
-    np.testing.assert_array_equal(counted_ids(data.looks[0]) < 0, cells)
+    np.testing.assert_array_equal(counted_ids(data.lesson.ids[0], data.frames[0].masks[0]) < 0, cells)
     tool = OF_TOOL @ data.meaning.basis  # of which nothing was learned
     assert np.linalg.norm(tool) < 0.75 * np.linalg.norm(OF_TOOL)
-    problem, _ = begin_deform(data.looks, DeformConfig(channels=4), data.codes)
-    assert len({id(batch.codebook) for batch in problem.batches}) == 1  # of all frames, in memory once
+    problem, _ = Deform(DeformConfig(channels=4)).start(data.frames, data.lesson)
+    np.testing.assert_array_equal(problem.ids[0] < 0, cells)
 
 
 def test_files_are_found_by_the_names_of_pictures(tmp_path):
@@ -202,7 +201,7 @@ def test_files_are_found_by_the_names_of_pictures(tmp_path):
     given = ("draw", TeacherChoice(str(tmp_path)), 4, (), Notes(console), console)
     found = deform_data(seen, 8, *given)
     assert sorted(found.held_out) == [1]
-    ids, codes = found.said(0)
+    ids, codes = found.labels(0)
     scale = np.linalg.norm([feature_map(2 + i) for i in found.train], axis=-1).mean()
     np.testing.assert_allclose(codes[ids], feature_map(2) / scale @ found.meaning.basis, atol=1e-5)
 
@@ -216,7 +215,7 @@ def test_a_run_of_features_goes_on_to_the_same_bits(files, learned, tmp_path, mo
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
         assert main(told(tmp_path / "run", *options)) == 130
     assert main(told(tmp_path / "run", *options, "--resume")) == 0
     ours, theirs = (read_deformation(run / "deformation.npz") for run in (tmp_path / "run", learned))

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-from gsjax.cli import distill
-from gsjax.cli.distill import Options
-from gsjax.engine import learning
+from gsjax.engine import progress
 from gsjax.engine.distill import teacher as field_teacher
 from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.distill.run import Options, with_paths
 from gsjax.io.ply import read_ply, write_ply
 from tests.cli.distill.conftest import SMALL, metrics
 
@@ -112,7 +111,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
         assert gsjax(*told)[0] == 130
     before, mask = (out / "field.npz").read_bytes(), recording / "seg/0/000000.png"
     gaussians = read_ply(file)[0]
@@ -125,7 +124,7 @@ def test_a_run_goes_on_with_what_it_was_begun_with_or_not_at_all(
     cv2.imwrite(str(mask), cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)[:, ::-1])
     code, said = gsjax(*told, "--resume")
     assert code == 2
-    assert "--resume: what is said of photographs, and their poses" in said
+    assert "--resume: the teacher's features of photographs, and their poses" in said
     assert (out / "field.npz").read_bytes() == before
     mask.write_bytes(kept)
     assert gsjax(*told, "--resume")[0] == 0
@@ -139,9 +138,9 @@ def test_a_run_is_told_by_what_paths_mean_not_by_how_they_are_typed(monkeypatch,
     def settings(base):
         told = Options(base / "scene.ply", features=str(base / "features"), sam=base / "sam")
         asked = TeacherChoice(told.features, sam=told.sam)
-        return distill._settings(told, asked)
+        return with_paths(told, asked)
 
     assert settings(Path()) == settings(tmp_path)
     asked = TeacherChoice("clip", weights=Path("clip"))
-    named = distill._settings(Options(Path("run"), features="clip", weights=Path("clip")), asked)
+    named = with_paths(Options(Path("run"), features="clip", weights=Path("clip")), asked)
     assert (named.features, named.weights) == ("clip", tmp_path / "clip")

@@ -15,10 +15,10 @@ from gsjax.geometry.cameras import Camera
 from gsjax.io.ply import read_ply
 from gsjax.methods.distill import (
     DistillConfig,
-    carried,
     frozen_views,
     init_field,
     pixel_cosines,
+    rendered_features,
 )
 from gsjax.rasterize.frozen import paint, strip_of
 from gsjax.scene.feature_grid import FeatureGridConfig
@@ -39,7 +39,7 @@ def test_a_picture_of_features_needs_three_numbers_a_pixel(scene, encoding):
     back = jnp.eye(4).at[2, 3].set(3.0)
     cameras = [Camera(back, K, 40, 32), Camera(back.at[2, 3].set(2.0), K, 40, 32)]
     colors, pca = feature_colors(field, located)
-    parts = carried(field, located)
+    parts = rendered_features(field, located)
     ones = jnp.ones(len(parts.values))
     known = fit_pca_colors(np.asarray(parts.channels_of(parts.joined(parts.values, ones))))
     wanted = frozen_views(gaussians, cameras)

@@ -88,7 +88,7 @@ def test_what_was_distilled_can_be_asked(gsjax, field, pristine):
 
 @pytest.mark.slow
 def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, distilled, tmp_path):
-    from gsjax.engine import learning
+    from gsjax.engine import progress
 
     steps, heard = ("--distill.iterations", STEPS, *TABLE), []
     told = ("distill", scene, "--out", tmp_path / "again", *images(pristine), *SMALL, *steps)
@@ -99,7 +99,7 @@ def test_resumed_it_is_the_same_field(gsjax, monkeypatch, pristine, scene, disti
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning, "raise_if_interrupted", raise_if_interrupted)
+        patch.setattr(progress, "raise_if_interrupted", raise_if_interrupted)
         code, said = gsjax(*told)
     assert code == 130, said
     assert (tmp_path / "again" / "field.npz").is_file()  # what was learned so far can be asked

@@ -103,7 +103,7 @@ def test_a_run_without_a_field_is_told_how_to_get_one(gsjax, tmp_path):
     assert code == 2
     assert f"expected a field, found none; gsjax distill {run} makes one" in said
     (run / "field").mkdir()
-    (run / "field" / "config.yml").write_text("# gsjax run\nscene: x\nfeatures: auto\nfield: {}\n")
+    (run / "field" / "config.yml").write_text("# gsjax run\nscene: x\nfeatures: auto\ndistill: {}\n")
     for path in (run, run / "field"):
         code, said = gsjax("query", path, "can")
         assert code == 2

@@ -1,11 +1,14 @@
 """What makes a row stale, and scripts that are shared."""
 
 import importlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from gsjax.engine.experiments import script
 from gsjax.engine.experiments.script import forget_scripts
 from gsjax.engine.experiments.sweep import experiment_names, read_experiment
 from tests.cli.experiment.toys import SCRIPT, calls, results
@@ -47,8 +50,10 @@ def test_a_figure_drawn_otherwise_leaves_the_rows_as_they_are(toy, gsjax):
     assert "4 stale" in gsjax("list")[1]
 
 
-GSJAX_IMPORTS = """
+ROOT = Path(__file__).resolve().parents[3] / "experiments"
+IMPORTS = """
 from gsjax.engine.recording import open_recording
+from experiments.shared.recordings import recorded
 from gsjax.scene import (  # several
     Gaussians,
     Tags,
@@ -59,7 +64,7 @@ LATE = "\ndef late():\n    from gsjax.cli.{} import follow  # noqa\n    return f
 
 
 @pytest.mark.parametrize("where", ["sweep.py", "helper.py"])
-def test_where_a_module_of_gsjax_stands_changes_no_fingerprint(toy, where):
+def test_where_a_module_of_gsjax_or_of_experiments_stands_changes_no_fingerprint(toy, where):
     folder, text = toy(), SCRIPT + LATE.format("track.loop")
 
     def fingerprint(text: str) -> str:
@@ -67,11 +72,13 @@ def test_where_a_module_of_gsjax_stands_changes_no_fingerprint(toy, where):
         return read_experiment(Path("experiments"), "toy", Path("runs")).fingerprint
 
     plain = fingerprint(text)
-    assert fingerprint(GSJAX_IMPORTS.lstrip() + text) == plain
+    assert fingerprint(IMPORTS.lstrip() + text) == plain
     assert fingerprint(SCRIPT + LATE.format("track_loop")) == plain
     for other in (
         "import gsjax, os",  # not gsjax alone
         "import gsjaxlike",
+        "import benchmarks",
+        "import experiments.shared.recordings as recordings",
         "from gsjax.metrics.image import psnr as score",  # `as score` of another would run alike
         "from .gsjax import x",
         "import gsjax; SIZE = 3",
@@ -102,6 +109,36 @@ def test_what_stands_beside_experiments_is_not_forgotten(toy):
         sys.path.remove(str(elsewhere.resolve()))
 
 
+def test_a_script_imports_what_is_shared_and_scripts_of_other_folders(toy, gsjax):
+    """By names from the folder that holds the root, also where helpers stand beside neither."""
+    folder = toy(
+        "from experiments.shared.factors import FACTOR\nfrom experiments.other.sweep import MORE\n"
+        "from beside_root import MOST\n"
+        + SCRIPT.replace("/ 10 + seed", "* FACTOR * MORE * MOST")
+        + "\nassert __name__ == 'experiments.toy.sweep'\n"
+    )
+    for path, text in {
+        "shared/factors.py": "FACTOR = 2\n",
+        "other/sweep.py": "from experiments.shared.factors import FACTOR\nMORE = 10 * FACTOR\n",
+        "../beside_root.py": "MOST = 100\n",
+    }.items():
+        (folder.parent / path).parent.mkdir(exist_ok=True)
+        (folder.parent / path).write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "gsjax.cli", "experiment", "run", "toy"],  # -P: as a console script
+        env={**os.environ, "PYTHONPATH": str(ROOT.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert results(folder)["rows"][0]["result"]["ms"] == 320 * 2 * 20 * 100
+    before = read_experiment(Path("experiments"), "toy", Path("runs")).made_with
+    (folder.parent / "shared/factors.py").write_text("FACTOR = 3\n")
+    script._hash_of.cache_clear()
+    assert read_experiment(Path("experiments"), "toy", Path("runs")).made_with != before
+
+
 def test_two_experiments_share_a_script(toy, gsjax):
     """Its helpers stand beside the script, not beside the config."""
     folder = toy("from factor import FACTOR\n" + SCRIPT, script="../shared/sweep.py")
@@ -114,9 +151,6 @@ def test_two_experiments_share_a_script(toy, gsjax):
     (other / "config.yaml").write_text((folder / "config.yaml").read_text())
     assert [gsjax("run", name)[0] for name in ("toy", "other")] == [0, 0]
     assert results(folder)["rows"][0]["result"] == results(other)["rows"][0]["result"]
-
-
-ROOT = Path(__file__).resolve().parents[3] / "experiments"
 
 
 @pytest.mark.parametrize("name", experiment_names(ROOT))

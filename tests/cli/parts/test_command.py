@@ -7,12 +7,18 @@ from html import unescape
 import numpy as np
 import pytest
 
-import gsjax.cli.parts
-import gsjax.engine.parts.loop
+import gsjax.engine.parts.run
 from gsjax.cli import main
 from gsjax.data.video import describe_video
+from gsjax.engine.drive import Drive
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.parts.loop import resumed
+from gsjax.engine.progress import Progress
 from gsjax.engine.recording import chosen_recording
+from gsjax.io.checkpoints import CheckpointError
 from gsjax.io.ply import read_ply
+from gsjax.methods.parts import order_of_frames
+from gsjax.optim.method import Run
 from gsjax.viz.colors import label_color
 
 SCENE = "simulated:hard_parts?case=small&amount=0.05&width=96&height=72&cameras=4"
@@ -26,7 +32,7 @@ QUICK = (
 
 @pytest.fixture
 def gsjax_parts(tmp_path, capfd):
-    """Runs `gsjax parts` in this process, into tmp_path/NAME; returns the exit code and what was said."""
+    """Runs `gsjax parts` in this process, into tmp_path/NAME; returns the exit code and its output."""
 
     def call(*options: str, name: str = "run", dataset=SCENE) -> tuple[int, str]:
         code = main(["parts", str(dataset), "--out", str(tmp_path / name), *options])
@@ -45,6 +51,10 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     assert found["complete"]
     assert found["frames"]["followed"] == 4
     assert found["held_out"]["psnr"] > 8
+    rows = [row for row in found["curve"] if "frame" in row]
+    assert [row["frame"] for row in rows] == [1, 2, 3]
+    assert all(row["update_s"] > 0 and len(row["losses"]) == 2 for row in rows)
+    assert found["seconds"]["updates"] == pytest.approx(sum(row["update_s"] for row in rows))
     box = next(row for row in found["parts"] if row.get("true_name") == "box")
     assert box["moved_mm"] > 200
     assert box["median_point_error_mm"] < 50
@@ -86,7 +96,7 @@ def test_a_run_from_a_scene_to_a_report(gsjax_parts, tmp_path):
     first = f'background: rgb{label_color(found["parts"][0]["part"])}"></i>part '
     assert first in page
     assert "following parts; compiling" in said
-    assert "4 of 4 frames: " in said
+    assert "4 of 4 frames, " in said
 
     code, said = gsjax_parts(*QUICK)
     assert code == 2
@@ -99,42 +109,54 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(gsjax_parts, tmp_path, 
     assert code == 0, said
     run = tmp_path / "run"
     arrays = dict(np.load(run / "parts.npz"))
+    given = ("--scene", str(run / "canonical"), "--anchor", str(int(arrays["anchor"])))
 
-    def stop_in(name):
-        """After the first step of that loop."""
-        loop = getattr(gsjax.engine.parts.loop, name)
+    def stopped_after(step, name):
+        """Ctrl-C, as soon as that many steps were made."""
+        advance = Drive.__next__
 
-        def stopped(*arguments):
-            yield next(loop(*arguments))
-            raise KeyboardInterrupt
+        def interrupted(ticks):
+            if ticks.run.step == step:
+                raise KeyboardInterrupt
+            return advance(ticks)
 
-        monkeypatch.setattr(gsjax.engine.parts.loop, name, stopped)
+        monkeypatch.setattr(Drive, "__next__", interrupted)
+        code, said = gsjax_parts(*QUICK, *given, name=name)
+        monkeypatch.undo()
+        assert code == 130
+        found = json.loads((tmp_path / name / "metrics.json").read_text())
+        assert not found["complete"]
+        return found, said
 
     def resumed(name):
-        monkeypatch.undo()
         code, said = gsjax_parts(*QUICK, *given, "--resume", name=name)
         assert code == 0, said
         again = dict(np.load(tmp_path / name / "parts.npz"))
         for key, array in arrays.items():
             np.testing.assert_array_equal(again[key], array, err_msg=key)
+        found = json.loads((tmp_path / name / "metrics.json").read_text())
+        assert [row["frame"] for row in found["curve"] if "frame" in row] == order_of_frames(
+            4, int(arrays["anchor"])
+        )
+        assert found["steps"] == 3 * 30 + 5
 
-    stop_in("follow")
-    given = ("--scene", str(run / "canonical"), "--anchor", str(int(arrays["anchor"])))
-    code, said = gsjax_parts(*QUICK, *given, name="stopped")
-    assert code == 130
-    partial = json.loads((tmp_path / "stopped" / "metrics.json").read_text())
-    assert not partial["complete"]
+    partial, said = stopped_after(30 + 7, "stopped")  # within the second frame
     assert partial["frames"]["followed"] == 2
     assert "partial run" in said
     assert "not complete" in " ".join(partial["notes"])
     resumed("stopped")
 
-    stop_in("refine")
-    code, said = gsjax_parts(*QUICK, *given, name="late")
-    assert code == 130
+    _, said = stopped_after(3 * 30 + 1, "late")
     assert "refined by 1 of 5 steps, and then stopped by Ctrl-C" in said
-    assert not json.loads((tmp_path / "late" / "metrics.json").read_text())["complete"]
     resumed("late")
+
+
+def test_what_an_earlier_version_left_to_resume_is_refused(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.resume.mkdir()
+    (folder.resume / "parts.npz").write_bytes(b"of another format")
+    with pytest.raises(CheckpointError, match=r"parts\.npz: expected a checkpoint"):
+        resumed(folder, Run(None, None), Progress())
 
 
 def test_what_cannot_be_done_is_said(gsjax_parts, tmp_path):
@@ -170,7 +192,7 @@ def test_masks_that_are_not_there(gsjax_parts, monkeypatch):
         recording = chosen_recording(options)
         return replace(recording, tracked=replace(recording.tracked, load_mask=None))
 
-    monkeypatch.setattr(gsjax.cli.parts, "chosen_recording", maskless)
+    monkeypatch.setattr(gsjax.engine.parts.run, "chosen_recording", maskless)
     code, said = gsjax_parts("--frames", "0:24:8", "--masks", "files")
     assert code == 2
     assert "--masks files: expected a mask of frame" in said

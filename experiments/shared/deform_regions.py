@@ -6,11 +6,11 @@ wrong in a known share of blocks.
 
 import jax.numpy as jnp
 import numpy as np
-from deforming import Dataset, Reconstructed
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from gsjax.engine.deform.scores import classes_of_pixels, draw
+from experiments.shared.deforming import Dataset, Reconstructed, seen_as
+from gsjax.engine.deform.scores import classes_of_pixels
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
 
@@ -25,14 +25,15 @@ BLOCK_PX = 16
 def region_map(data: Dataset, t: int) -> Int[np.ndarray, "h w"]:
     """What the left eye sees: 0 the background, 1 to 5 regions of the tissue by where on it they lie (the
     nearest of five places on its own map, uv), -1 the tool."""
-    look = data.look(t)
-    height, width = look.image.shape[:2]
+    frame = data.frame(t)
+    seen, viewmat, K = frame.depths[0], frame.cameras.viewmat[0], frame.cameras.K[0]
+    height, width = seen.shape
     high, wide = data.truth["seg"][t].shape
     seg = data.truth["seg"][t][np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)]
-    y, x = np.nonzero((seg == 1) & (look.depth > 0))
-    depth = look.depth[y, x].astype(np.float64)
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(look.K).T
-    camera_to_world = np.linalg.inv(look.viewmat)
+    y, x = np.nonzero((seg == 1) & (seen > 0))
+    depth = seen[y, x].astype(np.float64)
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
+    camera_to_world = np.linalg.inv(viewmat)
     points = (rays * depth[:, None]) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
     apart, which = cKDTree(data.truth["verts"][t]).query(points, k=_NEAREST)
     weights = 1 / np.maximum(apart, 1e-9) ** 2
@@ -63,10 +64,10 @@ def with_errors(
 def meanings(found: Reconstructed, data: Dataset, codes: np.ndarray) -> dict[str, float]:
     """Of held-out frames: f-PSNR against what the teacher would say without errors, IoU of classes (a mean
     over classes, pooled over frames), how it varies from frame to frame, and the share of right pixels."""
-    state, overlap, each, psnrs, right = found.state, LabelOverlap(), [], [], []
+    overlap, each, psnrs, right = LabelOverlap(), [], [], []
     for t in data.test:
         true = region_map(data, t)
-        features = draw(state.scene, state.moving, data.look(t), found.problem.plan_for(state)).features
+        features = seen_as(found, data.frame(t)).features
         psnrs.append(feature_psnr(np.asarray(features), codes[np.maximum(true, 0)], true >= 0))
         named = np.asarray(classes_of_pixels(features, jnp.asarray(codes, features.dtype)))
         overlap.add(named, true)

@@ -1,26 +1,90 @@
-"""What a text, a point or a box means of a deforming scene, and how well what has features fits it."""
+"""What a scene's features mean: the names that they tell apart, and what a text or a place is among them."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from gsjax.engine.deform.teacher import Meaning
 from gsjax.methods.deform.query import like_feature, prompt_cosines
 from gsjax.methods.deform.questions import plain_words
 from gsjax.methods.distill import Threshold, relevancy, threshold_for
 from gsjax.methods.protocols import LanguageEncoder
 
+_NEARLY = 0.95  # share of the pixels of a teacher's cell that have to count, for the cell to count
+
+
+@dataclass(frozen=True, eq=False)
+class Meaning:
+    """What features mean, apart from any frame.
+
+    Attributes:
+        source: what made the features that were learned, which knows the encoder that reads texts in their
+            space (`gsjax.engine.distill.source.Source`).
+        names: of what the features tell apart: classes, or groups of features that are alike.
+        codebook: the feature of each name.
+        basis: orthonormal columns that bring the source's vectors of D numbers into the scene's channels.
+            Fixed, for two that learn agree best where both are 0.
+    """
+
+    source: Any
+    names: tuple[str, ...]
+    codebook: Float[np.ndarray, "k channels"]
+    basis: Float[np.ndarray, "D channels"]
+
+    def hint(self, weights: Path | None = None) -> str:
+        """What can be asked for, in words; as `Source.hint`.
+
+        Args:
+            weights: folder of CLIP's, where they are now.
+        """
+        known = self.source.hint(weights)
+        return known if self.source.kind == "classes" else f"{known}; or one of: {', '.join(self.names)}"
+
+
+class Lesson(NamedTuple):
+    """A teacher's labels of frames, pixel by pixel.
+
+    Attributes:
+        ids: of each frame, the row of the codebook of each of the teacher's pixels, -1 for none; a grid of
+            any size, the same in all frames.
+        codebook: the teacher's features, in the scene's channels.
+        meaning: what these mean; None without names.
+    """
+
+    ids: Sequence[Int[np.ndarray, "h w"]]
+    codebook: Float[np.ndarray, "n channels"]
+    meaning: Meaning | None = None
+
+
+def counted_ids(
+    ids: Int[np.ndarray, "h w"], mask: Bool[np.ndarray, "height width"] | None
+) -> Int[np.ndarray, "h w"]:
+    """The teacher's ids of pixels that count, and of cells of its grid of which nearly all do, else -1: what
+    is behind a tool is not to learn that it is one.
+
+    Args:
+        ids: of the teacher's pixels, on a grid of any size.
+        mask: the pixels of the picture that count; None if all do.
+    """
+    if mask is None:
+        return ids
+    high, wide = ids.shape
+    share = cv2.resize(mask.astype(np.float32), (wide, high), interpolation=cv2.INTER_AREA)
+    return np.where(share > _NEARLY, ids, -1)
+
 
 class Wanted(NamedTuple):
-    """What is looked for, and what it is told apart from.
+    """What is looked for, and what it is held against.
 
     Attributes:
         vectors: in the scene's channels, a row a candidate: directions, or what the channels have of them.
-        row: which of them is asked for.
+        row: of the one that is looked for.
         meant: the name that it has or is the most like; None of a text that an encoder reads.
         against: the others, in words.
         least: the encoder's own threshold of a cosine; None where it has none.
@@ -33,18 +97,22 @@ class Wanted(NamedTuple):
     least: float | None = None
 
     def scores(self, features: Float[Array, "*n c"]) -> Float[Array, "*n"]:
-        """Of Gaussians, or of a picture; higher fits better: the cosine where nothing is told apart, else the
-        least share against one of the others, 1/2 where both fit alike (`relevancy`). A share among all of
-        them would be small of names that are much alike."""
+        """Scores of Gaussians, or of a picture; higher fits better: the cosine where it is held against
+        nothing, else the least share against one of the others, 1/2 where both fit alike (`relevancy`). A
+        share among all of them would be small of names that are much alike.
+
+        Args:
+            features: of Gaussians, or rendered.
+        """
         order = [self.row, *(row for row in range(len(self.vectors)) if row != self.row)]
         return _scores(features, jnp.asarray(self.vectors[order], jnp.float32))
 
     def threshold(self, scores: Float[np.ndarray, "n"], given: float | None = None) -> Threshold:
-        """Above which score something is meant, and by which rule.
+        """The score above which something is meant, and the rule by which it was chosen.
 
         Args:
             scores: of Gaussians.
-            given: by who asks.
+            given: a threshold that was asked for.
 
         Raises:
             ValueError: no score can be above the given one, or all are.
@@ -70,9 +138,9 @@ def wanted_text(
 
     Args:
         meaning: of the scene's features.
-        text: what is asked for.
-        negatives: texts that it is held against; the source's own unless given. Of no use for names.
-        encoder: loads who reads texts; the source's own unless given. Not called for names.
+        text: what is looked for.
+        negatives: texts that it is held against (default: the source's own). Of no use for names.
+        encoder: loads the encoder that reads texts (default: the source's own). Not called for names.
 
     Raises:
         ValueError: no class has the name, nobody reads texts in these features' space, or options do not fit.
@@ -99,13 +167,13 @@ def wanted_text(
 
 
 def wanted_like(meaning: Meaning, feature: Float[np.ndarray, "c"]) -> Wanted:
-    """What is like a feature, told apart from the names that are less like it."""
+    """What is like a feature, held against the names that are less like it."""
     prompt = like_feature(feature, meaning.codebook)
     return _among(meaning, prompt.vectors, prompt.row)
 
 
 def row_of(names: tuple[str, ...], text: str) -> int:
-    """Which of the names a text is.
+    """The row of the name that a text is.
 
     Raises:
         ValueError: it is none of them.

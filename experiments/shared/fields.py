@@ -10,30 +10,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from recordings import recorded
 
-from gsjax.cli import fit as fit_command
-from gsjax.cli import track as track_command
+from experiments.shared.commands import succeeded
+from experiments.shared.recordings import recorded
 from gsjax.data.photographs import Photographs
 from gsjax.data.simulated.flawed_masks import Flaws, flawed_masks
 from gsjax.engine.distill.scene import FieldScene, scene_of_run
 from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
+from gsjax.engine.drive import drive
+from gsjax.engine.fit.run import Options as FitOptions
+from gsjax.engine.fit.run import run as run_fit
 from gsjax.geometry.cameras import project
 from gsjax.methods.distill import (
+    Distill,
     DistillConfig,
-    DistillProblem,
-    DistillState,
     FeatureField,
+    Problem,
     Teacher,
-    begin_distill,
-    compiled_step,
-    distill,
-    finished,
     frozen_views,
+    full_table,
     majority_labels,
     teacher_of_objects,
 )
 from gsjax.methods.fit import PRESETS
+from gsjax.optim.compiler import host_options
+from gsjax.optim.method import Run
 from gsjax.perception.codebook import ClassCodebook
 from gsjax.perception.outlines import snap_outlines
 from gsjax.rasterize.frozen import paint
@@ -53,10 +54,7 @@ def fitted(
     path = folder.parents[1] / "field_scenes" / name
     if not (path / "report.html").is_file():
         options.setdefault("fit", PRESETS[preset])
-        told = fit_command.Options(
-            str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options
-        )
-        fit_command.run(told)
+        run_fit(FitOptions(str(recorded(name)), path, eval_cameras=eval_cameras, overwrite=True, **options))
     return scene_of_run(path)
 
 
@@ -66,17 +64,9 @@ def first_tracked(
     """The scene that `gsjax track` begins with, for few cameras: a Gaussian a point of depth."""
     path = folder.parents[1] / "field_scenes" / f"{name}_tracked"
     if not (path / "report.html").is_file():
-        track_command.run(
-            track_command.Options(
-                str(recorded(name)),
-                path,
-                frames="0:2",
-                cameras=cameras,
-                mask_camera=mask_camera,
-                eval_cameras=eval_cameras,
-                overwrite=True,
-            )
-        )
+        words = ["track", recorded(name), "--out", path, "--frames", "0:2", "--overwrite"]
+        words += ["--mask-camera", mask_camera, "--cameras", *cameras, "--eval-cameras", *eval_cameras]
+        succeeded(*words)
     return scene_of_run(path)
 
 
@@ -151,32 +141,35 @@ class Learned:
 def learned(scene: FieldScene, which: Any, teacher: Teacher, config: DistillConfig) -> Learned:
     """Distil a field from some photographs."""
     cameras = [scene.photographs.camera(i) for i in which]
-    problem, state = begin_distill(scene.gaussians, cameras, teacher, config, scene.rasterize_mode)
+    method = Distill(config)
+    ticks = drive(method, *method.start(scene.gaussians, cameras, teacher, scene.rasterize_mode))
     seconds, compiling, infos = 0.0, 0.0, []
-    for found in distill(problem, state):
-        state = found.state
-        seconds, compiling = seconds + found.seconds, compiling + found.compile_seconds
-        infos = [*infos[-19:], jax.device_get(found.info)]
+    for now in ticks:
+        seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds
+        infos = [*infos[-19:], jax.device_get(now.info)]
     assert not any(info["skipped"] for info in infos)
-    field = finished(problem, state)
+    problem, last = ticks.problem, ticks.run
+    field = full_table(last.params, problem.rows)
     located = None if problem.rows is None else locate(field.encoding, jnp.asarray(scene.gaussians.means))
-    names = [name for name in infos[0] if name not in ("skipped",)]
+    names = [name for name in infos[0] if name not in ("skipped", "overflow", "needed")]
     return Learned(
         field,
         located,
         seconds,
         compiling,
-        step_memory_mb(problem, state),
-        sum(leaf.size for leaf in jax.tree.leaves(state.field)),
+        step_memory_mb(method, problem, last),
+        sum(leaf.size for leaf in jax.tree.leaves(last.params)),
         {name: float(np.mean([info[name] for info in infos])) for name in names},
     )
 
 
-def step_memory_mb(problem: DistillProblem, state: DistillState) -> float:
+def step_memory_mb(method: Distill, problem: Problem, run: Run) -> float:
     """What a compiled step is given, and what it needs beside."""
-    batch, config = problem.views[0], problem.config
-    given = (state.field, state.optimizer, batch, jnp.asarray(0), jax.random.key(0))
-    needed = compiled_step(config).lower(*given).compile().memory_analysis()
+    advance = jax.jit(method.step.update, compiler_options=host_options(), donate_argnums=(0, 1))
+    given = (run.params, run.state, problem.views[0])
+    lowered = advance.lower(*given, step=jnp.asarray(0), key=jax.random.key(0))
+    needed = lowered.compile().memory_analysis()
+    assert needed is not None
     return (needed.argument_size_in_bytes + needed.temp_size_in_bytes) / 2**20
 
 

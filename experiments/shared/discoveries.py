@@ -12,12 +12,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float, Int
 
-from gsjax.cli import fit as fit_command
-from gsjax.cli.parts import FIT as FIT  # for settings that differ from it in one thing
-from gsjax.cli.parts import Options
-from gsjax.cli.parts import run as run_parts
 from gsjax.data import Sequence
+from gsjax.engine.fit.run import Options as FitOptions
+from gsjax.engine.fit.run import run as run_fit
+from gsjax.engine.parts.run import Options
+from gsjax.engine.parts.run import run as run_parts
 from gsjax.engine.parts.saved import open_parts_run
+from gsjax.engine.parts.start import FIT as FIT  # for settings that differ from it in one thing
 from gsjax.engine.parts.views import part_views
 from gsjax.methods.parts import PartsConfig, Start, begin, choose_anchor
 from gsjax.metrics.temporal import temporal_scores
@@ -40,8 +41,8 @@ def canonical_of(options: Options, folder: Path) -> Path:
     asked = f"{options.dataset} {options.cameras} {options.eval_cameras} {options.anchor} {options.fit}"
     path = folder.parent / f"canonical-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
     if not (path / "report.html").is_file():
-        fit_command.run(
-            fit_command.Options(
+        run_fit(
+            FitOptions(
                 options.dataset,
                 path,
                 frames=f"{options.anchor}:{options.anchor + 1}",

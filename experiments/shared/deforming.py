@@ -1,6 +1,6 @@
-"""What experiments with deforming scenes share: looks, held-out frames, scores against simulated truth."""
+"""What experiments with deforming scenes share: frames to learn from, held-out ones, scores against truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -8,24 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from recordings import recorded
 
 import gsjax
+from experiments.shared.recordings import recorded
 from gsjax.data import Sequence
 from gsjax.data.files import read_arrays
 from gsjax.engine.deform.data import unit_times
-from gsjax.engine.deform.scores import draw
-from gsjax.geometry.cameras import PointPixels, pixels_of
-from gsjax.methods.deform import (
-    DeformConfig,
-    DeformProblem,
-    DeformState,
-    Look,
-    begin_deform,
-    reconstruct,
-)
+from gsjax.engine.deform.scores import Drawn, draw
+from gsjax.engine.drive import drive
+from gsjax.geometry.cameras import NEAR, Camera, PointPixels, pixels_of
+from gsjax.methods.deform import Deform, DeformConfig, Lesson, Problem
+from gsjax.methods.deform.method import PLAN
 from gsjax.metrics.image import psnr, ssim
 from gsjax.metrics.tracking import carried_points
+from gsjax.optim.method import Run
+from gsjax.scene.frame import Frame
 
 EVERY = 8  # frame i is held out if (i - 1) mod 8 is 0, as for EndoNeRF
 TOOL = 1
@@ -55,14 +52,28 @@ class Dataset:
         seg = self.truth["seg"][t].astype(np.int32)
         return np.where(seg < 2, seg, -1)
 
-    def look(self, t: int, camera: int = 0, ids: np.ndarray | None = None, tools: bool = False) -> Look:
+    def frame(self, t: int, camera: int = 0, tools: bool = False) -> Frame:
         """What a camera saw in a frame; tools do not count unless wanted."""
         s = self.sequence
-        counts = None if tools else s.mask(t, camera) != TOOL
-        time = float(unit_times(s)[t])
-        return Look(
-            s.image(t, camera), counts, s.depth(t, camera), s.viewmats[t, camera], s.Ks[t, camera], time, ids
-        )
+        mask = None if tools else s.mask(t, camera) != TOOL
+        pose, time = (s.viewmats[t, camera], s.Ks[t, camera]), float(unit_times(s)[t])
+        return one_frame(s.image(t, camera), *pose, time, s.depth(t, camera), mask)
+
+
+def one_frame(
+    image: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    time: float,
+    depth: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
+    near: float = NEAR,
+) -> Frame:
+    """What one camera saw at a time, 0 to 1, on the host."""
+    height, width = image.shape[:2]
+    depths, masks = (None if pixels is None else pixels[None] for pixels in (depth, mask))
+    camera = Camera(viewmat[None], K[None], width, height, near)
+    return Frame(image[None], depths, camera, masks, np.asarray(time))
 
 
 def dataset(name: str = "tissue_0", scale: float = 1.0) -> Dataset:
@@ -77,38 +88,45 @@ def dataset(name: str = "tissue_0", scale: float = 1.0) -> Dataset:
 class Reconstructed:
     """A deforming scene that was learned, and what that took."""
 
-    problem: DeformProblem
-    state: DeformState
+    config: DeformConfig
+    problem: Problem
+    run: Run
     seconds: float
     compile_seconds: float
 
 
 def learned(
-    looks: list[Look], config: DeformConfig, codebook: np.ndarray | None = None, first: int | None = None
+    frames: list[Frame], config: DeformConfig, lesson: Lesson | None = None, first: int | None = None
 ) -> Reconstructed:
-    """A scene of these looks, that begins with one of them; no step may be skipped."""
-    problem, state = begin_deform(looks, config, codebook, first)
+    """A scene of these frames, that begins with one of them; no step may be skipped."""
+    method = Deform(config)
+    problem, run = method.start(frames, lesson, first=first)
+    ticks = drive(method, problem, run)
     seconds = compiling = skipped = 0.0
-    for found in reconstruct(problem, state):
-        state = found.state
-        seconds, compiling = seconds + found.seconds, compiling + found.compile_seconds
-        skipped += float(found.info["skipped"])
+    for now in ticks:
+        seconds, compiling = seconds + now.seconds, compiling + now.compile_seconds
+        skipped += float(now.info["skipped"])
     assert not skipped, f"{skipped:.0f} steps were skipped"
-    return Reconstructed(problem, state, seconds, compiling)
+    return Reconstructed(config, problem, ticks.run, seconds, compiling)
 
 
-def drawn(found: Reconstructed, look: Look) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and depth as a look would see the scene."""
-    got = draw(found.state.scene, found.state.moving, look, found.problem.plan_for(found.state))
+def seen_as(found: Reconstructed, frame: Frame) -> Drawn:
+    """The scene where and when a frame was seen."""
+    return draw(found.run.params, found.run.kept.moving, frame, found.run.plans[PLAN])
+
+
+def drawn(found: Reconstructed, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and depth of the scene where and when a frame was seen."""
+    got = seen_as(found, frame)
     return got.colors, got.depths
 
 
-def frames_per_second(found: Reconstructed, look: Look, repeats: int = 20) -> float:
+def frames_per_second(found: Reconstructed, frame: Frame, repeats: int = 20) -> float:
     """How often a second the scene is deformed, drawn and brought to the host, over times; the median."""
     took = []
     for i in range(repeats + 2):
         begun = perf_counter()
-        drawn(found, look._replace(time=i / (repeats + 2)))
+        drawn(found, replace(frame, time=np.asarray(i / (repeats + 2))))
         took.append(perf_counter() - begun)
     return 1 / float(np.median(took[2:]))
 
@@ -121,20 +139,20 @@ def scores(found: Reconstructed, data: Dataset) -> dict[str, float]:
     """
     rows = []
     for t in data.test:
-        look = data.look(t)
-        colors, depths = drawn(found, look)
-        true = look.image / 255.0
-        known = look.counts & (look.depth > 0)
+        frame = data.frame(t)
+        colors, depths = drawn(found, frame)
+        true, counts, depth = frame.images[0] / 255.0, frame.masks[0], frame.depths[0]
+        known = counts & (depth > 0)
         row = {
-            "psnr": psnr(colors, true, look.counts),
-            "mse": _mse(colors, true, look.counts),
-            "ssim": ssim(colors, true, look.counts),
-            "depth_mm": 1e3 * float(np.abs(depths - look.depth)[known].mean()),
-            "psnr_near_tool": psnr(colors, true, look.counts & near_tool(look)),
+            "psnr": psnr(colors, true, counts),
+            "mse": _mse(colors, true, counts),
+            "ssim": ssim(colors, true, counts),
+            "depth_mm": 1e3 * float(np.abs(depths - depth)[known].mean()),
+            "psnr_near_tool": psnr(colors, true, counts & near_tool(frame)),
         }
         if data.sequence.num_cameras > 1:
-            right = data.look(t, camera=1)
-            row["psnr_right"] = psnr(drawn(found, right)[0], right.image / 255.0, right.counts)
+            right = data.frame(t, camera=1)
+            row["psnr_right"] = psnr(drawn(found, right)[0], right.images[0] / 255.0, right.masks[0])
         rows.append(row)
     means = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
     return means | {"psnr_pooled": -10 * np.log10(means.pop("mse"))}
@@ -144,11 +162,11 @@ def _mse(image: np.ndarray, true: np.ndarray, counts: np.ndarray) -> float:
     return float(np.square(image - true)[counts].mean())
 
 
-def near_tool(look: Look) -> Bool[np.ndarray, "h w"]:
+def near_tool(frame: Frame) -> Bool[np.ndarray, "h w"]:
     """Pixels within some of the tool."""
     from scipy.ndimage import distance_transform_edt
 
-    return distance_transform_edt(look.counts) <= NEAR_TOOL_PX
+    return distance_transform_edt(frame.masks[0]) <= NEAR_TOOL_PX
 
 
 def copies(data: Dataset) -> dict[str, float]:
@@ -156,7 +174,7 @@ def copies(data: Dataset) -> dict[str, float]:
     s = data.sequence
 
     def of(name, guess):
-        each = [_mse(guess(t), s.image(t, 0) / 255.0, data.look(t).counts) for t in data.test]
+        each = [_mse(guess(t), s.image(t, 0) / 255.0, data.frame(t).masks[0]) for t in data.test]
         mean, pooled = float(np.mean(-10 * np.log10(each))), float(-10 * np.log10(np.mean(each)))
         return {f"psnr_{name}": mean, f"pooled_{name}": pooled}
 
@@ -174,10 +192,10 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     """How far vertices that frame 0 sees are from where they truly are, each carried by the displacement of
     the four Gaussians nearest to it in frame 0; and how far if nothing moved. Millimetres."""
     tracks, frames = data.sequence.truth.tracks, data.sequence.num_frames
-    seen = _seen(tracks[0], data.look(0))
+    seen = _seen(tracks[0], data.frame(0))
     start = tracks[0][seen]
     at = jax.jit(lambda scene, moving, time: scene.at(time, moving).means)
-    scene, moving = found.state.scene, found.state.moving
+    scene, moving = found.run.params, found.run.kept.moving
     times = jnp.asarray(unit_times(data.sequence), jnp.float32)
     means = [np.asarray(at(scene, moving, time)) for time in times]
     carried = carried_points(start, np.stack(means))
@@ -197,29 +215,28 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     }
 
 
-def _pixels(points: Float[np.ndarray, "n 3"], look: Look) -> PointPixels:
-    """Where points fall in a look."""
-    height, width = look.image.shape[:2]
-    return pixels_of(points, look.viewmat, look.K, width, height)
+def _pixels(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
+    """Where points fall in a frame."""
+    camera = frame.cameras
+    return pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
 
 
-def _seen(points: Float[np.ndarray, "n 3"], look: Look) -> Bool[np.ndarray, "n"]:
-    """Which points a look sees, by its depth and mask."""
-    x, y, depth, inside = _pixels(points, look)
-    return inside & look.counts[y, x] & (np.abs(look.depth[y, x] - depth) < _SEEN_WITHIN_M)
+def _seen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
+    """Which points a frame sees, by its depth and mask."""
+    x, y, depth, inside = _pixels(points, frame)
+    return inside & frame.masks[0][y, x] & (np.abs(frame.depths[0][y, x] - depth) < _SEEN_WITHIN_M)
 
 
 def _near_tool_at(points: Float[np.ndarray, "n 3"], data: Dataset, t: int) -> Bool[np.ndarray, "n"]:
-    look = data.look(t)
-    at = _pixels(points, look)
-    return at.inside & near_tool(look)[at.rows, at.columns]
+    frame = data.frame(t)
+    at = _pixels(points, frame)
+    return at.inside & near_tool(frame)[at.rows, at.columns]
 
 
 def summary(found: Reconstructed) -> dict[str, Any]:
     """What it took."""
-    steps = found.problem.config.warmup + found.problem.config.iterations
     return {
-        "gaussians": found.state.scene.gaussians.num,
+        "gaussians": found.run.params.gaussians.num,
         "minutes": (found.seconds + found.compile_seconds) / 60,
-        "step_ms": 1e3 * found.seconds / max(1, steps),
+        "step_ms": 1e3 * found.seconds / max(1, found.config.warmup + found.config.iterations),
     }

@@ -8,13 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from deform_regions import REGIONS, region_map
-from deforming import TOOL, Dataset
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 import gsjax
-from gsjax.methods.deform import Look, Question
+from experiments.shared.deform_regions import REGIONS, region_map
+from experiments.shared.deforming import TOOL, Dataset
+from gsjax.methods.deform import Question
+from gsjax.scene.frame import Frame
 
 NAMES = ("background", *(f"patch {i}" for i in range(1, REGIONS + 1)), "tool")
 THE_TOOL = len(NAMES) - 1
@@ -49,14 +50,19 @@ class Truth:
         return self.data.sequence.num_frames
 
     @cached_property
-    def looks(self) -> list[Look]:
+    def frames(self) -> list[Frame]:
         """What the left eye saw, tools too."""
-        return [self.data.look(t, tools=True) for t in range(self.count)]
+        return [self.data.frame(t, tools=True) for t in range(self.count)]
+
+    def pose(self, t: int) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3 3"]]:
+        """View matrix and intrinsics of the left eye in a frame."""
+        camera = self.frames[t].cameras
+        return camera.viewmat[0], camera.K[0]
 
     @cached_property
     def depths(self) -> Float[np.ndarray, "t h w"]:
         """Metres, 0 where unknown."""
-        return np.stack([look.depth for look in self.looks])
+        return np.concatenate([frame.depths for frame in self.frames])
 
     @cached_property
     def labels(self) -> Int[np.ndarray, "t h w"]:
@@ -71,10 +77,10 @@ class Truth:
 
     def points(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
         """What frame `t` shows of a class, world."""
-        look, depth = self.looks[t], self.depths[t]
+        (viewmat, K), depth = self.pose(t), self.depths[t]
         rows, columns = np.nonzero((self.pieces[t][k] > 0) & (depth > 0))
-        rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(look.K).T
-        return (rays * depth[rows, columns, None] - look.viewmat[:3, 3]) @ look.viewmat[:3, :3]
+        rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(K).T
+        return (rays * depth[rows, columns, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
 
     def surface(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
         """`points` without those whose label and depth are of two surfaces, as on an edge: tissue is near its
@@ -108,9 +114,9 @@ class Truth:
             turn = pose[g] @ np.linalg.inv(pose[f]) if k == THE_TOOL else np.eye(4)
             end = start @ turn[:3, :3].T + turn[:3, 3]
         else:
-            look, verts = self.looks[f], self.data.truth["verts"]
-            local = verts[f] @ look.viewmat[:3, :3].T + look.viewmat[:3, 3]
-            x, y = ((local @ look.K.T)[:, :2] / local[:, 2:]).T
+            (viewmat, K), verts = self.pose(f), self.data.truth["verts"]
+            local = verts[f] @ viewmat[:3, :3].T + viewmat[:3, 3]
+            x, y = ((local @ K.T)[:, :2] / local[:, 2:]).T
             height, width = self.depths[f].shape
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
             column, row = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
@@ -141,7 +147,7 @@ class Truth:
                 return None
             if kind == "motion":
                 return float(np.median(np.linalg.norm(way, axis=1)))
-            return _direction(self.looks[t].viewmat[:3, :3] @ way.mean(axis=0))
+            return _direction(self.pose(t)[0][:3, :3] @ way.mean(axis=0))
         if not all(self.pieces[t][one].any() for one in things):
             return None
         if kind == "place":

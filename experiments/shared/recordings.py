@@ -18,7 +18,7 @@ from gsjax.engine.track.views import views
 from gsjax.methods.track import StartConfig, TrackConfig, TrackedScene, start_scene
 from gsjax.scene.frame import Frame
 
-DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 MASK_CAMERA = 1
 QUIET = Console(stderr=True, quiet=True)
 

@@ -1,0 +1,198 @@
+"""A run of `gsjax deform`: one camera's frames in, a folder with a scene over time, its scores and a report
+out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+
+from gsjax.data import Photographs, Sequence
+from gsjax.data.open import is_photographs, is_recording, open_photographs
+from gsjax.data.ordered import open_as_sequence
+from gsjax.engine.deform.data import Tools, deform_data
+from gsjax.engine.deform.depth import Depth, DepthSource, with_depth
+from gsjax.engine.deform.file import NAME, write_deformation
+from gsjax.engine.deform.poses import as_refined
+from gsjax.engine.deform.results import print_results, write_results
+from gsjax.engine.deform.scores import judge
+from gsjax.engine.deform.start import NOBODY
+from gsjax.engine.distill.choice import TeacherChoice, TeacherOptions
+from gsjax.engine.drive import drive
+from gsjax.engine.ending import exit_code, finish
+from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked
+from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
+from gsjax.engine.recording import located, open_recording
+from gsjax.io.ply import write_ply
+from gsjax.methods.deform import PRESETS, Deform, DeformConfig
+from gsjax.methods.deform.method import PLAN
+
+_LOSSES = ("rgb", "depth", "feature", "node", "structure", "spatial", "temporal", "planes")
+_HARDLY = 0.95  # of the error of a scene that stands still
+_UNLIKE = 0.6  # an IoU
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(TeacherOptions, OfDataset):
+    """Options of `gsjax deform`."""
+
+    preset: Literal["surst", "clin"] = "surst"
+    """Recipe whose settings are the defaults of --deform: SurstSplat's or GaussianClin's."""
+    tools: Tools = "leave-out"
+    """Tools, which are known by the names of mask values, or without names are all values but 0: leave them
+    out, or draw them too."""
+    tool_values: Annotated[tuple[int, ...], tyro.conf.arg(metavar="VALUE")] = ()
+    """Mask values that are tools, whatever their names are."""
+    depth: Depth = "auto"
+    """Source of the depth: data (files), stereo (the camera to learn from and the next one are matched) or
+    plane (none: the scene begins on one, and its depth has no unit). auto: the first of these that exists."""
+    deform: DeformConfig = field(default_factory=lambda: PRESETS["surst"])
+    """How it is learned."""
+
+
+def run(options: Options) -> int:
+    """Reconstruct a deforming scene and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: what was asked cannot be done; everything learned before that is on disk.
+    """
+    options = checked(options)
+    asked = _teacher(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        expect_dataset(options.dataset)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        elsewhere = {} if asked is None else asked.located()
+        settings = replace(options, dataset=located(options.dataset), **elsewhere)
+        if options.resume:
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
+        sequence, source = _recording(options, notes)
+        how = (options.test_every, options.tools, asked, options.deform.channels)
+        data = deform_data(sequence, *how, options.tool_values, notes, console)
+        if data.meaning is None and asked is not None:
+            only = "One class among the pixels that count" if data.sequence.has_masks else "No masks"
+            only += ": colours are learned, and no meaning or graph"
+            notes.add(f"{only}.")
+            console.print(f"{only}; for gsjax query and ask: --tools draw, or --features", soft_wrap=True)
+        method, metric = Deform(options.deform), source != "plane"
+        with stage(console, "placing the first Gaussians"):
+            timeline = data.timeline(metric)
+            problem, run = method.start(data.frames, data.lesson, first=data.first, timeline=timeline)
+        progress = Progress({"frames, depth, masks, poses and features": data.digest()})
+        if options.resume:
+            run, progress = load_run(folder.resume, run, progress)
+            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+            if (folder.path / "query").exists():
+                notes.warn(f"{folder.path / 'query'} is an answer of the scene as it was; ask again")
+        folder.write_config(settings)  # from here on an earlier run is gone
+        row, ticks = means_of("psnr", *_LOSSES), drive(method, problem, run)
+        schedule = Schedule("reconstructing", method.total(problem), row, _in_words)
+        watch(ticks, progress, schedule, folder, console, minutes=options.minutes)
+        run, result = ticks.run, ticks.result
+        data, refined = as_refined(folder, problem, run.params, data, notes)
+        write_deformation(folder.path / NAME, result)
+        write_ply(folder.scene, jax.device_get(result.at(0.0)))
+        with stage(console, "looking at held-out frames"):
+            judged = judge(folder, result, run.plans[PLAN], data, options.tools)
+        note_if_cut_short(progress, schedule, run.step, notes)
+        _warn_of_oddities(progress, judged, notes)
+        if not data.test:
+            notes.add("No frame is held out: nothing was judged that the scene had not learned from.")
+        found = {
+            "kind": "deform",
+            "dataset": data.sequence.name,
+            "preset": options.preset,
+            "num_gaussians": run.params.gaussians.num,
+            "frames": {"learned": len(data.train), "held_out": len(data.test)},
+            "size": (data.sequence.width, data.sequence.height),
+            "features": "none" if data.meaning is None else data.meaning.source.kind,
+            "names": data.names,
+            "depth": {"source": source, "metric": metric},
+            "poses": refined,
+            **progress.found(run.step, begun),
+            "machine": describe_machine(),
+            **judged,
+            "notes": notes.all,
+        }
+        finish(folder, found, write_results)
+    print_results(folder, found)
+    return exit_code(progress.stopped)
+
+
+def _warn_of_oddities(progress: Progress, judged: Mapping[str, Any], notes: Notes) -> None:
+    """Warns of skipped steps, and of a scene that hardly learned to move, or what is what."""
+    if progress.skipped:
+        notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
+    tracks = judged["tracks"]
+    if tracks is not None and tracks["median_mm"] > _HARDLY * tracks["still_median_mm"]:
+        notes.warn("tracks are hardly better than if nothing moved; more steps (--deform.iterations)?")
+    unlike = [f"{one['class']} {one['iou']:.2f}" for one in judged["classes"] if one["iou"] < _UNLIKE]
+    if unlike:
+        notes.warn(f"what is drawn hardly overlaps what was seen (IoU): {', '.join(unlike)}; more steps?")
+
+
+def _recording(options: Options, notes: Notes) -> tuple[Sequence, DepthSource]:
+    """The recording, the camera that is learned from first, with its depth, and where that is from."""
+    chosen = (options.frames, options.read, options.scale)
+    whole = open_recording(options.dataset, (), (), *chosen, opened=open_as_sequence).judged
+    if is_photographs(options.dataset) and not is_recording(options.dataset):
+        photographs = open_photographs(options.dataset, options.read)
+        notes.add(_of_photographs(photographs, whole.viewmats[0, 0]))
+    for flag, camera in (("--cameras", options.cameras), ("--eval-cameras", options.eval_cameras)):
+        if camera and camera[0] not in whole.camera_ids:
+            known = list(whole.camera_ids)
+            raise ValueError(f"{flag}: {whole.name} has no camera {camera[0]}; it has {known}")
+    judge = options.eval_cameras
+    first = options.cameras or tuple(c for c in whole.camera_ids if c not in judge)[:1]
+    if not first or first == judge:
+        raise ValueError(
+            f"--eval-cameras: expected another camera than that to learn from, found {list(judge)} for both"
+        )
+    others = [camera for camera in whole.camera_ids if camera not in (*first, *judge)]
+    sequence = whole.select(cameras=[*first, *judge, *others])
+    return with_depth(sequence, options.depth, options.deform.plane_depth, notes)
+
+
+def _of_photographs(photographs: Photographs, facing: Float[np.ndarray, "4 4"]) -> str:
+    """The note on their order, and on the unit of lengths by their points; `facing` is the first view
+    matrix."""
+    words = f"{photographs.num} photographs are taken as frames, in their order."
+    if photographs.cloud is None or not len(photographs.cloud.points):
+        return words
+    away = float(np.median(photographs.cloud.points @ facing[2, :3] + facing[2, 3]))
+    return (
+        f"{words} The points that came with their poses lie {away:.3g} before the first, in the poses' unit."
+    )
+
+
+def _teacher(options: Options) -> TeacherChoice | None:
+    """The teacher that is asked for, once all options fit; None: no teacher."""
+    if len(options.cameras) > 1:
+        raise ValueError(f"--cameras: expected one to learn from, found {list(options.cameras)}")
+    if len(options.eval_cameras) > 1:
+        raise ValueError(f"--eval-cameras: expected one to judge by, found {list(options.eval_cameras)}")
+    asked = TeacherChoice(options.features, options.masks, options.sam, options.weights, options.level)
+    option = "masks" if asked.masks != "auto" else "sam" if asked.sam is not None else None
+    if option is not None and asked.features not in ("closed", "clip"):
+        raise ValueError(
+            f"--{option}: expected --features closed or clip, which ask of masks, found {options.features}"
+        )
+    if options.features != NOBODY:
+        asked.check(also=(NOBODY,))
+        return asked
+    if asked != TeacherChoice(NOBODY):
+        raise ValueError("--weights, --level: expected --features that have a use for them, found none")
+    return None
+
+
+def _in_words(row: Mapping[str, Any]) -> str:
+    """The means of a row in words."""
+    return "–" if row["psnr"] is None else f"{row['psnr']:.1f} dB"

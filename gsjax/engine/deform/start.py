@@ -1,0 +1,57 @@
+"""A reconstruction of a recording, begun as `gsjax deform` begins it, but of all frames and silently."""
+
+import warnings
+
+from rich.console import Console
+
+from gsjax.data.errors import DataWarning
+from gsjax.data.sequence import Sequence
+from gsjax.engine.deform.data import Tools, deform_data
+from gsjax.engine.deform.depth import with_depth
+from gsjax.engine.distill.choice import TeacherChoice
+from gsjax.engine.messages import Notes
+from gsjax.methods.deform import Deform, Problem
+from gsjax.optim.method import Run
+from gsjax.scene.gaussians import Gaussians
+
+NOBODY = "none"
+"""The name of a teacher that is none."""
+
+
+def start_from(
+    method: Deform,
+    sequence: Sequence,
+    teacher: TeacherChoice | str | None,
+    tools: Tools,
+    tool_values: tuple[int, ...],
+    first: int | None,
+    gaussians: Gaussians | None,
+) -> tuple[Problem, Run]:
+    """The problem and the run before its first step; what is odd of the data is warned of.
+
+    Args:
+        method: with its settings.
+        sequence, teacher, tools, tool_values, first, gaussians: as for `gsjax.deform`.
+
+    Raises:
+        ValueError, DataError, FileNotFoundError: as `gsjax.deform`.
+    """
+    choice = teacher if isinstance(teacher, TeacherChoice) else TeacherChoice(teacher or "auto")
+    asked = None if choice.features == NOBODY else choice
+    if asked is not None:
+        asked.check(also=(NOBODY,))
+    quiet, config = Console(quiet=True), method.config
+    notes = Notes(quiet)
+    seen, source = with_depth(sequence, "auto", config.plane_depth, notes)
+    data = deform_data(seen, 0, tools, asked, config.channels, tool_values, notes, quiet)
+    if first is not None and first not in data.train:
+        raise ValueError(f"first: expected one of the frames to learn from, {data.train}, found {first}")
+    for text in notes.warnings:
+        warnings.warn(text, DataWarning, stacklevel=3)
+    return method.start(
+        data.frames,
+        data.lesson,
+        first=data.first if first is None else data.train.index(first),
+        gaussians=gaussians,
+        timeline=data.timeline(metric=source != "plane"),
+    )

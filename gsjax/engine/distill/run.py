@@ -1,0 +1,177 @@
+"""A run of `gsjax distill`: a scene and its photographs in, a folder with a field and a report out."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+from rich.console import Console
+
+from gsjax.engine.distill.cache import FeatureCache
+from gsjax.engine.distill.choice import Second, TeacherChoice, TeacherOptions
+from gsjax.engine.distill.file import FOLDER, NAME
+from gsjax.engine.distill.results import judge, print_results, write_results
+from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_scene
+from gsjax.engine.distill.teacher import Teaching
+from gsjax.engine.drive import drive
+from gsjax.engine.ending import exit_code, finish
+from gsjax.engine.folder import RunFolder, plain
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import RESUME_MAY_CHANGE, Common, Resuming, Seeded, Timed, checked
+from gsjax.engine.progress import Progress, Schedule, load_run, means_of, note_if_cut_short, watch
+from gsjax.engine.recording import located
+from gsjax.engine.records import digest
+from gsjax.io.atomic import atomic_write
+from gsjax.methods.distill import Distill, DistillConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common, Resuming, Timed, Seeded, TeacherOptions, SceneOptions):
+    """Options of `gsjax distill`."""
+
+    out: Path | None = None
+    """Folder for the field. Default: `field` in the run's folder."""
+    second: Second = "none"
+    """Second teacher beside --features clip, which knows of masks alone: maskclip, CLIP's vectors of patches,
+    by the same --weights. Its weight is --distill.weights.map."""
+    snap: int = 0
+    """Move outlines of masks to the picture's edges, where there are any within this many pixels: for masks
+    whose outlines are off, as many segmenters' are."""
+    distill: DistillConfig = dataclasses.field(default_factory=DistillConfig)
+    """Settings of the field and its training."""
+
+
+def run(options: Options) -> int:
+    """Distil a field and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: the options cannot be followed; everything learned before that is on disk.
+    """
+    options = checked(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        choice = TeacherChoice(
+            options.features,
+            options.masks,
+            options.sam,
+            options.weights,
+            options.level,
+            options.second,
+            options.snap,
+        )
+        choice.check()
+        scene = open_scene(options)
+        sha256 = digest(scene.file)
+        folder = RunFolder(_out(options, scene.file), overwrite=options.overwrite, resume=options.resume)
+        settings = with_paths(options, choice)
+        if options.resume:
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
+        cache, photographs = FeatureCache(), scene.photographs
+        teaching = Teaching(photographs, scene.taught, choice, cache, console)
+        if choice.features == "auto":
+            console.print(f"[bold]features[/]  {teaching.source.kind}: {teaching.about}", soft_wrap=True)
+        method, values = Distill(options.distill), asdict(settings)
+        with stage(console, "looking which Gaussians each view shows"):
+            problem, run = method.start(
+                scene.gaussians,
+                [photographs.camera(i) for i in scene.taught],
+                teaching.teacher,
+                scene.rasterize_mode,
+                source=teaching.source,
+                scene={
+                    "file": str(scene.file.resolve()),
+                    "sha256": sha256,
+                    "photographs": plain({f.name: values[f.name] for f in fields(SceneOptions)}),
+                },
+            )
+        progress = Progress(
+            {
+                str(scene.file.resolve()): sha256,
+                "the teacher's features of photographs, and their poses": teaching.digest(),
+            }
+        )
+        if options.resume:
+            run, progress = load_run(folder.resume, run, progress)
+            notes.add(f"Resumed after {run.step} steps of an earlier run.")
+        folder.write_config(settings)  # from here on an earlier field is gone
+        ticks = drive(method, problem, run)
+        total, losses = method.total(problem), means_of("rec", "cos", "contrast", "tv")
+        schedule = Schedule("distilling", total, losses, _words)
+        watch(ticks, progress, schedule, folder, console, minutes=options.minutes)
+        steps, result = ticks.run.step, ticks.result
+        with atomic_write(folder.path / NAME) as temporary:
+            result.write(temporary)
+        with stage(console, "asking it about views"):
+            judged = judge(folder, scene, teaching, result, options.distill, notes)
+        note_if_cut_short(progress, schedule, steps, notes)
+        _note_oddities(scene, progress, notes)
+        found = {
+            "kind": "distill",
+            "dataset": photographs.name,
+            "features": teaching.source.kind,
+            "second": options.second,
+            "features_are": teaching.about,
+            "masks": teaching.masks,
+            "names": sorted(teaching.source.names.values()),
+            "dimension": teaching.teacher.dimension,
+            "num_gaussians": scene.gaussians.num,
+            "trained": sum(leaf.size for leaf in jax.tree.leaves(ticks.run.params)),
+            "views": {"taught": len(problem.views), "held_out": len(scene.held_out)},
+            "size": photographs.sizes.max(0),
+            "encoded": {"anew": cache.asked, "from_cache": cache.found},
+            **progress.found(steps, begun),
+            "machine": describe_machine(),
+            **judged,
+            "notes": notes.all,
+        }
+        finish(folder, found, write_results)
+    print_results(folder, found)
+    return exit_code(progress.stopped)
+
+
+def with_paths(options: Options, choice: TeacherChoice) -> Options:
+    """The options with paths as they are found from any folder.
+
+    Args:
+        options: of the command.
+        choice: its teacher.
+    """
+    found: dict[str, Any] = choice.located() | {"scene": Path(located(str(options.scene)))}
+    if options.images is not None:
+        found["images"] = located(options.images)
+    return replace(options, **found)
+
+
+def _words(row: Mapping[str, Any]) -> str:
+    """A row of means in words."""
+    return "1 - cosine to the teacher " + ("–" if row["cos"] is None else f"{row['cos']:.3f}")
+
+
+def _out(options: Options, scene: Path) -> Path:
+    """The folder for the field.
+
+    Raises:
+        ValueError: there is none, or the scene lies in it and would be removed when the field is replaced.
+    """
+    if options.out is None and options.scene.is_file():
+        raise ValueError(
+            f"{options.scene}: a PLY file has no folder of its own; --out names one for the field"
+        )
+    out = options.scene / FOLDER if options.out is None else options.out
+    if any(place.is_relative_to(out.resolve()) for place in (scene.resolve(), scene.parent.resolve())):
+        raise ValueError(
+            f"--out {out}: expected a folder for the field alone, found one with its scene, {scene}, in it; "
+            "name another"
+        )
+    return out
+
+
+def _note_oddities(scene: FieldScene, progress: Progress, notes: Notes) -> None:
+    if progress.skipped:
+        notes.warn(f"{progress.skipped} steps met numbers that are not finite and changed nothing")
+    if not len(scene.held_out):
+        notes.add("No view is held out: nothing was judged that the field had not seen.")

@@ -1,0 +1,244 @@
+"""A run of `gsjax parts`: synchronised cameras in, a folder with the parts of a moving scene out."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+from rich.console import Console
+
+from gsjax.data import Sequence
+from gsjax.engine.ending import exit_code, finish
+from gsjax.engine.fit.run import Options as FitOptions
+from gsjax.engine.fit.run import run as run_fit
+from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
+from gsjax.engine.messages import Notes, stage
+from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
+from gsjax.engine.parts.loop import Loop, resumed
+from gsjax.engine.parts.results import finished, print_results, write_results
+from gsjax.engine.parts.start import FIT
+from gsjax.engine.progress import Progress
+from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
+from gsjax.engine.records import digest
+from gsjax.io.ply import read_ply
+from gsjax.methods.fit import FitConfig
+from gsjax.methods.parts import (
+    Anchor,
+    Parts,
+    PartsConfig,
+    Start,
+    begin,
+    choose_anchor,
+    masks_of_labels,
+    moved_pixels,
+)
+from gsjax.methods.protocols import Segmenter
+from gsjax.perception.sam import load_sam
+from gsjax.perception.segmenters import PieceSegmenter
+from gsjax.scene.gaussians import Gaussians
+
+_EVERYTHING = 0.6  # share of pixels that change
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Seeded, SamWeights, OfRecording):
+    """Options of `gsjax parts`."""
+
+    anchor: int | None = None
+    """Index of the canonical frame among those frames, from 0. Default: the one that differs most."""
+    masks: Literal["segment", "files"] = "segment"
+    """Where the pieces in the anchor's pictures come from: a segmenter, or the recording's own masks, whose
+    labels must mean the same in all cameras."""
+    scene: Path | None = None
+    """The scene at the anchor, which must then be given: a PLY file, or a run of `gsjax fit`. Default: it is
+    fitted, into RUN/canonical."""
+    fit: FitConfig = FIT
+    """How the canonical scene is fitted."""
+    parts: PartsConfig = field(default_factory=PartsConfig)
+    """How parts are found and followed."""
+
+
+def run(options: Options) -> int:
+    """Find the parts of a recording and report on them; returns the exit code.
+
+    Raises:
+        ValueError, OSError: an option cannot be met; everything found before that is on disk.
+    """
+    options = checked(options)
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        expect_dataset(options.dataset)
+        recording = chosen_recording(options)
+        _check(options, recording)
+        segmenter = _segmenter(options)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
+        if options.resume:
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
+        scene = None if options.scene is None else _ply_of(options.scene)
+        gaussians = None if scene is None else _read_scene(scene)
+        seconds: dict[str, float] = {}
+        tracked = recording.tracked
+        with stage(console, "looking for what moves"):
+            anchor = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, options.anchor)
+            discover = options.parts.discover
+            moved = moved_pixels(
+                tracked.image,
+                anchor,
+                tracked.num_cameras,
+                frames=discover.frames,
+                threshold=discover.threshold,
+            )
+        masks = _masks(tracked, anchor, moved, options)
+        folder.write_config(settings)  # from here on an earlier run is gone
+        notes.add(
+            f"The canonical frame is {anchor.frame}, frame {tracked.frame_ids[anchor.frame]} of the data."
+        )
+        at = perf_counter()
+        if scene is None or gaussians is None:
+            scene = _fitted(settings, folder, anchor, recording, console)
+            if scene is None:
+                return 130
+            gaussians = _read_scene(scene)
+        seconds["canonical"], at = perf_counter() - at, perf_counter()
+        with stage(console, "finding what may move, in all views"):
+            key = jax.random.key(options.parts.seed)
+            start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
+        _warn_if_odd(start, moved.mean(), options, notes)
+        method = Parts(options.parts)
+        problem, first = method.start(tracked, start)
+        seconds["discovery"] = perf_counter() - at
+        progress = Progress({"the canonical scene": digest(scene)})
+        if options.resume:
+            first, progress = resumed(folder, first, progress)
+            followed = int(method.result(problem, first).done.sum())
+            notes.add(f"Resumed after {followed} frames of an earlier run.")
+        loop = Loop(method, problem, first, progress, seconds, folder, notes, console)
+        loop.follow()
+        if progress.stopped is None:
+            loop.finish()
+            loop.refine()
+        last = method.brought_up_to_date(problem, loop.run)
+        outcome = method.result(problem, last)
+        found = finished(folder, recording, start, last, outcome, progress, seconds, notes, console)
+        found["seconds"]["total"] = perf_counter() - begun
+        found["notes"] = notes.all
+        finish(folder, found, write_results)
+    print_results(folder, found)
+    return exit_code(progress.stopped)
+
+
+def _check(options: Options, recording: Recording) -> None:
+    sequence = recording.tracked
+    if sequence.num_cameras < 2:
+        raise ValueError(
+            f"--cameras: expected at least 2 that see the scene at once, found {list(sequence.camera_ids)}; "
+            "parts are found in space. One camera and depth: gsjax track"
+        )
+    if sequence.num_frames < 2:
+        raise ValueError(
+            f"--frames: expected 2 or more, between which something moves, found {options.frames}"
+        )
+    if options.anchor is not None and not 0 <= options.anchor < sequence.num_frames:
+        raise ValueError(
+            f"--anchor: expected one of {sequence.num_frames} frames, 0 to {sequence.num_frames - 1}, found "
+            f"{options.anchor}"
+        )
+    inside = options.scene is not None and options.out.resolve() in options.scene.resolve().parents
+    if inside and options.overwrite:
+        raise ValueError(
+            f"--scene {options.scene}: expected one outside of --out, which --overwrite replaces, found it "
+            "in there; name another --out"
+        )
+    if options.scene is not None and options.anchor is None:
+        raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
+
+
+def _segmenter(options: Options) -> Segmenter:
+    return PieceSegmenter() if options.sam is None else load_sam(options.sam)
+
+
+def _masks(
+    sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C H W"], options: Options
+) -> Int[np.ndarray, "C H W"] | None:
+    """What moves by the recording's own masks; None where a segmenter finds it."""
+    if options.masks == "segment":
+        return None
+    labels = [sequence.mask(anchor.frame, c) for c in range(sequence.num_cameras)]
+    missing = [camera for camera, mask in zip(sequence.camera_ids, labels, strict=True) if mask is None]
+    if missing:
+        raise ValueError(
+            f"--masks files: expected a mask of frame {sequence.frame_ids[anchor.frame]} for each camera, "
+            f"found none for {', '.join(map(str, missing))}; name other --cameras, or use --masks segment"
+        )
+    known = [label for label in labels if label is not None]
+    masks = masks_of_labels(np.stack(known), moved, options.parts.discover.most_parts)
+    if not masks.any():
+        raise ValueError(
+            "--masks files: expected a label of which a third of the pixels changes in other frames, found "
+            "none; use --masks segment"
+        )
+    return masks
+
+
+def _fitted(
+    options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
+) -> Path | None:
+    """The PLY file of the scene at the anchor frame; None where fitting was stopped by Ctrl-C."""
+    path = folder.path / "canonical"
+    if not RunFolder(path, overwrite=True).finished:
+        console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
+        code = run_fit(_fit_options(options, path, anchor, recording))
+        if code == 130:
+            return None
+    return _ply_of(path)
+
+
+def _ply_of(path: Path) -> Path:
+    """The PLY file itself, or that of a run of `gsjax fit`."""
+    if path.is_dir():
+        expect_run(path, "`gsjax fit`")
+        return path / "scene.ply"
+    return path
+
+
+def _read_scene(path: Path) -> Gaussians:
+    return jax.tree.map(jnp.asarray, read_ply(path)[0])
+
+
+def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Recording) -> FitOptions:
+    frame = range(recording.frames_in_data)[parse_frames(options.frames)][anchor.frame]
+    return FitOptions(
+        options.dataset,
+        path,
+        frames=f"{frame}:{frame + 1}",
+        cameras=options.cameras,
+        eval_cameras=options.eval_cameras,
+        scale=options.scale,
+        resume=is_run(path),
+        read=options.read,
+        fit=options.fit,
+    )
+
+
+def _warn_if_odd(start: Start, moved: float, options: Options, notes: Notes) -> None:
+    """Warn where parts are doubtful; `moved` is the share of pixels that change."""
+    pieces = int(start.masks.max())
+    if moved > _EVERYTHING:
+        notes.warn(
+            f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or cameras do; "
+            "what stands still is then badly known"
+        )
+    if pieces >= options.parts.discover.most_parts:
+        notes.warn(
+            f"there are more pieces that changed than --parts.discover.most-parts {pieces}; the smallest "
+            "were left out"
+        )
+    seen = [(start.masks == piece).any((1, 2)).sum() for piece in range(1, pieces + 1)]
+    alone = sum(count == 1 for count in seen)
+    if alone:
+        notes.add(f"{alone} of {pieces} pieces were seen to change by one camera only.")

@@ -1,0 +1,60 @@
+"""The verb `distill`, and the files that its result can be kept in."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.data import open_sequence, photographs_of
+from gsjax.engine.checkpoint import load, save
+from gsjax.engine.distill.file import read_field
+from gsjax.engine.verbs import distill
+from gsjax.methods.distill import DistillConfig, Teacher, teacher_of_objects
+from gsjax.scene.feature_grid import FeatureGridConfig
+from tests.cli.conftest import first_picture
+
+GRID = FeatureGridConfig(
+    levels=2, least_resolution=4, most_resolution=8, log2_entries=9, features=4, hidden=16
+)
+SMALL = DistillConfig(iterations=4, channels=8, grid=GRID, contrast_patch=4)
+
+
+@pytest.fixture(scope="module")
+def shown(pristine):
+    """A scene, and the photographs of it."""
+    sequence = open_sequence(str(pristine)).select(frames=slice(0, 1))
+    return jax.tree.map(jnp.asarray, first_picture(pristine)[0]), photographs_of(sequence)
+
+
+def test_a_scene_and_photographs_make_a_field_that_answers_and_goes_on(shown, tmp_path):
+    scene, photographs = shown
+    for now in distill(scene, photographs, "classes", SMALL):
+        if now.step == 2:
+            save(tmp_path / "run.npz", now)
+    scores = np.asarray(now.result.query("can"))
+    assert scores.shape == (scene.num,)
+    assert ((scores >= 0) & (scores <= 1)).all()  # against all other classes
+    before = load(tmp_path / "run.npz")
+    assert before.result.source == now.result.source
+    assert np.isfinite(before.result.query("can")).all()
+    *_, again = distill(scene, photographs, "classes", SMALL, after=before)
+    assert again.step == 4
+    np.testing.assert_array_equal(again.result.query("can"), scores)
+    now.result.write(tmp_path / "field.npz")
+    read = read_field(tmp_path / "field.npz")
+    assert (read.source, dict(read.scene)) == (now.result.source, now.result.scene)
+    for one, other in zip(read.at(scene.means), now.result.placed, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_a_teacher_of_ones_own_needs_an_encoder_for_texts_alone(shown):
+    scene, photographs = shown
+    masks = [photographs.labels(i).astype(int) for i in range(photographs.num)]
+    codes = np.eye(8, 16, dtype=np.float32)
+    teacher = teacher_of_objects(masks, [codes] * photographs.num)
+    assert isinstance(teacher, Teacher)
+    ticks = distill(scene, photographs, teacher, SMALL)
+    next(ticks)
+    assert np.isfinite(ticks.result.scores(codes[[3, 2]])).all()
+    with pytest.raises(ValueError, match="no encoder of their texts is known"):
+        ticks.result.query("can")
