@@ -39,7 +39,8 @@ class Tick:
     """A method after one more step.
 
     Attributes:
-        method: the method, with its configuration.
+        method: the method, with its configuration; the tracker, which takes frames and not steps, is none but
+            has `config` and `result` as well.
         problem: what does not change; None after `gsjax.load`.
         run: what there is to go on from. The next step takes over its arrays: copy what is to be kept.
         info: losses and diagnostics of this step by name, on the device; see `gsjax.optim.step`.
@@ -48,7 +49,7 @@ class Tick:
         progress: how far the schedule was before this step, 0 to 1.
     """
 
-    method: Method
+    method: Method | Any
     problem: Any
     run: Run
     info: dict[str, Any]

@@ -275,10 +275,10 @@ def test_a_meta_of_other_types(refused, recording, key, value, says):
 @pytest.mark.parametrize(
     ("option", "value", "says"),
     [
-        ("headroom", "0.5", "TrackConfig.headroom: expected 1 or more, found 0.5"),
-        ("start.part-size", "0", "StartConfig.part_size: expected more than 0, found 0"),
-        ("refine.iterations", "-1", "RefineConfig.iterations: expected 0 or more, found -1"),
-        ("align.spacing", "nan", "AlignConfig.spacing: expected more than 0, found nan"),
+        ("headroom", "0.5", "track.headroom: expected at least 1, found 0.5"),
+        ("start.part-size", "0", "track.start.part_size: expected more than 0, found 0"),
+        ("refine.iterations", "-1", "track.refine.iterations: expected at least 0, found -1"),
+        ("align.spacing", "nan", "track.align.spacing: expected more than 0, found nan"),
     ],
 )
 def test_settings_without_a_meaning(gsjax_track, pristine, capfd, option, value, says):
