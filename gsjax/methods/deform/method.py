@@ -155,7 +155,8 @@ class Deform:
         return self.config.warmup + self.config.iterations
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Opens the field after the warm-up, chooses the Gaussians that go on moving, and makes the graph."""
+        """Opens the field after the warm-up, chooses the Gaussians that go on moving, and makes the graph.
+        Arguments as for `Method.between`."""
         config, step = self.config, run.step
         if step == config.warmup and run.params.field is None:
             scene, moving = with_field(config, problem, run.params)
@@ -169,7 +170,7 @@ class Deform:
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
         """The frame whose turn it is: in the warm-up perhaps always the first; else all of them in a random
-        order, and then in another."""
+        order, and then in another. Arguments as for `Method.batch`."""
         if run.step < self.config.warmup and self.config.warmup_frames == "first":
             i = problem.first
         else:
@@ -190,7 +191,13 @@ class Deform:
 
 
 def batch_of(problem: Problem, run: Run, i: int) -> Batch:
-    """What a step on frame `i` is given."""
+    """What a step on one frame is given.
+
+    Args:
+        problem: from `Deform.start`.
+        run: before the step.
+        i: index of the frame.
+    """
     view = None
     if run.params.twists is not None:
         view = jnp.asarray(-1 if i == problem.first else i, jnp.int32)
