@@ -169,6 +169,7 @@ def step_memory_mb(method: Distill, problem: Problem, run: Run) -> float:
     given = (run.params, run.state, problem.views[0])
     lowered = advance.lower(*given, step=jnp.asarray(0), key=jax.random.key(0))
     needed = lowered.compile().memory_analysis()
+    assert needed is not None
     return (needed.argument_size_in_bytes + needed.temp_size_in_bytes) / 2**20
 
 

@@ -205,7 +205,13 @@ def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes:
 
 
 def save_run(folder: Path, run: Run, progress: Progress) -> None:
-    """Writes a checkpoint; the newest few are kept."""
+    """Writes a checkpoint; the newest few are kept.
+
+    Args:
+        folder: RUN/resume.
+        run: the newest run.
+        progress: how it has gone.
+    """
     save_checkpoint(_path(folder, run.step), run, progress.metadata())
     for old in _saved(folder)[:-KEPT]:
         old.unlink()

@@ -5,7 +5,6 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.engine.fit.judge import Judge
-from gsjax.engine.fit.results import ORBIT
 from gsjax.engine.folder import RunFolder
 from gsjax.geometry.cameras import Camera, on_device
 from gsjax.geometry.paths import orbit

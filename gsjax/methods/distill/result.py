@@ -126,18 +126,17 @@ class DistillResult:
         Raises:
             ValueError, FileNotFoundError: as for `query`.
         """
-        if encoder is None:
-            if self.source is None:
-                raise ValueError(
-                    "encoder: expected one that reads texts in the space of this field's features, found "
-                    "none, and the source of the features is not known; give one, or use `scores`"
-                )
-            encoder = self.source.encoder()
-        if negatives is None:
-            negatives = () if self.source is None else self.source.negatives(text)
-        assert encoder is not None
-        texts = (text, *(negatives or ()))
-        return np.stack([encoder.embed_text(one) for one in texts]), texts[1:]
+        if encoder is None and self.source is None:
+            raise ValueError(
+                "encoder: expected one that reads texts in the space of this field's features, found none, "
+                "and the source of the features is not known; give one, or use `scores`"
+            )
+        reader: LanguageEncoder = self.source.encoder() if encoder is None else encoder
+        if negatives is not None:
+            against = tuple(negatives)
+        else:
+            against: tuple[str, ...] = () if self.source is None else tuple(self.source.negatives(text))
+        return np.stack([reader.embed_text(one) for one in (text, *against)]), against
 
     def write(self, path: str | os.PathLike) -> None:
         """Write field.npz, which `gsjax query` and `gsjax view` read beside the scene.
