@@ -191,7 +191,13 @@ class Deform:
 
 
 def batch_of(problem: Problem, run: Run, i: int) -> Batch:
-    """What a step of a run on frame `i` is given."""
+    """What a step on one frame is given.
+
+    Args:
+        problem: from `Deform.start`.
+        run: before the step.
+        i: index of the frame.
+    """
     view = None
     if run.params.twists is not None:
         view = jnp.asarray(-1 if i == problem.first else i, jnp.int32)

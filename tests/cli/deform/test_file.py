@@ -116,7 +116,7 @@ def test_a_file_of_the_version_before_is_refused(tmp_path, monkeypatch):
             "indices: ",
         ),
         (lambda r: replace(r, meaning=replace(r.meaning, names=("tissue",))), "a code for each name"),
-        (lambda r: replace(r, meaning=replace(r.meaning, basis=np.eye(5, 4))), "a code for each name"),
+        (lambda r: replace(r, meaning=_wider(r.meaning)), "a code for each name"),
         (lambda r: replace(r, scene=DeformingScene(_bare(r.scene.gaussians))), "a code for each name"),
         (lambda r: _with(r, held_out=np.array([1, 4])), "held-out frames of these"),
         (lambda r: _with(r, size=(64, 0)), "a size of pictures"),
@@ -137,6 +137,10 @@ def _with_nan(scene):
 
 def _out_of_range(nodes):
     return nodes._replace(indices=nodes.indices.at[0, 0].set(99))
+
+
+def _wider(meaning):
+    return replace(meaning, codebook=np.eye(2, 4), basis=np.eye(5, 4))
 
 
 def _bare(gaussians):

@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from gsjax.data import DataError, DataWarning, open_photographs, open_sequence
+from gsjax.data.ordered import sequence_of
 from gsjax.engine.deform.depth import with_depth
 from gsjax.engine.messages import Notes
 from gsjax.io.video import VideoWriter
