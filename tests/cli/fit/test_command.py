@@ -46,7 +46,7 @@ def gsjax_fit(photographs, tmp_path, capfd):
 def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, tmp_path, monkeypatch):
     code, said = gsjax_fit(*QUICK)
     assert code == 0, said
-    assert "of 10 listed photographs 1 that have no file (images/lost.png)" in said
+    assert "of 10 listed photographs, 1 with no file (images/lost.png)" in said
     assert "held out" in said
     run = tmp_path / "run"
     found = json.loads((run / "metrics.json").read_text())

@@ -19,7 +19,7 @@ def test_photographs_are_described_and_what_is_missing_is_counted(photographs, c
     assert "9: images/00.png to images/22.png" in out
     assert "48 x 36" in out
     assert "points" in out
-    assert "of 10 listed photographs 1 that have no file" in err
+    assert "of 10 listed photographs, 1 with no file" in err
 
 
 def test_what_a_layout_leaves_open_is_asked_for_and_taken(tmp_path, capfd):
