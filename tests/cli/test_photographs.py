@@ -24,7 +24,7 @@ def test_frames_and_cameras_of_a_recording():
     assert small.sizes.tolist() == [[16, 12]] * 3
 
 
-@pytest.mark.filterwarnings("ignore:.*have no file")
+@pytest.mark.filterwarnings("ignore:.*with no file")
 def test_some_of_photographs(photographs):
     assert choose_photographs(str(photographs)).num == 9
     assert choose_photographs(str(photographs), frames="1:8:3").names == tuple(
