@@ -26,6 +26,7 @@ NOT_RUN = {
     "docs/experiments.md": 1,
     "docs/from-gsplat.md": 1,
     "docs/many-devices.md": 1,
+    "docs/parts.md": 1,
     "docs/scores.md": 2,
     "docs/semantics.md": 1,
     "docs/view.md": 2,
@@ -41,7 +42,7 @@ def test_what_is_not_run_says_why():
     assert Counter(block.page for block in kept) == Counter(NOT_RUN)
 
 
-LONG = ("composition", "deform", "fields", "fit", "howto/loss", "howto/step", "rasterizer", "semantics")
+LONG = ("composition", "deform", "distill", "fit", "howto/loss", "howto/step", "rasterizer", "semantics")
 SLOW = {f"docs/{page}.md" for page in LONG}
 """Of these pages, tests of methods and commands run the calls as well."""
 PROGRAMS = [
