@@ -20,7 +20,7 @@ from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
-from gsjax.methods.fit import Fit, FitConfig
+from gsjax.methods.fit import Fit, FitConfig, without_needless
 from gsjax.methods.parts import Parts, PartsConfig, begin, choose_anchor, moved_pixels
 from gsjax.methods.parts.pictures import problem_of
 from gsjax.methods.protocols import Segmenter
@@ -182,7 +182,7 @@ def parts(
             nothing is found that moves.
         DataError: a picture cannot be read.
     """
-    from gsjax.engine.parts.start import FIT, without_needless
+    from gsjax.engine.parts.start import FIT
     from gsjax.perception.segmenters import PieceSegmenter  # slow to import
 
     method = Parts(PartsConfig() if config is None else config, extra_losses)
@@ -202,7 +202,7 @@ def parts(
         fitting = fit(photographs, FIT)
         for _ in fitting:
             pass
-        gaussians = without_needless(photographs, fitting.result, FIT)
+        gaussians, _ = without_needless(fitting.result, fitting.problem.frames, FIT)
     segmenter, key = segmenter or PieceSegmenter(), jax.random.key(config.seed)
     start = begin(tracked, gaussians, chosen, moved, config, segmenter, key)
     problem, run = method.start(tracked, start)

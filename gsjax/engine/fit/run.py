@@ -8,7 +8,6 @@ from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 
 from gsjax.engine.drive import Drive, drive
@@ -29,10 +28,10 @@ from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.fit import Fit, FitConfig, Model, Problem, as_found, light_of, needed
+from gsjax.methods.fit import Fit, FitConfig, Model, Problem, as_found, without_needless
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
-from gsjax.scene.gaussians import Gaussians, take
+from gsjax.scene.gaussians import Gaussians
 
 JUDGED_AT_MOST = 4
 """Held-out views that are looked at while the fit goes on."""
@@ -110,7 +109,9 @@ def run(options: Options) -> int:
         light, scores = None, Scores([])
         if finished:  # who pressed Ctrl-C does not wait for this
             with aside("pruning", "leaving out what no photograph needs"):
-                gaussians, light = without_needless(found_frames, config, gaussians, notes)
+                before = gaussians.num
+                gaussians, light = without_needless(gaussians, found_frames, config)
+                _note_pruning(before, gaussians.num, config, notes)
         write_ply(folder.scene, gaussians)
         with aside("scores", "scoring held-out photographs"):
             shown = judged or [(photographs.names[i], frames[i]) for i in chosen[:1]]
@@ -247,22 +248,7 @@ def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], mode
     write_npz(folder.path / "cameras.npz", found)
 
 
-def without_needless(
-    frames: list[Frame], config: FitConfig, gaussians: Gaussians, notes: Notes
-) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
-    """Those that some photograph needs, and the light that each sends.
-
-    Args:
-        frames: the photographs that were fitted.
-        config: how; its `prune` is the share of light below which one is not needed.
-        gaussians: the scene.
-        notes: told how many were left out.
-    """
-    if not gaussians.num:
-        return gaussians, np.zeros(0)
-    light = light_of(gaussians, frames, "antialiased" if config.antialiased else "classic")
-    kept = needed(light, config.prune) if config.prune else np.ones(len(light), bool)
-    if not kept.all():
-        some = f"{(~kept).sum():,} of {gaussians.num:,} Gaussians were left out in the end"
+def _note_pruning(before: int, after: int, config: FitConfig, notes: Notes) -> None:
+    if after < before:
+        some = f"{before - after:,} of {before:,} Gaussians were left out in the end"
         notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")
-    return take(gaussians, kept), light[kept]

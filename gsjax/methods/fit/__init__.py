@@ -20,7 +20,7 @@ from gsjax.methods.fit.config import (
 )
 from gsjax.methods.fit.method import Fit, Problem, as_found
 from gsjax.methods.fit.model import Model
-from gsjax.methods.fit.pruning import light_of, needed
+from gsjax.methods.fit.pruning import light_of, needed, without_needless
 from gsjax.methods.fit.start import Extent, extent_of
 from gsjax.methods.fit.update import Batch, fit_loss, grow
 from gsjax.methods.fit.update import fit_step as step
@@ -44,4 +44,5 @@ __all__ = [
     "light_of",
     "needed",
     "step",
+    "without_needless",
 ]

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gsjax.geometry.cameras import Camera, on_device
+from gsjax.methods.fit.config import FitConfig
 from gsjax.optim.compiler import host_options
 from gsjax.rasterize.plan import HEADROOM, Plan, with_room
 from gsjax.scene.frame import Frame
-from gsjax.scene.gaussians import Gaussians
+from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
 
@@ -28,6 +29,23 @@ def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]
         False  # sums of maxima: no view has more
     )
     return kept
+
+
+def without_needless(
+    gaussians: Gaussians, frames: list[Frame], config: FitConfig
+) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
+    """The Gaussians that some photograph needs, and the light that each of them sends.
+
+    Args:
+        gaussians: the scene.
+        frames: the photographs that were fitted, of one camera each.
+        config: settings of the fit; with `prune` 0 all Gaussians are kept.
+    """
+    if not gaussians.num:
+        return gaussians, np.zeros(0)
+    light = light_of(gaussians, frames, "antialiased" if config.antialiased else "classic")
+    kept = needed(light, config.prune) if config.prune else np.ones(len(light), bool)
+    return take(gaussians, kept), light[kept]
 
 
 def light_of(
