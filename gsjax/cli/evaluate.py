@@ -10,8 +10,6 @@ import tyro
 from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table as Grid
-from rich.text import Text
 
 from gsjax.data.errors import DataError
 from gsjax.data.photographs import Photographs
@@ -23,9 +21,10 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import Common
 from gsjax.engine.photographs import photographs_of_run, read_frames, split
 from gsjax.engine.records import EVALUATION, Record, digest, read_record
-from gsjax.engine.report import Media, Table, format_number, write_report
+from gsjax.engine.report import write_report
 from gsjax.engine.scores import mean_scores
-from gsjax.engine.tables import Column
+from gsjax.engine.summary import Card, Column, Media, Summary, Table
+from gsjax.engine.terminal import print_summary
 from gsjax.io.atomic import write_json
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import FitConfig
@@ -54,7 +53,7 @@ _PER_PHOTOGRAPH = {"exposure": "an exposure", "refine_poses": "a pose"}
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax eval` is told."""
+    """Options of `gsjax eval`."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder of a run of `gsjax fit`, finished or stopped."""
@@ -120,9 +119,10 @@ def run(options: Options) -> int:
                 "machine": describe_machine(),
                 "notes": notes.all,
             }
-            _write_page(new, record, found)
+            summary = _summarize(new, record, found)
+            write_report(new / "report.html", summary)
             write_json(new / EVALUATION.name, found)
-    _print(found, folder)
+    print_summary(summary, folder / "report.html", notes=True)
     return 0
 
 
@@ -237,67 +237,33 @@ def _say_what_is_missing(
         )
 
 
-def _write_page(folder: Path, record: Record, found: dict[str, Any]) -> None:
-    """Writes report.html."""
-    rows, cards = found["views"], {}
-    for kind, means in found["mean"].items():
-        for column in COLUMNS:
-            if means[column.key] is not None:
-                value = format_number(means[column.key], column.decimals)
-                cards[f"{column.head}, {kind}"] = (value, column.unit)
-    shown = _shown(rows)
-    several = len(found["mean"]) > 1
+def _summarize(folder: Path, record: Record, found: dict[str, Any]) -> Summary:
+    """The summary of an evaluation, whose pictures lie in `folder`."""
+    rows, means = found["views"], found["mean"]
     every = max(1, -(-len(rows) // _PICTURES))
-    write_report(
-        folder / "report.html",
+    split = [Column("split", "split")] if len(means) > 1 else []
+    return Summary(
         title=f"Scores of {record.path.resolve().name}",
         subtitle=f"{found['dataset']}: {len(rows)} views, {found['num_gaussians']:,} Gaussians"
         + ("" if found["complete"] else ", of a run that was not finished"),
-        summary=cards,
-        strips=[Media(folder / row["picture"], f"{row['view']}, {row['split']}") for row in rows[::every]],
+        cards=[
+            Card(f"{column.head}, {kind}", values[column.key], column.unit, column.decimals)
+            for kind, values in means.items()
+            for column in COLUMNS
+            if values[column.key] is not None
+        ],
         tables=[
             Table(
                 "Scores",
-                ("view", *([""] if several else []), *(column.head for column in shown)),
-                [
-                    [
-                        row["view"],
-                        *([row["split"]] if several else []),
-                        *(row[column.key] for column in shown),
-                    ]
-                    for row in rows
+                [Column("view", "view"), *split, *COLUMNS],
+                rows,
+                means=[
+                    values | {"view": f"mean of {sum(row['split'] == kind for row in rows)} {kind}"}
+                    for kind, values in means.items()
                 ],
-                ("", *([""] if several else []), *(column.unit for column in shown)),
-                decimals=(None, *([None] if several else []), *(column.decimals for column in shown)),
+                brief=True,
             )
         ],
+        strips=[Media(folder / row["picture"], f"{row['view']}, {row['split']}") for row in rows[::every]],
         notes=[*found["notes"], f"Machine: {in_words(found['machine'])}."],
     )
-
-
-def _shown(rows: list[dict[str, Any]]) -> list[Column]:
-    """The columns in which something stands."""
-    return [column for column in COLUMNS if any(row[column.key] is not None for row in rows)]
-
-
-def _print(found: dict[str, Any], folder: Path) -> None:
-    """The table, the means below it, and what is absent."""
-    console, rows = Console(highlight=False), found["views"]
-    grid, shown = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold"), _shown(rows)
-    grid.add_column("view")
-    for column in shown:
-        grid.add_column(
-            f"{column.head} [dim]{column.unit}[/]" if column.unit else column.head, justify="right"
-        )
-    for kind, means in found["mean"].items():
-        for row in (row for row in rows if row["split"] == kind):
-            grid.add_row(Text(row["view"]), *(format_number(row[c.key], c.decimals) for c in shown))
-        numbers = (format_number(means[c.key], c.decimals) for c in shown)
-        count = sum(row["split"] == kind for row in rows)
-        grid.add_row(f"mean of {count} {kind}", *numbers, style="bold", end_section=True)
-    console.print()
-    console.print(grid)
-    for note in found["notes"]:
-        console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
-    console.print(f"[bold]scores[/]  {folder / 'metrics.json'}", soft_wrap=True)
-    console.print(f"[bold]report[/]  {folder / 'report.html'}", soft_wrap=True)

@@ -31,11 +31,11 @@ from gsjax.engine.recording import (
     located,
     warn_of_missing,
 )
-from gsjax.engine.report import format_number
 from gsjax.engine.scores import Scores
+from gsjax.engine.summary import Media, format_number
 from gsjax.engine.track.loop import Tracking, begin, follow
 from gsjax.engine.track.outputs import write_first_mask, write_plots, write_tracking
-from gsjax.engine.track.results import print_results, write_results
+from gsjax.engine.track.results import summarize
 from gsjax.engine.track.resume import Saver, load
 from gsjax.engine.track.scoring import (
     budget_metrics,
@@ -108,13 +108,12 @@ def run(options: Options) -> int:
         seconds |= _seconds(tracking)
         write_tracking(folder, tracking, recording.tracked.times)
         _say_if_stopped(tracking, recording, notes)
-        found, report, failed = _judge(
+        found, media, failed = _judge(
             folder, tracking, recording, mask, seconds, notes, console, options.budget_ms
         )
         seconds["total"] = perf_counter() - begun
         found |= {"seconds": seconds, "notes": notes.all}
-        finish(folder, found, partial(write_results, **report))
-    print_results(folder, found)
+        finish(folder, found, partial(summarize, **media))
     return exit_code(tracking.stopped or failed)
 
 
@@ -168,12 +167,12 @@ def _judge(
     notes: Notes,
     console: Console,
     budget_ms: float | None,
-) -> tuple[dict[str, Any], dict[str, Any], Exception | None]:
+) -> tuple[dict[str, Any], dict[str, list[Media]], Exception | None]:
     """Render and score what was tracked. Ctrl-C or an error ends it; what was scored until then counts.
 
     Returns:
-        What metrics.json holds but for seconds and notes, what the report shows beside it, and what ended
-        the scoring early, or None.
+        metrics.json but for seconds and notes; the plots and images of the report; and what ended the scoring
+        early, or None.
     """
     begun = perf_counter()
     values = group_values(tracking, mask, recording)
@@ -197,11 +196,11 @@ def _judge(
     found = _what_ran(tracking, recording, mask, scores, budget_ms)
     found |= metrics(tracking, recording, mask, scores, motion, values)
     _note_what_is_missing(found, tracking, recording, mask, values, notes)
-    report = {
+    media = {
         "plots": write_plots(folder, tracking, recording, scores, motion, names, colors),
-        "first_mask": write_first_mask(folder, recording, mask),
+        "images": write_first_mask(folder, recording, mask),
     }
-    return found, report, failed
+    return found, media, failed
 
 
 def _budget(tracking: Tracking, budget_ms: float | None) -> dict[str, Any] | None:

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as Grid
-
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import reason
+from gsjax.engine.report import write_report
+from gsjax.engine.summary import Summary
+from gsjax.engine.terminal import print_summary
 
 
 def ended(stopped: BaseException | None, *, report: bool = True) -> dict[str, Any]:
@@ -22,36 +22,22 @@ def ended(stopped: BaseException | None, *, report: bool = True) -> dict[str, An
 
 
 def finish(
-    folder: RunFolder, found: dict[str, Any], write_results: Callable[[RunFolder, dict[str, Any]], None]
+    folder: RunFolder, found: dict[str, Any], summarize: Callable[[RunFolder, dict[str, Any]], Summary]
 ) -> None:
-    """Writes metrics.json, then the report, by which a run is finished; one that is complete keeps nothing to
-    go on from.
+    """Write metrics.json, then the report, by which a run is finished, and print the summary. A run that is
+    complete keeps nothing to resume from.
 
     Args:
         folder: of the run.
         found: what metrics.json holds.
-        write_results: writes plots and report.html.
+        summarize: folder, metrics -> the summary; it may draw plots into the folder.
     """
     folder.write_metrics(found)
-    write_results(folder, found)
+    summary = summarize(folder, found)
+    write_report(folder.report, summary)
     if found["complete"]:
         folder.forget_resume()
-
-
-def print_grid(folder: RunFolder, found: dict[str, Any], grid: Grid) -> None:
-    """The run in a few lines, on stdout: those of the grid, whether it was stopped, where the report is.
-
-    Args:
-        folder: of the run.
-        found: what metrics.json holds.
-        grid: a row each, its head in bold.
-    """
-    if not found["complete"]:
-        grid.add_row("[bold]stopped[/]", "[bold yellow]partial run; go on with --resume[/]")
-    console = Console(highlight=False)
-    console.print()
-    console.print(grid)
-    console.print(f"[bold]report[/]  {folder.report}", soft_wrap=True)
+    print_summary(summary, folder.report)
 
 
 def exit_code(stopped: BaseException | None) -> int:

@@ -1,14 +1,13 @@
-"""report.html: a run on one page that needs no network, no script and no file beside it."""
+"""report.html: a summary on one page that needs no network, no script and no file beside it."""
 
 import base64
 import html
-import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from gsjax.engine.summary import ARROWS, Card, Media, Summary, Table, format_number
 from gsjax.io.atomic import atomic_write
 
 _MIME = {
@@ -23,90 +22,29 @@ _MIME = {
 }
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of the report.
-
-    Attributes:
-        title: stands above it.
-        columns: heads; the first column names the row.
-        rows: cells of each row: text, numbers, or None where there is nothing to say.
-        units: one a column, "" for none; shown small below the heads.
-        decimals: one a column: digits behind the point of its fractions, None for three digits in all.
-        note: a line below the table.
-        best: (row, column) of cells that stand out.
-        colors: one a row, RGB 0 to 255: that in which videos show what the row is about; none if empty.
-    """
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    units: Sequence[str] = ()
-    note: str = ""
-    decimals: Sequence[int | None] = ()
-    best: Collection[tuple[int, int]] = ()
-    colors: Sequence[tuple[int, int, int]] = ()
-
-    def __post_init__(self):
-        width = len(self.columns)
-        if self.units and len(self.units) != width:
-            raise ValueError(f"Table {self.title!r}: {len(self.units)} units for {width} columns")
-        if self.decimals and len(self.decimals) != width:
-            raise ValueError(f"Table {self.title!r}: {len(self.decimals)} decimals for {width} columns")
-        if self.colors and len(self.colors) != len(self.rows):
-            raise ValueError(f"Table {self.title!r}: {len(self.colors)} colors for {len(self.rows)} rows")
-        for i, row in enumerate(self.rows):
-            if len(row) != width:
-                raise ValueError(f"Table {self.title!r}: {len(row)} cells in row {i} for {width} columns")
-
-
-@dataclass(frozen=True)
-class Media:
-    """An image, video or plot to embed, and what it shows."""
-
-    path: str | Path
-    caption: str = ""
-
-
-def write_report(
-    path: str | Path,
-    *,
-    title: str,
-    summary: Mapping[str, Any],
-    subtitle: str = "",
-    tables: Sequence[Table] = (),
-    images: Sequence[Media | str | Path] = (),
-    videos: Sequence[Media | str | Path] = (),
-    plots: Sequence[Media | str | Path] = (),
-    strips: Sequence[Media | str | Path] = (),
-    notes: Sequence[str] = (),
-) -> None:
-    """Writes a standalone page.
+def write_report(path: str | Path, summary: Summary) -> None:
+    """Write a summary as a standalone page. A medium whose file is missing is left out and noted.
 
     Args:
         path: the .html file, replaced whole.
-        title: the heading.
-        summary: headline figures, name to value or (value, unit); each becomes a card.
-        subtitle: a line below the heading: what ran on what.
-        tables, images, videos, plots: what to show; media are embedded, a plain path has no caption.
-        strips: images of several pictures side by side, one below the other.
-        notes: what was not scored and why, warnings, the machine.
-            A medium whose file is missing is left out and added here.
+        summary: what it shows.
 
     Raises:
         ValueError: a medium's suffix is none that browsers show.
     """
-    notes = list(notes)
+    notes = list(summary.notes)
     sections = [
-        _cards(summary),
-        _gallery("Videos", videos, _video, notes),
-        _gallery("Plots", plots, _image, notes),
-        "".join(map(_table, tables)),
-        _gallery("Images", images, _image, notes),
-        _gallery("Pictures", strips, _image, notes),
-        _notes(notes),
+        _cards(summary.cards),
+        _gallery("Videos", summary.videos, _video, notes),
+        _gallery("Plots", summary.plots, _image, notes),
+        "".join(_table(table) for table in summary.tables if table.rows),
+        _gallery("Images", summary.images, _image, notes),
+        _gallery("Pictures", summary.strips, _image, notes),
+        _list("Notes", map(_text, notes)),
+        _list("Next", (f"{_text(label)}: <code>{_text(command)}</code>" for label, command in summary.hints)),
     ]
-    below = f"<p>{_text(subtitle)}</p>" if subtitle else ""
+    title = summary.title + ("" if summary.complete else " (partial run)")
+    below = f"<p>{_text(summary.subtitle)}</p>" if summary.subtitle else ""
     head = f"<header><h1>{_text(title)}</h1>{below}</header>"
     style = resources.files("gsjax.engine").joinpath("report.css").read_text(encoding="utf-8")
     page = (
@@ -121,90 +59,62 @@ def write_report(
         temporary.write_text(page, encoding="utf-8")
 
 
-def format_number(value: Any, decimals: int | None = None) -> str:
-    """A cell's text: three digits for fractions, thin spaces between thousands, a dash for nothing.
-
-    With `decimals`, fractions have that many digits behind the point, so that a column lines up.
-    """
-    if value is None:
-        return "–"
-    if isinstance(value, (str, bool)):
-        return str(value)
-    if isinstance(value, int) or (hasattr(value, "dtype") and value.dtype.kind in "iu"):
-        return f"{int(value):,}".replace(",", "\u202f")
-    value = float(value)
-    if not math.isfinite(value):
-        return "–"
-    if decimals is not None:
-        value = round(value, decimals) + 0.0  # no minus before a zero
-        return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.2e}".replace("-", "−")
-    decimals = 0 if value == 0 else max(0, 2 - math.floor(math.log10(abs(value))))
-    return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
-
-
 def _text(value: Any) -> str:
     return html.escape(str(value))
 
 
-def _cards(summary: Mapping[str, Any]) -> str:
-    cards = []
-    for name, entry in summary.items():
-        value, unit = entry if isinstance(entry, tuple) else (entry, "")
-        unit = f"<small>{_text(unit)}</small>" if unit else ""
-        cards.append(f"<div><dt>{_text(name)}</dt><dd>{_text(format_number(value))}{unit}</dd></div>")
-    return f'<dl class="cards">{"".join(cards)}</dl>' if cards else ""
+def _cards(cards: Sequence[Card]) -> str:
+    drawn = []
+    for card in cards:
+        unit = f"<small>{_text(card.unit)}</small>" if card.unit else ""
+        drawn.append(f"<div><dt>{_text(card.head)}</dt><dd>{_text(card.text)}{unit}</dd></div>")
+    return f'<dl class="cards">{"".join(drawn)}</dl>' if drawn else ""
 
 
 def _table(table: Table) -> str:
-    numeric = [
-        any(not isinstance(row[i], str) and row[i] is not None for row in table.rows)
-        for i in range(len(table.columns))
-    ]
-
-    def cells(values: Sequence[str], tag: str, row: int | None = None) -> str:
-        kinds = [
-            " ".join(name for name, holds in (("number", n), ("best", (row, i) in table.best)) if holds)
-            for i, n in enumerate(numeric)
-        ]
-        kinds = [f' class="{kind}"' if kind else "" for kind in kinds]
-        return "".join(f"<{tag}{k}>{v}</{tag}>" for k, v in zip(kinds, values, strict=True))
-
-    units = table.units or [""] * len(table.columns)
+    columns = table.shown
+    numeric = ["number" if table.is_numeric(column) else "" for column in columns]
     heads = [
-        _text(name) + (f"<small>{_text(unit)}</small>" if unit else "")
-        for name, unit in zip(table.columns, units, strict=True)
+        _text(column.head + ARROWS[column.better])
+        + (f"<small>{_text(column.unit)}</small>" if column.unit else "")
+        for column in columns
     ]
-    decimals = table.decimals or [None] * len(table.columns)
-    texts = [[_text(format_number(v, d)) for v, d in zip(row, decimals, strict=True)] for row in table.rows]
-    for row, color in zip(texts, table.colors, strict=False):
-        row[0] = f'<i class="swatch" style="background: rgb{color}"></i>{row[0]}'
-    body = "".join(f"<tr>{cells(row, 'td', i)}</tr>" for i, row in enumerate(texts))
+
+    def line(texts: Iterable[str], tag: str, row: int | None = None) -> str:
+        kinds = (
+            " ".join(filter(None, (number, "best" if (row, column.key) in table.best else "")))
+            for number, column in zip(numeric, columns, strict=True)
+        )
+        classes = (f' class="{kind}"' if kind else "" for kind in kinds)
+        return "".join(f"<{tag}{kind}>{text}</{tag}>" for kind, text in zip(classes, texts, strict=True))
+
+    def texts(row: Mapping[str, Any]) -> list[str]:
+        return [_text(format_number(row.get(column.key), column.decimals)) for column in columns]
+
+    body = ""
+    for i, row in enumerate(table.rows):
+        cells = texts(row)
+        if table.colors:
+            cells[0] = f'<i class="swatch" style="background: rgb{table.colors[i]}"></i>{cells[0]}'
+        body += f"<tr>{line(cells, 'td', i)}</tr>"
+    body += "".join(f'<tr class="mean">{line(texts(row), "td")}</tr>' for row in table.means)
     note = f'<p class="note">{_text(table.note)}</p>' if table.note else ""
     return (
         f'<section><h2>{_text(table.title)}</h2><div class="scroll"><table>'
-        f"<thead><tr>{cells(heads, 'th')}</tr></thead><tbody>{body}</tbody></table></div>{note}</section>"
+        f"<thead><tr>{line(heads, 'th')}</tr></thead><tbody>{body}</tbody></table></div>{note}</section>"
     )
 
 
-def _gallery(
-    title: str,
-    media: Sequence[Media | str | Path],
-    element: Callable[[str, str], str],
-    notes: list[str],
-) -> str:
+def _gallery(title: str, media: Sequence[Media], element: Callable[[str, str], str], notes: list[str]) -> str:
     """The media whose files exist; the others are named in `notes`."""
     figures = []
-    for item in media:
-        item = item if isinstance(item, Media) else Media(item)
-        file = Path(item.path)
-        if not file.is_file():
-            notes.append(f"{title}: {file.name} was not written.")
+    for path, caption in media:
+        if not path.is_file():
+            notes.append(f"{title}: {path.name} was not written.")
             continue
-        shown = element(_data_uri(file), item.caption or file.stem.replace("_", " "))
-        caption = f"<figcaption>{_text(item.caption)}</figcaption>" if item.caption else ""
-        figures.append(f"<figure>{shown}{caption}</figure>")
+        shown = element(_data_uri(path), caption or path.stem.replace("_", " "))
+        below = f"<figcaption>{_text(caption)}</figcaption>" if caption else ""
+        figures.append(f"<figure>{shown}{below}</figure>")
     if not figures:
         return ""
     return f'<section><h2>{title}</h2><div class="gallery {title.lower()}">{"".join(figures)}</div></section>'
@@ -225,8 +135,6 @@ def _data_uri(file: Path) -> str:
     return f"data:{mime};base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
-def _notes(notes: Sequence[str]) -> str:
-    if not notes:
-        return ""
-    items = "".join(f"<li>{_text(note)}</li>" for note in notes)
-    return f'<section class="notes"><h2>Notes</h2><ul>{items}</ul></section>'
+def _list(title: str, lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{line}</li>" for line in lines)
+    return f'<section class="notes"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.engine.tables import Column
+from gsjax.engine.summary import Column
 from gsjax.engine.views import View
 from gsjax.metrics.image import depth_error, psnr, ssim
 from gsjax.metrics.segmentation import LabelOverlap

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.engine.compare.aspects import ASPECTS, Aspect, data_in_words, data_of
+from gsjax.engine.compare.data import SCORES, data_in_words, data_of
 from gsjax.engine.machine import name as machine_name
 from gsjax.engine.records import Kind, Record
-from gsjax.engine.report import format_number
+from gsjax.engine.summary import Score, format_number
 
 _NOT_COMPARED = (
     "out",
@@ -22,7 +22,7 @@ _NOT_COMPARED = (
 )  # settings that say nothing of a result
 
 
-_OF_VIEWS = [aspect.key for aspect in ASPECTS["fit"] if aspect.of == "views"]
+_OF_VIEWS = [score.key for score in SCORES["fit"] if score.of == "views"]
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Group:
         dataset: its name.
         labels: of the runs.
         views: held-out views that all of them were judged by; their scores are means over these.
-        best: of each aspect, the runs that are best; an aspect that cannot be compared is not there.
+        best: the runs that are best by each score; one that cannot be compared is missing.
     """
 
     dataset: str
@@ -49,7 +49,7 @@ class Comparison:
     Attributes:
         kind: the command whose runs these are.
         records: the runs, by their labels, group by group.
-        scores: of each run, by the keys of `ASPECTS`; what is not known is None.
+        scores: of each run, by the keys of `SCORES`; None where it is not known.
         groups: runs that can be compared with each other.
         options: settings that all runs have, and not the same, of each run.
         notes: what was not compared, and why.
@@ -63,9 +63,9 @@ class Comparison:
     notes: list[str]
 
     @property
-    def aspects(self) -> list[Aspect]:
-        """Those of which any run has something."""
-        return [a for a in ASPECTS[self.kind] if any(s[a.key] is not None for s in self.scores.values())]
+    def shown(self) -> list[Score]:
+        """The scores that any run has."""
+        return [a for a in SCORES[self.kind] if any(s[a.key] is not None for s in self.scores.values())]
 
 
 def compare(records: Sequence[Record], same_views: Callable[[list[Record], str], bool]) -> Comparison:
@@ -100,10 +100,10 @@ def compare(records: Sequence[Record], same_views: Callable[[list[Record], str],
             comparable = _comparable_fits(members, group.views, notes)
         else:
             scores |= {label: _scores(record) for label, record in members.items()}
-            comparable = {aspect.key for aspect in ASPECTS[kind]}
+            comparable = {score.key for score in SCORES[kind]}
         if len(members) > 1 and len({_machine(record) for record in members.values()} - {None}) > 1:
             notes.append(f"{', '.join(members)}: run on different machines; time is not compared.")
-            comparable -= {aspect.key for aspect in ASPECTS[kind] if aspect.of == "machine"}
+            comparable -= {score.key for score in SCORES[kind] if score.of == "machine"}
         group.best = _best(kind, members, scores, comparable)
     for label, record in labelled.items():
         if not record.complete:
@@ -224,7 +224,7 @@ def _is_known(value: Any) -> bool:
 
 def _comparable_fits(members: Mapping[str, Record], views: list[str], notes: list[str]) -> set[str]:
     """Keys of the aspects in which these runs can be compared."""
-    keys = {aspect.key for aspect in ASPECTS["fit"] if views or aspect.of != "views"}
+    keys = {score.key for score in SCORES["fit"] if views or score.of != "views"}
     weights = {
         label: (record.evaluation or {}).get("lpips", {}).get("weights") for label, record in members.items()
     }
@@ -252,7 +252,7 @@ def _what_eval_adds(records: Mapping[str, Record]) -> list[str]:
 def _scores(record: Record) -> dict[str, float | None]:
     """Of a run of any other kind."""
     found = record.metrics
-    return {a.key: None if found is None else a.value(found) for a in ASPECTS[record.kind]}
+    return {a.key: None if found is None else a.value(found) for a in SCORES[record.kind]}
 
 
 def _machine(record: Record) -> str | None:
@@ -262,18 +262,18 @@ def _machine(record: Record) -> str | None:
 def _best(
     kind: Kind, members: Mapping[str, Record], scores: Mapping[str, Mapping[str, Any]], comparable: set[str]
 ) -> dict[str, list[str]]:
-    """Of each aspect, the finished runs that are best as far as the digits shown tell; none where all are."""
+    """By each score, the finished runs that are best as far as the digits shown tell; none where all are."""
     best = {}
-    for aspect in ASPECTS[kind]:
-        if aspect.better is None or aspect.key not in comparable:
+    for score in SCORES[kind]:
+        if score.better is None or score.key not in comparable:
             continue
-        values = {label: scores[label][aspect.key] for label, record in members.items() if record.complete}
+        values = {label: scores[label][score.key] for label, record in members.items() if record.complete}
         values = {label: value for label, value in values.items() if value is not None}
-        texts = {label: format_number(value, aspect.decimals) for label, value in values.items()}
+        texts = {label: format_number(value, score.decimals) for label, value in values.items()}
         if len({*texts.values()}) > 1:
-            pick = max if aspect.better == "more" else min
+            pick = max if score.better == "more" else min
             winner = pick(values, key=lambda label: values[label])
-            best[aspect.key] = [label for label, text in texts.items() if text == texts[winner]]
+            best[score.key] = [label for label, text in texts.items() if text == texts[winner]]
     return best
 
 

@@ -19,7 +19,7 @@ from gsjax.engine.deform.data import Tools, deform_data
 from gsjax.engine.deform.depth import Depth, DepthSource, with_depth
 from gsjax.engine.deform.file import NAME, write_deformation
 from gsjax.engine.deform.poses import as_refined
-from gsjax.engine.deform.results import print_results, write_results
+from gsjax.engine.deform.results import summarize
 from gsjax.engine.deform.scores import judge
 from gsjax.engine.deform.start import NOBODY
 from gsjax.engine.distill.choice import TeacherChoice, TeacherOptions
@@ -122,8 +122,7 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        finish(folder, found, write_results)
-    print_results(folder, found)
+        finish(folder, found, summarize)
     return exit_code(progress.stopped)
 
 

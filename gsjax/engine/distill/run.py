@@ -13,7 +13,8 @@ from rich.console import Console
 from gsjax.engine.distill.cache import FeatureCache
 from gsjax.engine.distill.choice import Second, TeacherChoice, TeacherOptions
 from gsjax.engine.distill.file import FOLDER, NAME
-from gsjax.engine.distill.results import judge, print_results, write_results
+from gsjax.engine.distill.judge import judge
+from gsjax.engine.distill.results import summarize
 from gsjax.engine.distill.scene import FieldScene, SceneOptions, open_scene
 from gsjax.engine.distill.teacher import Teaching
 from gsjax.engine.drive import drive
@@ -128,8 +129,7 @@ def run(options: Options) -> int:
             **judged,
             "notes": notes.all,
         }
-        finish(folder, found, write_results)
-    print_results(folder, found)
+        finish(folder, found, summarize)
     return exit_code(progress.stopped)
 
 

@@ -12,7 +12,8 @@ from gsjax.engine.experiments.records import RESULTS
 from gsjax.engine.experiments.sweep import Experiment
 from gsjax.engine.experiments.table import Shown, remarks, tabulate
 from gsjax.engine.messages import describe, say_error
-from gsjax.engine.report import Media, Table, write_report
+from gsjax.engine.report import write_report
+from gsjax.engine.summary import Column, Media, Summary, Table
 from gsjax.io.atomic import atomic_write, write_json
 
 SHARED = ("script", "machine", "gsjax")
@@ -122,15 +123,16 @@ def _write_page(experiment: Experiment, shown: Shown, notes: list[str], drawing:
     config = experiment.config
     pairs = zip(zip(*shown.lines, strict=True), shown.numeric, strict=True)
     columns = [_aligned(column) if numeric else column for column, numeric in pairs]
-    write_report(
-        experiment.folder / "results.html",
+    heads = [Column(head, str(i)) for i, head in enumerate(shown.heads)]
+    rows = [{str(i): text for i, text in enumerate(line)} for line in zip(*columns, strict=True)]
+    summary = Summary(
         title=experiment.name,
         subtitle=f"{config.claim.strip()} Source: {config.source.strip()}",
-        summary={},
+        tables=[Table("Results", heads, rows)],
         plots=drawing,
-        tables=[Table("Results", shown.heads, list(zip(*columns, strict=True)))],
         notes=notes,
     )
+    write_report(experiment.folder / "results.html", summary)
 
 
 def _aligned(column: tuple[str, ...]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from gsjax.engine import machine
 from gsjax.engine.experiments.config import Column
 from gsjax.engine.experiments.sweep import Cell, Experiment, in_words
-from gsjax.engine.report import format_number
+from gsjax.engine.summary import format_number
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 

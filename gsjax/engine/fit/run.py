@@ -15,7 +15,7 @@ from gsjax.engine.ending import ended, exit_code, finish
 from gsjax.engine.fit.ablation import ablate
 from gsjax.engine.fit.judge import Judge, Scores
 from gsjax.engine.fit.orbit import write_orbit
-from gsjax.engine.fit.results import print_results, write_results
+from gsjax.engine.fit.results import summarize
 from gsjax.engine.fit.schedule import Budget, Looks, looks, schedule_of
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
@@ -147,8 +147,7 @@ def run(options: Options) -> int:
         }
         if board is not None:
             board.close({f"held_out/{row['view']}": folder.path / row["picture"] for row in scores.rows})
-        finish(folder, found, write_results)
-    print_results(folder, found)
+        finish(folder, found, summarize)
     return exit_code(stopped)
 
 

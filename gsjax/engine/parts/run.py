@@ -19,7 +19,8 @@ from gsjax.engine.folder import RunFolder, expect_dataset, expect_run, is_run
 from gsjax.engine.messages import Notes, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, Seeded, checked
 from gsjax.engine.parts.loop import Loop, resumed
-from gsjax.engine.parts.results import finished, print_results, write_results
+from gsjax.engine.parts.outputs import finished
+from gsjax.engine.parts.results import summarize
 from gsjax.engine.parts.start import FIT
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
@@ -127,8 +128,7 @@ def run(options: Options) -> int:
         found = finished(folder, recording, start, last, outcome, progress, seconds, notes, console)
         found["seconds"]["total"] = perf_counter() - begun
         found["notes"] = notes.all
-        finish(folder, found, write_results)
-    print_results(folder, found)
+        finish(folder, found, summarize)
     return exit_code(progress.stopped)
 
 

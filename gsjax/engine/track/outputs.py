@@ -1,13 +1,12 @@
 """What a run writes: trajectory, scene, renders, videos, plots."""
 
-from pathlib import Path
-
 import numpy as np
 from jaxtyping import Bool
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.recording import FirstMask, Recording
 from gsjax.engine.scores import Scores
+from gsjax.engine.summary import Media
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
@@ -49,14 +48,14 @@ def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarra
     return rows
 
 
-def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -> Path | None:
-    """Writes a picture of the labels that tracking started from, the only ones it ever saw."""
+def write_first_mask(folder: RunFolder, recording: Recording, mask: FirstMask) -> list[Media]:
+    """Write a picture of the labels that tracking starts from, if there are any."""
     if mask.labels is None or mask.camera is None:
-        return None
+        return []
     image = recording.tracked.image(0, recording.tracked.camera_ids.index(mask.camera))
     path = folder.plot("first_mask", ".png")
     write_png(path, overlay_labels(image, mask.labels))
-    return path
+    return [Media(path, f"The first mask, of camera {mask.camera}, from which objects start")]
 
 
 def write_plots(
@@ -67,8 +66,8 @@ def write_plots(
     motion: dict[int, ObjectScore],
     names: dict[int, str],
     colors: np.ndarray,
-) -> list[tuple[Path, str]]:
-    """Writes the plots; returns each one's path and what it shows.
+) -> list[Media]:
+    """Write the plots.
 
     Args:
         folder: of the run.
@@ -81,7 +80,7 @@ def write_plots(
     written = []
 
     def keep(name: str, figure, caption: str) -> None:
-        written.append((plots.save(figure, folder.plot(name)), caption))
+        written.append(Media(plots.save(figure, folder.plot(name)), caption))
 
     known = {names[label]: label for label in motion if label in names and motion[label].num_scored}
     if tracking.num_frames > 1:

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.engine.compare.aspects import ASPECTS
+from gsjax.engine.compare.data import SCORES
 
 MACHINE = {
     "processor": "x",
@@ -81,7 +81,7 @@ def test_two_runs_of_a_kind_stand_side_by_side(tmp_path, kind, key, better, capf
     assert found["groups"][0]["best"][key] == ["b"]
     assert found["better"][key] == better
     assert list(found["options"]) == ["scale"]
-    assert set(found["runs"][0]) >= {aspect.key for aspect in ASPECTS[kind]}
+    assert set(found["runs"][0]) >= {score.key for score in SCORES[kind]}
     assert "scale" in capfd.readouterr().out
 
 

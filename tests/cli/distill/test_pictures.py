@@ -8,7 +8,7 @@ import pytest
 
 from gsjax.engine.distill import pictures as field_pictures
 from gsjax.engine.distill import scores as field_scores
-from gsjax.engine.distill.results import draw_features, feature_colors
+from gsjax.engine.distill.judge import draw_features, feature_colors
 from gsjax.engine.distill.saved import short_names
 from gsjax.engine.distill.scores import class_maps, classes_of, one_by_one
 from gsjax.geometry.cameras import Camera

@@ -12,7 +12,7 @@ import yaml
 from gsjax.data.video import describe_video
 from gsjax.engine.parts import films
 from gsjax.engine.parts.films import shots
-from gsjax.engine.parts.results import write_parts
+from gsjax.engine.parts.outputs import write_parts
 from gsjax.engine.parts.saved import open_parts_run
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.io.video import read_video_frames

@@ -5,7 +5,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from gsjax.engine.report import Media, Table, format_number, write_report
+from gsjax.engine.report import write_report
+from gsjax.engine.summary import Card, Column, Media, Summary, Table, format_number
+from gsjax.engine.terminal import print_summary
 
 VOID = {"meta", "img", "br"}
 
@@ -33,8 +35,7 @@ class Outline(HTMLParser):
 @pytest.fixture
 def write(tmp_path):
     def written(**content):
-        options = {"title": "a run", "summary": {}} | content
-        write_report(tmp_path / "report.html", **options)
+        write_report(tmp_path / "report.html", Summary(**{"title": "a run"} | content))
         outline = Outline()
         outline.feed((tmp_path / "report.html").read_text())
         assert outline.open == []
@@ -47,9 +48,9 @@ def test_page_stands_alone_and_holds_its_media(write, tmp_path):
     for name in ("a.png", "b.mp4", "c.svg"):
         (tmp_path / name).write_bytes(name.encode() * 3)
     page = write(
-        images=[tmp_path / "a.png"],
+        images=[Media(tmp_path / "a.png")],
         videos=[Media(tmp_path / "b.mp4", "camera 0")],
-        plots=[str(tmp_path / "c.svg")],
+        plots=[Media(tmp_path / "c.svg")],
     )
     kinds = [link.split(";")[0] for link in page.links]
     assert kinds == ["data:video/mp4", "data:image/svg+xml", "data:image/png"]
@@ -61,36 +62,47 @@ def test_page_stands_alone_and_holds_its_media(write, tmp_path):
 
 
 def test_figures_tables_and_notes_are_shown(write):
-    rows = [("cup", 1.234), ("box", None)]
+    rows = [{"name": "cup", "error": 1.234}, {"name": "box", "error": None}]
+    columns = (Column("object", "name"), Column("error", "error", "mm"), Column("empty", "empty"))
     page = write(
-        summary={"Update rate": (18.24, "Hz"), "Gaussians": 48211},
-        tables=[Table("Objects", ("object", "error"), rows, units=("", "mm"), note="A note.")],
+        cards=[Card("Update rate", 18.24, "Hz"), Card("Gaussians", 48211)],
+        tables=[
+            Table("Objects", columns, rows, note="A note.", means=[{"name": "mean", "error": 1.234}]),
+            Table("Nothing in it", columns, []),
+        ],
         notes=["The robot: no truth."],
     )
     text = " ".join(page.text)
     for said in ("Update rate", "18.2", "Hz", "48\u202f211", "cup", "1.23", "–", "mm", "A note.", "truth."):
         assert said in text
+    assert "empty" not in text
+    assert "Nothing in it" not in text
 
 
 def test_text_is_escaped(write):
-    page = write(title="<script>", notes=["a < b & c"], tables=[Table("t", ("<b>",), [("<i>",)])])
+    page = write(
+        title="<script>", notes=["a < b & c"], tables=[Table("t", [Column("<b>", "k")], [{"k": "<i>"}])]
+    )
     assert {"script", "b", "i"}.isdisjoint(page.tags)
     assert "a < b & c" in page.text
 
 
 def test_cells_may_stand_out_and_strips_lie_below_each_other(write, tmp_path):
     (tmp_path / "a.png").write_bytes(b"a")
-    table = Table("Runs", ("run", "PSNR"), [("a", 20.0), ("b", 21.0)], best={(1, 1), (0, 0)})
+    rows = [{"run": "a", "psnr": 20.0}, {"run": "b", "psnr": 21.0}]
+    columns = (Column("run", "run"), Column("PSNR", "psnr", better="more"))
+    table = Table("Runs", columns, rows, best={(1, "psnr"), (0, "run")})
     page = write(tables=[table], strips=[Media(tmp_path / "a.png", "view 7")])
     assert "view 7" in page.text
     html = (tmp_path / "report.html").read_text()
     assert '<td class="best">a</td><td class="number">20.0</td>' in html
     assert '<td>b</td><td class="number best">21.0</td>' in html
     assert '<div class="gallery pictures">' in html
+    assert "PSNR ↑" in page.text
 
 
 def test_missing_media_become_a_note(write, tmp_path):
-    page = write(videos=[tmp_path / "video_7.mp4"])
+    page = write(videos=[Media(tmp_path / "video_7.mp4")])
     assert "Videos: video_7.mp4 was not written." in page.text
     assert "video" not in page.tags
 
@@ -104,17 +116,38 @@ def test_what_no_browser_shows_is_refused_and_the_old_page_stays(write, tmp_path
     (tmp_path / "scene.ply").touch()
     before = (tmp_path / "report.html").read_bytes()
     with pytest.raises(ValueError, match=r"scene\.ply: expected one of \.png"):
-        write(images=[tmp_path / "scene.ply"])
+        write(images=[Media(tmp_path / "scene.ply")])
     assert (tmp_path / "report.html").read_bytes() == before
 
 
-def test_ragged_tables_are_refused():
-    with pytest.raises(ValueError, match="1 cells in row 1 for 2 columns"):
-        Table("t", ("a", "b"), [(1, 2), (3,)])
-    with pytest.raises(ValueError, match="1 units for 2 columns"):
-        Table("t", ("a", "b"), [], units=("mm",))
+def test_tables_that_do_not_fit_together_are_refused():
+    columns = [Column("a", "a")]
     with pytest.raises(ValueError, match="2 colors for 1 rows"):
-        Table("t", ("a",), [(1,)], colors=[(0, 0, 0)] * 2)
+        Table("t", columns, [{"a": 1}], colors=[(0, 0, 0)] * 2)
+    for best in ((1, "a"), (0, "b")):
+        with pytest.raises(ValueError, match=f"no cell '{best[1]}' in row {best[0]}"):
+            Table("t", columns, [{"a": 1}], best=[best])
+
+
+def test_the_terminal_shows_what_the_report_does(capsys, tmp_path):
+    columns = (Column("object", "name"), Column("centroid error", "error", "mm", 2))
+    rows = [{"name": "cup", "error": 1.234}, {"name": "box"}]
+    summary = Summary(
+        title="a run",
+        cards=[Card("update rate", 18.24, "Hz", 2)],
+        tables=[Table("Objects", columns, rows, brief=True), Table("Time", columns, rows)],
+        notes=["A note."],
+        hints=[("view it", "gsjax view RUN")],
+        complete=False,
+    )
+    print_summary(summary, tmp_path / "report.html")
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    expected = ["cup 1.23", "box –", "update rate 18.24 Hz", "partial run; go on with --resume"]
+    assert [line for line in lines if line in expected] == expected
+    assert {"view it gsjax view RUN", f"report {tmp_path / 'report.html'}"} <= {*lines}
+    assert "A note." not in lines
+    print_summary(summary, None, notes=True, titles=True)
+    assert "A note." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,49 @@
+"""What two runs must share to be compared, and the scores by which runs of each command are."""
+
+from typing import Any
+
+from gsjax.engine.deform.results import SCORES as DEFORM
+from gsjax.engine.distill.results import SCORES as DISTILL
+from gsjax.engine.fit.results import SCORES as FIT
+from gsjax.engine.parts.results import SCORES as PARTS
+from gsjax.engine.records import Kind
+from gsjax.engine.summary import Metrics, Score
+from gsjax.engine.track.results import SCORES as TRACK
+
+SCORES: dict[Kind, tuple[Score, ...]] = {
+    "fit": FIT,
+    "track": TRACK,
+    "parts": PARTS,
+    "distill": DISTILL,
+    "deform": DEFORM,
+}
+"""The cards of each command's report."""
+
+
+def data_of(kind: Kind, found: Metrics) -> tuple[Any, ...]:
+    """What runs of the same dataset must share to be compared: the size of pictures, then the frames and
+    cameras of a recording, or the number of views or frames that were learned from and held out."""
+    if kind == "fit":
+        return tuple(found["size"])
+    if kind == "distill":
+        return (*found["size"], found["judged_by"], tuple(sorted(found["views"].items())))
+    if kind == "deform":
+        return (*found["size"], found["judged_by"], tuple(sorted(found["frames"].items())))
+    image, frames = found["image"], found["frames"]
+    cameras = tuple(found["tracked_cameras"]), tuple(found["held_out_cameras"])
+    count = frames["tracked"] if kind == "track" else frames["asked"]
+    return image["width"], image["height"], (frames["first_id"], frames["last_id"], count), cameras
+
+
+def data_in_words(dataset: str, data: tuple[Any, ...] | None) -> str:
+    """The same in words, for a note; `data` is None for a run that has no metrics yet."""
+    if data is None:
+        return dataset
+    size = f"{dataset} at {data[0]}x{data[1]}"
+    if len(data) == 2:
+        return size
+    if isinstance(data[2], str):  # what it was judged by, and how many there were
+        return f"{size}, " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in data[3])
+    (first, last, count), (tracked, held_out) = data[2:]
+    by = f", judged by {[*held_out]}" if held_out else ""
+    return f"{size}, {count} frames {first} to {last}, cameras {[*tracked]}{by}"

@@ -1,0 +1,135 @@
+"""The files of a run of `gsjax parts`: parts.npz, scene.ply, videos, and the scores of metrics.json."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gsjax.engine.ending import ended
+from gsjax.engine.folder import RunFolder
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import Notes, reason
+from gsjax.engine.parts.loop import update_seconds
+from gsjax.engine.parts.scoring import part_rows, score_parts
+from gsjax.engine.parts.views import part_views
+from gsjax.engine.pictures import Film
+from gsjax.engine.progress import Progress
+from gsjax.engine.recording import Recording
+from gsjax.engine.scores import Scores, camera_metrics
+from gsjax.geometry.rotations import quats_to_matrices
+from gsjax.io.atomic import write_npz
+from gsjax.io.ply import write_ply
+from gsjax.methods.parts import PartScene, PartsResult, Start, Trajectory
+from gsjax.optim.method import Run
+
+
+def finished(
+    folder: RunFolder,
+    recording: Recording,
+    start: Start,
+    run: Run,
+    found: PartsResult,
+    progress: Progress,
+    seconds: dict[str, float],
+    notes: Notes,
+    console: Console,
+) -> dict[str, Any]:
+    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes.
+
+    Args:
+        folder: of the run.
+        recording: its tracked cameras, and those that are only judged.
+        start: the canonical scene.
+        run: of the method, after its last step.
+        found: what it has come to.
+        progress: how that went.
+        seconds: by stage, so far.
+        notes: receive what is odd.
+        console: shows how far it is.
+    """
+    frames, kept = np.flatnonzero(found.done), run.kept
+    stopped, scene, trajectory = progress.stopped, found.scene, found.trajectory
+    complete = stopped is None
+    if stopped is not None:
+        why = reason(stopped).rstrip(".")
+        notes.add(f"This run is not complete: it was stopped after {len(frames)} frames by {why}.")
+    write_parts(folder.path / "parts.npz", scene, trajectory, found.anchor)
+    write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
+    joints, scores = found.joints(), Scores(None, None)
+    if complete:
+        colors = np.arange(scene.num_parts)
+        try:
+            with (
+                Film(folder, recording, recording.tracked.num_frames, colors) as film,
+                console.status("") as status,
+            ):
+                for frame in part_views(scene, trajectory, recording, found.blend):
+                    status.update(f"rendering and scoring frame {frame[0].t + 1} of {len(frames)}")
+                    for view in frame:
+                        scores.add(view)
+                        film.add(view)
+        except (KeyboardInterrupt, OSError) as error:
+            notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
+            progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
+    rows, against_truth = part_rows(scene, trajectory, joints), {}
+    if complete:
+        against_truth = score_parts(
+            scene, trajectory, joints, rows, recording, found.anchor, found.blend, notes
+        )
+    sequence, update_s = recording.tracked, update_seconds(progress)
+    return {
+        "kind": "parts",
+        "dataset": sequence.name,
+        **ended(progress.stopped),
+        "anchor": found.anchor,
+        "steps": run.step,
+        "frames": {
+            "followed": len(frames),
+            "asked": sequence.num_frames,
+            "first_id": sequence.frame_ids[0],
+            "last_id": sequence.frame_ids[-1],
+        },
+        "image": {"width": sequence.width, "height": sequence.height},
+        "tracked_cameras": list(sequence.camera_ids),
+        "held_out_cameras": list(recording.held_out),
+        "num_gaussians": scene.gaussians.num,
+        "movable": kept.canonical.movable.num,
+        "num_parts": scene.num_parts - 1,
+        "pieces": int(start.masks.max()),
+        "joined": kept.joined,
+        "divided": kept.divided,
+        "skipped": progress.skipped,
+        "ari": against_truth.get("ari"),
+        "true_parts": against_truth.get("true_parts"),
+        "missed": against_truth.get("missed"),
+        "parts": rows,
+        **camera_metrics(scores),
+        "update_s": {
+            "median": float(np.median(update_s)) if update_s else None,
+            "p95": float(np.percentile(update_s, 95)) if update_s else None,
+        },
+        "seconds": seconds,
+        "curve": progress.rows,
+        "machine": describe_machine(),
+    }
+
+
+def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: int) -> None:
+    """Writes parts.npz. A point x with weights w is at time t at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
+    0 is the background, which stands still. All in metres, seconds and the world's axes.
+
+    anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3], R [T,P,3,3], t [T,P,3],
+    times [T].
+    """
+    arrays = {
+        "anchor": np.array(anchor),
+        "means0": scene.gaussians.means,
+        "weights": scene.weights,
+        "labels": scene.labels,
+        "centres": scene.centers,
+        "R": quats_to_matrices(trajectory.poses.quats),
+        "t": trajectory.poses.translations,
+        "times": trajectory.times,
+    }
+    write_npz(path, {name: np.asarray(array) for name, array in arrays.items()})

@@ -1,0 +1,210 @@
+"""What a run came to, as one value: the terminal, report.html and `gsjax compare` draw the same."""
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+Metrics = Mapping[str, Any]
+"""The contents of a run's metrics.json."""
+Better = Literal["more", "less"]
+ARROWS: dict[Better | None, str] = {"more": " ↑", "less": " ↓", None: ""}
+
+
+class Column(NamedTuple):
+    """A column of a table.
+
+    Attributes:
+        head: its heading.
+        key: of the rows' values that stand in it.
+        unit: shown small below the heading.
+        decimals: digits behind the point of its fractions; None for three digits in all.
+        wide: a terminal of 80 columns has no room for it.
+        better: which of two values is better; None if neither.
+    """
+
+    head: str
+    key: str
+    unit: str = ""
+    decimals: int | None = None
+    wide: bool = False
+    better: Better | None = None
+
+
+class Score(NamedTuple):
+    """A headline figure of a method: a card of its report, and a column of `gsjax compare`.
+
+    Attributes:
+        head, key, unit, decimals, better: of its column.
+        value: metrics.json -> the number; None where there is none.
+        of: what two runs must share for it to be compared: the data, the held-out views too, or the machine
+            too.
+    """
+
+    head: str
+    key: str
+    unit: str
+    decimals: int | None
+    better: Better | None
+    value: Callable[[Metrics], Any]
+    of: Literal["data", "views", "machine"] = "data"
+
+    @property
+    def column(self) -> Column:
+        """The column of a comparison."""
+        return Column(self.head, self.key, self.unit, self.decimals, better=self.better)
+
+
+class Card(NamedTuple):
+    """A headline figure: its name, the value, the unit, and digits behind the point."""
+
+    head: str
+    value: Any
+    unit: str = ""
+    decimals: int | None = None
+
+    @property
+    def text(self) -> str:
+        """The value as it is shown, without its unit."""
+        return format_number(self.value, self.decimals)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        title: stands above it.
+        columns: all that there may be; those in which nothing stands are not drawn.
+        rows: values of each row by the columns' keys; what is missing or None is drawn as a dash.
+        note: a line below the table.
+        means: closing rows, which stand out.
+        best: (index of a row, key) of cells that stand out.
+        colors: one a row, RGB 0 to 255: that in which videos show what the row is about; none if empty.
+        brief: the terminal shows it too.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    rows: Sequence[Mapping[str, Any]]
+    note: str = ""
+    means: Sequence[Mapping[str, Any]] = ()
+    best: Collection[tuple[int, str]] = ()
+    colors: Sequence[tuple[int, int, int]] = ()
+    brief: bool = False
+
+    def __post_init__(self):
+        if self.colors and len(self.colors) != len(self.rows):
+            raise ValueError(f"Table {self.title!r}: {len(self.colors)} colors for {len(self.rows)} rows")
+        keys = {column.key for column in self.columns}
+        for row, key in self.best:
+            if key not in keys or not 0 <= row < len(self.rows):
+                raise ValueError(f"Table {self.title!r}: no cell {key!r} in row {row}")
+
+    @property
+    def shown(self) -> list[Column]:
+        """The columns in which something stands."""
+        return [c for c in self.columns if any(row.get(c.key) is not None for row in self.rows)]
+
+    def is_numeric(self, column: Column) -> bool:
+        """Whether a column holds anything but text."""
+        values = (row.get(column.key) for row in self.rows)
+        return any(value is not None and not isinstance(value, str) for value in values)
+
+
+class Media(NamedTuple):
+    """An image, video or plot to embed, and its caption."""
+
+    path: Path
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run, or a comparison of runs, came to.
+
+    Attributes:
+        title: what was made of which data.
+        subtitle: how, and with how much.
+        cards: headline figures.
+        tables: figures in detail; those without rows are not drawn.
+        videos, plots, images: media, by kind.
+        strips: images of several pictures side by side, one below the other.
+        notes: what was not scored and why, warnings, the machine.
+        hints: (label, command): what to do next.
+        complete: False for a run that was stopped.
+    """
+
+    title: str
+    subtitle: str = ""
+    cards: Sequence[Card] = ()
+    tables: Sequence[Table] = ()
+    videos: Sequence[Media] = ()
+    plots: Sequence[Media] = ()
+    images: Sequence[Media] = ()
+    strips: Sequence[Media] = ()
+    notes: Sequence[str] = ()
+    hints: Sequence[tuple[str, str]] = ()
+    complete: bool = True
+
+
+def cards_of(scores: Iterable[Score], found: Metrics) -> list[Card]:
+    """The scores of a run that are known, as cards."""
+    values = ((score, score.value(found)) for score in scores)
+    return [Card(s.head, value, s.unit, s.decimals) for s, value in values if value is not None]
+
+
+def at(*names: str) -> Callable[[Metrics], Any]:
+    """The value of a score that stands at a path in metrics.json; None if there is none."""
+
+    def value(found: Metrics) -> Any:
+        node: Any = found
+        for name in names:
+            node = node.get(name) if isinstance(node, Mapping) else None
+        return node
+
+    return value
+
+
+def minutes(stage: str = "steps") -> Callable[[Metrics], float]:
+    """Minutes of a stage that repeats a step, compiling included."""
+
+    def value(found: Metrics) -> float:
+        return (found["seconds"][stage] + found["seconds"]["compile"]) / 60
+
+    return value
+
+
+def time_table(times: Mapping[str, str], seconds: Mapping[str, float]) -> Table:
+    """Where the time went.
+
+    Args:
+        times: the stages in their order, with what each does.
+        seconds: of each.
+    """
+    rows = [{"stage": words, "seconds": seconds.get(name)} for name, words in times.items()]
+    return Table("Time", (Column("stage", "stage"), Column("time", "seconds", "s", 2)), rows)
+
+
+def format_number(value: Any, decimals: int | None = None) -> str:
+    """The text of a cell: three digits for fractions, thin spaces between thousands, a dash for nothing.
+
+    With `decimals`, fractions have that many digits behind the point, so that a column lines up.
+    """
+    if value is None:
+        return "–"
+    if isinstance(value, (str, bool)):
+        return str(value)
+    if isinstance(value, int) or (hasattr(value, "dtype") and value.dtype.kind in "iu"):
+        return f"{int(value):,}".replace(",", "\u202f")
+    value = float(value)
+    if not math.isfinite(value):
+        return "–"
+    if decimals is not None:
+        value = round(value, decimals) + 0.0  # no minus before a zero
+        return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.2e}".replace("-", "−")
+    decimals = 0 if value == 0 else max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")

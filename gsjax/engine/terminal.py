@@ -1,0 +1,86 @@
+"""A summary in the terminal: its brief tables, its cards, and where the report is."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table as Grid
+from rich.text import Text
+
+from gsjax.engine.summary import ARROWS, Card, Column, Summary, Table, format_number
+
+_WIDE = 130  # columns of a terminal that has room for every column of a table
+_LOG_WIDTH = 200
+
+
+def print_summary(
+    summary: Summary, report: Path | None, *, notes: bool = False, titles: bool = False
+) -> None:
+    """Print a summary on stdout.
+
+    Args:
+        summary: what a run came to.
+        report: the page that shows all of it; None if none was written.
+        notes: print its notes too.
+        titles: print the titles of its tables too.
+    """
+    console = Console(highlight=False)
+    if not console.is_terminal:  # a log has room, and programs search it
+        console.width = _LOG_WIDTH
+    console.print()
+    for table in summary.tables:
+        if table.brief and table.rows:
+            if titles:
+                console.print(Text(table.title, style="bold"))
+            console.print(_grid(table, console.width))
+    if summary.cards:
+        console.print(_cards(summary.cards))
+    if summary.subtitle:
+        console.print(Text(summary.subtitle, style="dim"), soft_wrap=not console.is_terminal)
+    for note in summary.notes if notes else ():
+        console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
+    if not summary.complete:
+        console.print("[bold yellow]partial run[/]; go on with --resume")
+    lines = [*summary.hints, *([] if report is None else [("report", str(report))])]
+    for label, text in lines:
+        console.print(Text.assemble((label, "bold"), "  ", text), soft_wrap=True)
+
+
+def _cards(cards: Sequence[Card]) -> Grid:
+    grid = Grid.grid(padding=(0, 3, 0, 0))
+    for card in cards:
+        grid.add_row(Text(card.head, style="bold"), Text(f"{card.text} {card.unit}".strip()))
+    return grid
+
+
+def _grid(table: Table, width: int) -> Grid:
+    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    columns = [column for column in table.shown if width >= _WIDE or not column.wide]
+    units = any(column.unit or column.better for column in columns)
+    for column in columns:
+        grid.add_column(
+            _head(column, units),
+            justify="right" if table.is_numeric(column) else "left",
+            no_wrap=column is not columns[0],
+            overflow="fold",
+        )
+    for i, row in enumerate(table.rows):
+        styles = ("bold green" if (i, column.key) in table.best else "" for column in columns)
+        texts = (format_number(row.get(column.key), column.decimals) for column in columns)
+        grid.add_row(*map(Text, texts, styles))
+    if table.means:
+        grid.add_section()
+    for row in table.means:
+        texts = (format_number(row.get(column.key), column.decimals) for column in columns)
+        grid.add_row(*map(Text, texts), style="bold")
+    grid.add_row()
+    return grid
+
+
+def _head(column: Column, units: bool) -> Text:
+    """The heading in two lines, and the unit in a third where any column has one."""
+    first, _, rest = column.head.partition(" ")
+    head = Text(f"{first}\n{rest}" if rest else f"\n{first}")
+    if units:
+        head.append(f"\n{column.unit}{ARROWS[column.better]}", style="dim")
+    return head
