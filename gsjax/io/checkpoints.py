@@ -1,9 +1,9 @@
-"""Checkpoints: a pytree of gsjax in one .npz, which says by itself what it holds. Never pickle.
+"""Checkpoints: a pytree in one self-describing .npz, without pickle.
 
-The file has the arrays by their path, and a JSON header with the tree around them: containers, numbers, text,
-and by name the types of NamedTuples, dataclasses and equinox modules with all their fields, static ones too.
-So it is read without a template. Only types of gsjax and of the libraries whose states it stores are made
-again, and no code of theirs runs but that of a dataclass that checks its own values.
+The file holds the arrays by their paths, and a JSON header with the tree around them: containers, numbers,
+text, and the type names and fields (static ones included) of NamedTuples, dataclasses and equinox modules. It
+is read without a template. Only types of gsjax and of the libraries whose states it stores are instantiated,
+and none of their code runs except the checks of dataclasses.
 """
 
 import dataclasses
@@ -27,11 +27,11 @@ from gsjax.io.atomic import write_npz
 _FORMAT = 2  # 1 needed a template
 _HEADER = "__header__"
 _LIBRARIES = ("gsjax", "optax", "equinox", "jaxlie")
-_ANEW = "begin anew, or go on with the version that wrote it"
+_ANEW = "start again, or continue with the version that wrote it"
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is damaged or of another version; the message says which, and what to do."""
+    """A checkpoint that is damaged or of another version."""
 
 
 def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, Any] | None = None) -> None:
@@ -40,10 +40,10 @@ def save_checkpoint(path: str | os.PathLike, tree: Any, metadata: Mapping[str, A
     Args:
         tree: arrays (also random keys and low-precision floats, kept exactly), numbers, text, None, lists,
             tuples, dicts, and NamedTuples, dataclasses and modules of gsjax, optax, equinox and jaxlie.
-        metadata: what JSON can hold.
+        metadata: values that JSON can hold.
 
     Raises:
-        TypeError: `tree` holds something else, a function say, or `metadata` what JSON cannot hold.
+        TypeError: `tree` holds something else, such as a function, or JSON cannot hold `metadata`.
     """
     arrays: dict[str, np.ndarray] = {}
     header = {
@@ -70,8 +70,8 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[Any, dict[str, Any]]:
         return _decoded(header["tree"], arrays), header["metadata"]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise CheckpointError(
-            f"{path}: expected what gsjax {import_module('gsjax').__version__} stores, found something else "
-            f"({error}), written by gsjax {header.get('version')}; {_ANEW}"
+            f"{path}: expected a checkpoint of gsjax {import_module('gsjax').__version__}, found one of "
+            f"gsjax {header.get('version')} that differs ({error}); {_ANEW}"
         ) from error
 
 
@@ -86,7 +86,7 @@ def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def _encoded(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """A node as JSON has it; its arrays go into `arrays`, by their path."""
+    """A node as JSON; its arrays are added to `arrays` by their paths."""
     if node is None or isinstance(node, (bool, str)) or type(node) in (int, float):
         return node
     if isinstance(node, (np.ndarray, np.generic, jax.Array)):
@@ -118,8 +118,8 @@ def _fields_of(node: Any, names: Any, path: str, arrays: dict[str, np.ndarray]) 
 
 
 def _name_of(kind: type) -> str:
-    """Where a type is found again: "optax:ScaleByAdamState" where the library itself exports it, for the
-    modules within a library move."""
+    """The name under which a type is found again: "optax:ScaleByAdamState" if the library itself exports it,
+    since its inner modules may move."""
     library = kind.__module__.split(".")[0]
     if library not in _LIBRARIES:
         raise TypeError(
@@ -134,7 +134,7 @@ def _type_named(name: str) -> type:
     """The inverse of `_name_of`.
 
     Raises:
-        ValueError: it is no type of these libraries, or one that holds no fields.
+        ValueError: it is not a type of these libraries, or has no fields.
     """
     module, _, qualified = name.partition(":")
     if module.split(".")[0] not in _LIBRARIES or "__main__" in module:
@@ -144,9 +144,9 @@ def _type_named(name: str) -> type:
         for part in qualified.split("."):
             kind = getattr(kind, part)
     except (ImportError, AttributeError):
-        raise ValueError(f"type {name}: there is none of this name") from None
+        raise ValueError(f"type {name}: not found") from None
     if not isinstance(kind, type) or not (dataclasses.is_dataclass(kind) or hasattr(kind, "_fields")):
-        raise ValueError(f"type {name}: no NamedTuple, dataclass or module")
+        raise ValueError(f"type {name}: not a NamedTuple, dataclass or module")
     return kind
 
 
@@ -167,19 +167,19 @@ def _decoded(node: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def _made(kind: type, fields: dict[str, Any]) -> Any:
-    """A value of a type with these fields.
+    """An instance of a type with these fields.
 
     Raises:
-        ValueError: the type has other fields by now.
+        ValueError: the type now has other fields.
     """
     is_tuple = hasattr(kind, "_fields")
     names = kind._fields if is_tuple else [field.name for field in dataclasses.fields(kind)]
     others = sorted(set(names) ^ set(fields))
     if others:
-        raise ValueError(f"type {kind.__name__}: {', '.join(others)} is not a field both then and now")
+        raise ValueError(f"type {kind.__name__}: its fields have changed ({', '.join(others)})")
     if not issubclass(kind, eqx.Module):
         return kind(**fields)
-    module = object.__new__(kind)  # as tree_unflatten does: what was sound when it was saved is not checked
+    module = object.__new__(kind)  # as tree_unflatten does, without the checks of __init__
     for name, value in fields.items():
         object.__setattr__(module, name, value)
     return module
@@ -206,7 +206,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     ) as error:
         raise CheckpointError(
             f"{path}: expected a checkpoint, found a file that cannot be read as one ({error}). "
-            "It may be cut off or damaged: use another one"
+            "It may be truncated or damaged; use another one"
         ) from error
     if written != _FORMAT:
         raise CheckpointError(
@@ -215,7 +215,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         )
     if not intact:
         raise CheckpointError(
-            f"{path}: expected a matching checksum, found changed content. Take another checkpoint"
+            f"{path}: expected a matching checksum, found altered content; use another checkpoint"
         )
     return stored, header
 

@@ -1,9 +1,9 @@
-"""The method protocol: everything that a loop over steps has to know, as one value.
+"""The method protocol: one value that holds everything that a loop over steps needs.
 
 A method is a frozen dataclass that holds its configuration. `gsjax.engine.drive` runs any of them:
 
     problem, run = method.start(...)              # on the host
-    run = method.between(problem, run, progress)  # before each step: what changes shapes now and then
+    run = method.between(problem, run, progress)  # before each step: changes of shape
     batch, plans = method.batch(problem, run, progress)
     params, state, info = method.step.update(run.params, run.state, batch, step=run.step, key=key)
     method.result(problem, run)
@@ -19,15 +19,15 @@ from gsjax.optim.step import Step
 
 
 class Run(eqx.Module):
-    """What a method goes on from, to the same bits; one form for all methods.
+    """Everything needed to continue a method with bitwise equal results; all methods share this form.
 
     Attributes:
-        params: what trains.
-        state: what the step carries along: optimizers' moments, say.
-        step: how many steps were made, which is the index of the next one.
-        plans: capacities, by the name of what is drawn with them; see `gsjax.rasterize.plan`.
-        kept: what steps are given as it is and `between` replaces: a graph, nodes, poses of the past. None
-            for a method that needs nothing.
+        params: trainable parameters.
+        state: the step's own state, such as the moments of an optimizer.
+        step: number of steps taken, which is the index of the next one.
+        plans: capacities by name; see `gsjax.rasterize.plan`.
+        kept: inputs of the steps that only `between` replaces, such as a graph, nodes or past poses; None for
+            a method that has none.
     """
 
     params: PyTree
@@ -37,16 +37,16 @@ class Run(eqx.Module):
     kept: PyTree = None
 
     def having(self, **changes: Any) -> "Run":
-        """The same with other values of some fields."""
+        """A copy with some fields replaced."""
         return replace(self, **changes)
 
     def grown(self, names: tuple[str, ...], needed: Any, headroom: float) -> "Run":
-        """The same with room for what a step needed.
+        """A copy whose plans have room for what a step needed.
 
         Args:
-            names: of the plans that the step drew with.
-            needed: what it needed of the plan, or of each of several.
-            headroom: how many times as much a plan is to hold, 1 or more.
+            names: names of the plans that the step used.
+            needed: what the step needed: a value for the plan, or one for each of several.
+            headroom: capacity as a multiple of what was needed, 1 or more.
         """
         plans = dict(self.plans)
         for name, value in zip(names, needed if len(names) > 1 else (needed,), strict=True):
@@ -59,36 +59,36 @@ Problem = TypeVar("Problem", contravariant=True)
 
 @runtime_checkable
 class Method(Protocol[Problem]):
-    """A method; see the module. Everything but `step` runs on the host."""
+    """A method; see the module's docstring. Everything but `step` runs on the host."""
 
     config: Any
-    """A frozen dataclass with a `seed`, among others."""
+    """The configuration: a frozen dataclass with a `seed` among its fields."""
 
     @property
     def step(self) -> Step:
-        """The maths, for anyone's jit."""
+        """The pure step, which may be called under any jit."""
         ...
 
     def total(self, problem: Problem) -> int:
-        """How many steps there are; progress is the share of them that was made."""
+        """Number of steps; progress is the fraction of them that has been taken."""
         ...
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """The run before its next step: growth, new parts, a graph, plans of what is drawn for the first
-        time. Arrays of the run may be given away.
+        """The run for the next step, after changes of shape: densification, new parts, a graph, new plans.
+        Arrays of `run` may be donated.
 
         Args:
-            problem: what does not change.
-            run: after the step before.
-            progress: how far the schedule is, 0 to 1.
+            problem: the data, which does not change.
+            run: the run after the previous step.
+            progress: position in the schedule, 0 to 1.
         """
         ...
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[PyTree, tuple[str, ...]]:
-        """What the next step is given, and the names in `run.plans` of the plans that it draws with, in the
-        order of `info["needed"]`. Arguments as for `between`."""
+        """The batch of the next step, and the names in `run.plans` of the plans that it uses, in the order of
+        `info["needed"]`. Arguments as for `between`."""
         ...
 
     def result(self, problem: Problem, run: Run) -> Any:
-        """What the user came for."""
+        """The result of the method so far: Gaussians, parts, a field, a deforming scene."""
         ...

@@ -3,17 +3,17 @@
     state = step.init(params)
     params, state, info = step.update(params, state, batch, step=i, key=key)
 
-`params` holds what trains, `batch` what is given (observations, frozen scene, plan, progress), `state` what a
-method carries along. `step` is the index of the step, a traced integer; how far a schedule is, 0 to 1,
-travels in the batch. `info` has the losses by name, and always
+`params` holds the trainable parameters, `batch` the inputs (observations, frozen scene, plan, progress) and
+`state` the step's own state. `step` is the index of the step, a traced integer; the position in a schedule,
+0 to 1, is part of the batch. `info` has the losses by name, and always
 
-    loss       what went down
-    skipped    the step changed neither params nor state: a number was not finite, or a plan overflowed
-    overflow   a plan was too small
-    needed     what it should have held; a number, or what the method's plans need in their own form
+    loss       the value that is minimised
+    skipped    True if params and state are unchanged: a number was not finite, or a plan overflowed
+    overflow   True if a plan was too small
+    needed     the capacity that would have sufficed: a number, or the form that the method's plans take
 
-Nothing is closed over but static configuration, so steps run under jit, vmap and scan, and compose by calling
-one another. tests/optim/test_laws.py holds every step of the package to this.
+Steps close over static configuration only, so they run under jit, vmap and scan, and compose by calling
+one another. tests/engine/test_laws.py checks every step of the package.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,7 +43,7 @@ class Update(Protocol):
 
 
 class Step(NamedTuple):
-    """A pair of pure functions; see the module."""
+    """A pair of pure functions; see the module's docstring."""
 
     init: Init
     update: Update
@@ -55,8 +55,8 @@ def gradient_step(
     """One step down the gradient of `loss(params, batch, *, step, key) -> (scalar, aux)`.
 
     A step whose loss or gradient is not finite, or whose aux has a true `overflow`, returns params and state
-    unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`; a loss that draws with
-    no plan need not mention `overflow` and `needed`, which are then False and 0.
+    unchanged; `info["skipped"]` reports it. `info` is aux with `loss` and `skipped`. Without a plan, aux need
+    not have `overflow` and `needed`, which default to False and 0.
     """
 
     def update(params, state, batch, *, step, key):
@@ -88,17 +88,16 @@ def per_field_adam(
     others: Mapping[str, optax.GradientTransformation] = MappingProxyType({}),
     decay: float = 0.0,
 ) -> optax.GradientTransformation:
-    """Adam (eps 1e-15, as in 3DGS) with a rate for each field of a module, or of the modules within it; the
-    others stand still.
+    """Adam (eps 1e-15, as in 3DGS) with a learning rate for each field of a module or of nested modules.
 
     Args:
-        rates: by the names of fields.
-        default: rate of fields that are not named.
-        others: what is done with fields that Adam does not change.
-        decay: what AdamW takes of each number of these fields a step, times the rate.
+        rates: learning rates by field name.
+        default: learning rate of all other fields; with 0 they do not change.
+        others: transformations, by field name, that replace Adam.
+        decay: weight decay of AdamW for the fields in `rates`.
 
     Raises:
-        ValueError: from the optimizer's init, where a rate is for a field that the module lacks.
+        ValueError: from the optimizer's init, if the module lacks one of the fields.
     """
     adam = partial(optax.adamw, weight_decay=decay) if decay else optax.adam
     transforms = {name: adam(rate, eps=1e-15) for name, rate in rates.items()} | dict(others)

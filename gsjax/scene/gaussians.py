@@ -63,8 +63,8 @@ class Gaussians(eqx.Module):
                 _check_array(f"Gaussians.{name}", value, shape)
         if self.shN is not None and self.shN.shape[1] + 1 not in SH_SIZES[1:]:
             raise ValueError(
-                f"Gaussians.shN: got shape {self.shN.shape}, want [N, 3, 3], [N, 8, 3] or [N, 15, 3] "
-                "(degree 1, 2 or 3 without its constant), or None for degree 0"
+                "Gaussians.shN: expected shape [N, 3, 3], [N, 8, 3] or [N, 15, 3] (degree 1, 2 or 3 without "
+                f"its constant), or None for degree 0, found {self.shN.shape}"
             )
 
     @property
@@ -113,9 +113,9 @@ def _check_array(name: str, value: ArrayLike, wanted: tuple[int | None, ...]) ->
     fits = len(shape) == len(wanted) and all(w is None or s == w for s, w in zip(shape, wanted, strict=True))
     if not fits:
         text = ", ".join("any" if size is None else str(size) for size in wanted)
-        raise ValueError(f"{name}: got shape {tuple(shape)}, want [{text}]")
+        raise ValueError(f"{name}: expected shape [{text}], found {tuple(shape)}")
     if not jnp.issubdtype(dtype, jnp.floating):
-        raise ValueError(f"{name}: got dtype {dtype}, want floats (integers belong in Tags)")
+        raise ValueError(f"{name}: expected floats (integers belong in Tags), found dtype {dtype}")
 
 
 def gaussians_from_activated(
@@ -171,7 +171,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
         ValueError: there are no parts, or their features differ in dimension or are missing in some parts.
     """
     if not parts:
-        raise ValueError("concatenate: got no parts, want at least one Gaussians")
+        raise ValueError("concatenate: expected at least one Gaussians, found no parts")
     sizes = {None if part.features is None else part.features.shape[1] for part in parts}
     if len(sizes) > 1:
         raise ValueError(f"concatenate: features must have one size in all parts or be None, got {sizes}")

@@ -42,9 +42,9 @@ def points_from_rgbd(
     image, depth = np.asarray(image), np.asarray(depth)
     check_depth(depth)
     if image.shape != (*depth.shape, 3):
-        raise ValueError(f"image: got shape {image.shape}, want {(*depth.shape, 3)} to match depth")
+        raise ValueError(f"image: expected shape {(*depth.shape, 3)} to match depth, found {image.shape}")
     if stride < 1:
-        raise ValueError(f"stride: got {stride}, want 1 or more")
+        raise ValueError(f"stride: expected 1 or more, found {stride}")
     rows, columns = np.mgrid[0 : depth.shape[0] : stride, 0 : depth.shape[1] : stride]
     sampled = depth[rows, columns]
     valid = valid_depth(sampled)
@@ -126,13 +126,13 @@ def gaussians_from_points(
     """
     points, colors = np.asarray(points), np.asarray(colors)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: got shape {points.shape}, want [M, 3]")
+        raise ValueError(f"points: expected shape [M, 3], found {points.shape}")
     if colors.shape != points.shape:
-        raise ValueError(f"colors: got shape {colors.shape}, want {points.shape} to match points")
+        raise ValueError(f"colors: expected shape {points.shape} to match points, found {colors.shape}")
     if isinstance(normals, str) and normals != "pca":
-        raise ValueError(f"normals: got {normals!r}, want None, 'pca' or an array {points.shape}")
+        raise ValueError(f"normals: expected None, 'pca' or an array {points.shape}, found {normals!r}")
     if normals is not None and not isinstance(normals, str) and np.shape(normals) != points.shape:
-        raise ValueError(f"normals: got shape {np.shape(normals)}, want {points.shape} to match points")
+        raise ValueError(f"normals: expected shape {points.shape} to match points, found {np.shape(normals)}")
     finite = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1))
     if len(finite) == 0:
         raise ValueError(f"points: none of the {len(points)} is finite; is there any valid depth?")
@@ -154,9 +154,11 @@ def check_depth(depth: np.ndarray) -> None:
         ValueError: it has another shape, or holds integers, whose unit is unknown.
     """
     if depth.ndim != 2:
-        raise ValueError(f"depth: got shape {depth.shape}, want [H, W]")
+        raise ValueError(f"depth: expected shape [H, W], found {depth.shape}")
     if not np.issubdtype(depth.dtype, np.floating):
-        raise ValueError(f"depth: got dtype {depth.dtype}, want metres as floats (times the file's unit)")
+        raise ValueError(
+            f"depth: expected metres as floats (times the file's unit), found dtype {depth.dtype}"
+        )
 
 
 def valid_depth(depth: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ def lift_labels(
     mask, depth, points = np.asarray(mask), np.asarray(depth), np.asarray(points, np.float64)
     check_depth(depth)
     if mask.shape != depth.shape:
-        raise ValueError(f"mask: got shape {mask.shape}, want {depth.shape} to match depth")
+        raise ValueError(f"mask: expected shape {depth.shape} to match depth, found {mask.shape}")
     if not valid_depth(depth).any():
         raise ValueError("depth: no pixel is positive and finite, so no label can be lifted from this view")
     height, width = depth.shape
@@ -93,9 +93,9 @@ def inherit_labels(
     """
     points, labels, normals = np.asarray(points, np.float64), np.asarray(labels), np.asarray(normals)
     if labels.shape != points.shape[:1]:
-        raise ValueError(f"labels: got shape {labels.shape}, want [{len(points)}] to match points")
+        raise ValueError(f"labels: expected shape [{len(points)}] to match points, found {labels.shape}")
     if normals.shape != points.shape:
-        raise ValueError(f"normals: got shape {normals.shape}, want {points.shape} to match points")
+        raise ValueError(f"normals: expected shape {points.shape} to match points, found {normals.shape}")
     known = labels != UNKNOWN_LABEL
     inherited = np.where(known, labels, BACKGROUND_LABEL).astype(np.int32)
     begins, ends = _neighbor_pairs(points, max_step)

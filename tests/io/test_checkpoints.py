@@ -84,17 +84,17 @@ def with_header(path, change):
     [
         ("os:system", "not of gsjax, optax"),
         ("gsjax.cli.__main__:entry", "not of gsjax, optax"),
-        ("gsjax.scene.gaussians:take", "no NamedTuple, dataclass or module"),
-        ("gsjax.scene.gaussians:Gone", "there is none of this name"),
-        ("gsjax.nowhere:Gone", "there is none of this name"),
-        ("optax:adam", "no NamedTuple, dataclass or module"),
+        ("gsjax.scene.gaussians:take", "not a NamedTuple, dataclass or module"),
+        ("gsjax.scene.gaussians:Gone", "not found"),
+        ("gsjax.nowhere:Gone", "not found"),
+        ("optax:adam", "not a NamedTuple, dataclass or module"),
     ],
 )
 def test_only_types_that_hold_fields_are_made(tmp_path, name, says):
     path = tmp_path / "a.npz"
     save_checkpoint(path, Plan(8, 9, 4096))
     with_header(path, lambda header: header["tree"].update(type=name))
-    with pytest.raises(CheckpointError, match=rf"a\.npz: .*{says}.*begin anew"):
+    with pytest.raises(CheckpointError, match=rf"a\.npz: .*{says}.*start again"):
         load_checkpoint(path)
 
 
@@ -102,7 +102,7 @@ def test_a_type_with_other_fields_than_then_is_named(tmp_path):
     path = tmp_path / "a.npz"
     save_checkpoint(path, Plan(8, 9, 4096))
     with_header(path, lambda header: header["tree"]["fields"].pop("eps2d"))
-    with pytest.raises(CheckpointError, match="type Plan: eps2d is not a field both then and now"):
+    with pytest.raises(CheckpointError, match=r"type Plan: its fields have changed \(eps2d\)"):
         load_checkpoint(path)
 
 
@@ -110,7 +110,7 @@ def test_one_of_the_version_before_is_refused_in_a_sentence(tmp_path):
     path = tmp_path / "a.npz"
     save_checkpoint(path, jnp.ones(2))
     with_header(path, lambda header: header.update(format=1))
-    with pytest.raises(CheckpointError, match=r"format 2, found format 1, of another version.*begin anew"):
+    with pytest.raises(CheckpointError, match=r"format 2, found format 1, of another version.*start again"):
         load_checkpoint(path)
 
 
@@ -120,7 +120,7 @@ def test_a_checkpoint_cut_off_is_named(tmp_path, keep):
     save_checkpoint(path, {"a": jnp.arange(1000.0)})
     content = path.read_bytes()
     path.write_bytes(content[: int(keep * len(content))])
-    with pytest.raises(CheckpointError, match=r"a\.npz: expected a checkpoint.*cut off or damaged"):
+    with pytest.raises(CheckpointError, match=r"a\.npz: expected a checkpoint.*truncated or damaged"):
         load_checkpoint(path)
 
 

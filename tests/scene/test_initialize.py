@@ -56,15 +56,15 @@ def test_depth_in_another_unit_is_noticed():
     image, depth = picture()
     with pytest.warns(UserWarning, match="millimetres"):
         points_from_rgbd(image, 1000 * depth, VIEWMAT, K)
-    with pytest.raises(ValueError, match="got dtype uint16, want metres as floats"):
+    with pytest.raises(ValueError, match="expected metres as floats .*, found dtype uint16"):
         points_from_rgbd(image, (1000 * depth).astype(np.uint16), VIEWMAT, K)
 
 
 def test_images_of_another_size_and_bad_strides_are_refused():
     image, depth = picture()
-    with pytest.raises(ValueError, match=r"image: got shape \(24, 31, 3\), want \(24, 32, 3\)"):
+    with pytest.raises(ValueError, match=r"image: expected shape \(24, 32, 3\).*, found \(24, 31, 3\)"):
         points_from_rgbd(image[:, 1:], depth, VIEWMAT, K)
-    with pytest.raises(ValueError, match="stride: got 0"):
+    with pytest.raises(ValueError, match="stride: expected 1 or more, found 0"):
         points_from_rgbd(image, depth, VIEWMAT, K, stride=0)
 
 
@@ -131,9 +131,9 @@ def test_given_normals_follow_their_points_through_thinning():
     [
         ({"points": np.full((4, 3), np.nan)}, "none of the 4 is finite"),
         ({"points": np.zeros((0, 3)), "colors": np.zeros((0, 3))}, "none of the 0 is finite"),
-        ({"colors": np.ones((3, 3))}, r"colors: got shape \(3, 3\), want \(4, 3\)"),
-        ({"normals": "guess"}, "normals: got 'guess'"),
-        ({"normals": np.ones((2, 3))}, r"normals: got shape \(2, 3\), want \(4, 3\)"),
+        ({"colors": np.ones((3, 3))}, r"colors: expected shape \(4, 3\).*, found \(3, 3\)"),
+        ({"normals": "guess"}, "normals: expected None, 'pca' or .*found 'guess'"),
+        ({"normals": np.ones((2, 3))}, r"normals: expected shape \(4, 3\).*, found \(2, 3\)"),
     ],
 )
 def test_bad_arguments_are_refused(change, message):
