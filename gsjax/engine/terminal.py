@@ -1,6 +1,6 @@
 """A summary in the terminal: its brief tables, its cards, and where the report is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -46,11 +46,35 @@ def print_summary(
         console.print(Text.assemble((label, "bold"), "  ", text), soft_wrap=True)
 
 
-def _cards(cards: Sequence[Card]) -> Grid:
+def print_table(table: Table) -> None:
+    """Print a table on stdout, below its title."""
+    console = Console(highlight=False)
+    console.print(Text(f"\n{table.title}", style="bold"))
+    console.print(_grid(table, console.width))
+
+
+def print_facts(facts: Mapping[str, str], title: str = "") -> None:
+    """Print facts on stdout, a line each, with their names in bold.
+
+    Args:
+        facts: name -> text.
+        title: stands above them.
+    """
+    console = Console(highlight=False)
+    if title:
+        console.print(Text(title, style="bold cyan"))
+    console.print(_facts(facts))
+
+
+def _facts(facts: Mapping[str, str]) -> Grid:
     grid = Grid.grid(padding=(0, 3, 0, 0))
-    for card in cards:
-        grid.add_row(Text(card.head, style="bold"), Text(f"{card.text} {card.unit}".strip()))
+    for name, text in facts.items():
+        grid.add_row(Text(name, style="bold"), Text(text, overflow="fold"))
     return grid
+
+
+def _cards(cards: Sequence[Card]) -> Grid:
+    return _facts({card.head: f"{card.text} {card.unit}".strip() for card in cards})
 
 
 def _grid(table: Table, width: int) -> Grid:

@@ -16,7 +16,8 @@ from matplotlib.ticker import MaxNLocator
 
 from gsjax.viz.colors import label_color
 
-_INK, _FAINT, _GRID = "#22262b", "#6b7280", "#e4e7eb"
+INK, FAINT, GRID = "#22262b", "#6b7280", "#e4e7eb"
+"""Colours of text, of secondary text, and of grids and frames."""
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
 
 
@@ -68,8 +69,8 @@ def error_over_frames(
     for i, (name, error) in enumerate(errors_mm.items()):
         axes.plot(error, color=_rgb(labels[name] if labels else i + 1), lw=1.6, label=name)
     if limit_mm is not None:
-        axes.axhline(limit_mm, color=_FAINT, lw=1.0, ls=(0, (5, 3)))
-        _margin_label(axes, limit_mm, f"{limit_mm:g} mm", _FAINT)
+        axes.axhline(limit_mm, color=FAINT, lw=1.0, ls=(0, (5, 3)))
+        _margin_label(axes, limit_mm, f"{limit_mm:g} mm", FAINT)
     axes.set_ylim(bottom=0)
     _legend(figure, axes)
     return figure
@@ -86,8 +87,8 @@ def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out
     psnr = np.array([np.nan if row["test_psnr"] is None else row["test_psnr"] for row in rows], float)
     known = np.isfinite(psnr)
     behind = axes.twinx()
-    behind.plot(minutes, [row["alive"] for row in rows], color=_FAINT, lw=1.0)
-    behind.set_ylabel("Gaussians", color=_FAINT)
+    behind.plot(minutes, [row["alive"] for row in rows], color=FAINT, lw=1.0)
+    behind.set_ylabel("Gaussians", color=FAINT)
     behind.set_ylim(bottom=0)
     behind.spines[["top"]].set_visible(False)
     axes.plot(minutes[known], psnr[known], color=_BLUE, lw=1.6, marker="o", ms=3)
@@ -174,7 +175,7 @@ def trajectories(
     for i, (name, path) in enumerate(centroids.items()):
         color = _rgb(labels[name] if labels else i + 1)
         if truth and name in truth:
-            axes.plot(*np.asarray(truth[name])[:, :take].T, color=_INK, lw=0.9, alpha=0.55)
+            axes.plot(*np.asarray(truth[name])[:, :take].T, color=INK, lw=0.9, alpha=0.55)
         axes.plot(*np.asarray(path)[:, :take].T, color=color, lw=2.0, label=name)
         finite = np.asarray(path)[np.isfinite(path).all(axis=1), :take]
         if len(finite):
@@ -183,7 +184,7 @@ def trajectories(
     # Three-dimensional axes accept "equal" too, but their box then no longer fills the figure.
     axes.set_aspect("equal", adjustable="datalim" if view == "top" else "box")
     if view == "3d":
-        axes.set_zlabel("z (m)", color=_FAINT, fontsize=10)  # pyright: ignore[reportAttributeAccessIssue]
+        axes.set_zlabel("z (m)", color=FAINT, fontsize=10)  # pyright: ignore[reportAttributeAccessIssue]
     _legend(figure, axes)
     return figure
 
@@ -205,18 +206,23 @@ def save(figure: Figure, path: str | Path) -> Path:
 def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(6.4, 5.0 if projection else 3.4), facecolor="white", layout="constrained")
     axes = figure.add_subplot(projection=projection)
-    axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=10)
-    axes.set_xlabel(xlabel, color=_FAINT, fontsize=10)
-    axes.set_ylabel(ylabel, color=_FAINT, fontsize=10)
-    axes.tick_params(colors=_FAINT, labelsize=9.5, length=0)
+    axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=10)
+    style_axes(axes, xlabel, ylabel)
     if xlabel == "frame":
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(color=_GRID, lw=0.8)
-    axes.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
-    axes.spines["bottom"].set_color(_GRID)
+    axes.spines[["top", "right", "left"]].set_visible(False)
     return figure, axes
+
+
+def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Label axes, with a faint grid behind the data."""
+    axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
+    axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
+    axes.tick_params(colors=FAINT, labelsize=9.5, length=0)
+    axes.grid(color=GRID, lw=0.8)
+    axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color(GRID)
 
 
 def _margin_label(axes: Axes, y: float, text: str, color: str) -> None:
@@ -230,7 +236,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     columns = 5 if max(map(len, names), default=0) < 14 else 3
     if names:
-        text = {"fontsize": 9.5, "labelcolor": _INK}
+        text = {"fontsize": 9.5, "labelcolor": INK}
         spacing = {"columnspacing": 1.3, "handlelength": 1.4, "frameon": False}
         figure.legend(handles, names, loc="outside lower left", ncols=columns, **text, **spacing)
 

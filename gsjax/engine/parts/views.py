@@ -17,7 +17,7 @@ from gsjax.scene.render import Rendered, render
 def part_views(
     scene: PartScene, trajectory: Trajectory, recording: Recording, blend: Blend, every: int = 1
 ) -> Iterator[list[View]]:
-    """The views of all cameras, a list for every `every`-th frame; groups are the parts."""
+    """The views of all cameras, a list for every n-th frame; groups are the parts."""
 
     def at(t: int) -> tuple[PartScene, Moment]:
         return scene, moment(trajectory, t)

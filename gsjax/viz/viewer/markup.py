@@ -23,15 +23,19 @@ def heading(scene: Viewable, sent: int) -> str:
         sent: number of Gaussians sent to the browser.
     """
     count = scene.gaussians.num
-    facts = [f"**{count:,}** Gaussians", f"SH degree {scene.gaussians.sh_degree}"]
-    if scene.num_frames > 1:
-        facts.append(f"{scene.num_frames} frames")
-    if scene.shots is not None:
-        facts.append(f"{len(scene.shots.names)} {'cameras' if scene.num_frames > 1 else 'photographs'}")
-    lines = [", ".join(facts) + "."]
+    lines = [", ".join([f"**{count:,}** Gaussians", *contents(scene)]) + "."]
     if sent < count:
         lines.append(f"The view shows the {sent:,} most opaque of them; the render shows all.")
     return " ".join(lines) + "\n\nDrag to rotate, right-drag to pan, scroll to zoom."
+
+
+def contents(scene: Viewable) -> list[str]:
+    """The contents of a scene besides its number of Gaussians."""
+    moves = scene.num_frames > 1
+    facts = [f"SH degree {scene.gaussians.sh_degree}", *([f"{scene.num_frames} frames"] if moves else [])]
+    if scene.shots is not None:
+        facts.append(f"{len(scene.shots.names)} {'cameras' if moves else 'photographs'}")
+    return facts
 
 
 def format_length(value: float, unit: str) -> str:

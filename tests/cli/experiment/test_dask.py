@@ -240,11 +240,11 @@ def test_a_job_of_slurm_is_one_worker_with_all_its_cores(defaults):
         ),
         (
             ("--executor", "dask", "--scheduler", "tcp://nowhere:1", "--workers", "2"),
-            "--workers: expected none given, for tcp://nowhere:1 has its own, found 2",
+            "--workers: expected none, because tcp://nowhere:1 has its own, found 2",
         ),
         (
             ("--executor", "dask", "--scheduler", "slurm"),
-            "--workers: expected how many jobs to submit to SLURM, found none given",
+            "--workers: expected the number of jobs to submit to SLURM, found none",
         ),
         (
             ("--executor", "dask", "--scheduler", "slurm", "--workers", "2"),

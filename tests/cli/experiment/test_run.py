@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsjax.cli import main
-from gsjax.cli.experiment import choose
+from gsjax.engine.experiments.run import choose
 from gsjax.engine.experiments.sweep import Cell, read_experiment
 from tests.cli.experiment.toys import calls, cell_files, markdown_table, results, stopping
 
