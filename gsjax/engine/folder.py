@@ -107,6 +107,8 @@ class RunFolder:
 
     Attributes:
         path: the folder, which exists once settings are written.
+        config, metrics, metrics_lines, scene, report: paths of its files, as above.
+        resume: folder of what an unfinished run resumes from.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool | None = False):
@@ -127,6 +129,9 @@ class RunFolder:
             ValueError: both `resume` and `overwrite` are on.
         """
         self.path, self._stale = Path(path), False
+        self.config, self.resume = self.path / "config.yml", self.path / "resume"
+        self.metrics, self.metrics_lines = self.path / "metrics.json", self.path / "metrics.jsonl"
+        self.scene, self.report = self.path / "scene.ply", self.path / "report.html"
         if resume and overwrite:
             raise ValueError(
                 "--resume and --overwrite: one continues a run, the other replaces it; choose one"
@@ -163,40 +168,14 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         """Whether a run that was not stopped has written everything: its report comes last."""
-        metrics = self.path / "metrics.json"
-        if not metrics.is_file():
+        if not self.metrics.is_file():
             return False
-        found = json.loads(metrics.read_text(encoding="utf-8"))
+        found = json.loads(self.metrics.read_text(encoding="utf-8"))
         return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
-
-    @property
-    def config(self) -> Path:
-        """Path of the settings."""
-        return self.path / "config.yml"
-
-    @property
-    def metrics_lines(self) -> Path:
-        """Path of the rows logged while a run learns, one per line."""
-        return self.path / "metrics.jsonl"
-
-    @property
-    def resume(self) -> Path:
-        """Folder of what an unfinished run resumes from."""
-        return self.path / "resume"
 
     def forget_resume(self) -> None:
         """Remove what only an unfinished run needs."""
         shutil.rmtree(self.resume, ignore_errors=True)
-
-    @property
-    def report(self) -> Path:
-        """Path of the report."""
-        return self.path / "report.html"
-
-    @property
-    def scene(self) -> Path:
-        """Path of the Gaussians."""
-        return self.path / "scene.ply"
 
     def render(self, camera: int | str, frame: int) -> Path:
         """Path of the rendered image of a camera (its id) at a frame; its folder exists."""
@@ -248,7 +227,7 @@ class RunFolder:
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write metrics.json; numbers that are not finite become null."""
-        write_json(self.path / "metrics.json", metrics)
+        write_json(self.metrics, metrics)
 
     def write_trajectory(self, **arrays: Any) -> None:
         """Write trajectory.npz."""

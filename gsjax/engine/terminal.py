@@ -40,7 +40,7 @@ def print_summary(
     for note in summary.notes if notes else ():
         console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
     if not summary.complete:
-        console.print("[bold yellow]partial run[/]; go on with --resume")
+        console.print("[bold yellow]partial run[/]; continue with --resume")
     lines = [*summary.hints, *([] if report is None else [("report", str(report))])]
     for label, text in lines:
         console.print(Text.assemble((label, "bold"), "  ", text), soft_wrap=True)

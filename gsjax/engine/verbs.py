@@ -21,7 +21,7 @@ from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, without_needless
-from gsjax.methods.parts import Parts, PartsConfig, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts import Parts, PartsConfig, begin
 from gsjax.methods.parts.pictures import problem_of
 from gsjax.methods.protocols import Segmenter
 from gsjax.scene.gaussians import Gaussians
@@ -165,13 +165,13 @@ def parts(
 
     Args:
         sequence: from `gsjax.open_sequence`, of synchronised cameras.
-        config: how; the default settings unless given.
-        eval_cameras: ids of cameras that are held out.
-        anchor: the canonical frame; by default the one that differs most from the others.
-        gaussians: the scene at `anchor`, which must then be given; by default it is fitted here, which takes
-            minutes.
-        segmenter: finds what belongs together in a picture; by default one that needs no weights.
-        after: a tick of an earlier discovery in the same sequence, to go on from.
+        config: settings (default: those of `PartsConfig`).
+        eval_cameras: ids of the cameras to hold out.
+        anchor: index of the canonical frame (default: the one that differs most from the others).
+        gaussians: the scene at `anchor`, which must then be given (default: it is fitted, which takes
+            minutes).
+        segmenter: divides a picture into pieces (default: one without weights).
+        after: a tick of an earlier discovery in the same sequence, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
@@ -182,7 +182,7 @@ def parts(
             nothing is found that moves.
         DataError: a picture cannot be read.
     """
-    from gsjax.engine.parts.start import FIT
+    from gsjax.engine.parts.start import FIT, detect_motion
     from gsjax.perception.segmenters import PieceSegmenter  # slow to import
 
     method = Parts(PartsConfig() if config is None else config, extra_losses)
@@ -192,11 +192,7 @@ def parts(
         return drive(method, problem_of(tracked), after.run, headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
-    chosen = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, anchor)
-    discover = config.discover
-    moved = moved_pixels(
-        tracked.image, chosen, tracked.num_cameras, frames=discover.frames, threshold=discover.threshold
-    )
+    chosen, moved = detect_motion(tracked, config, anchor)
     if gaussians is None:
         photographs = photographs_of(tracked.select(frames=[chosen.frame]))
         fitting = fit(photographs, FIT)

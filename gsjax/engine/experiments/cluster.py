@@ -109,7 +109,7 @@ def _reporting_loss(scheduler: str) -> Iterator[None]:
     except CancelledError as error:
         raise OSError(
             f"--scheduler {scheduler}: expected it to stay, found it gone; finished cells are kept, and the "
-            "same command goes on from there"
+            "same command continues from there"
         ) from error
 
 

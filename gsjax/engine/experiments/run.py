@@ -138,7 +138,7 @@ def run_experiment(experiment: Experiment, options: Run) -> int:
         kept = sum(experiment.is_done(experiment.own(cell)) for cell in chosen)
         again = "the same command" + (" without --fresh" if options.fresh else "")
         after = f"by Ctrl-C after {kept} of {len(chosen)} cells"
-        say_error(f"{after}; {again} goes on from there", word="stopped")
+        say_error(f"{after}; {again} continues from there", word="stopped")
         return 130
     if failed:
         again = f"{len(failed)} of {len(chosen)} cells failed and will run again next time"

@@ -21,7 +21,7 @@ from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, See
 from gsjax.engine.parts.loop import Loop, resumed
 from gsjax.engine.parts.outputs import finished
 from gsjax.engine.parts.results import summarize
-from gsjax.engine.parts.start import FIT
+from gsjax.engine.parts.start import FIT, detect_motion
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
@@ -33,9 +33,7 @@ from gsjax.methods.parts import (
     PartsConfig,
     Start,
     begin,
-    choose_anchor,
     masks_of_labels,
-    moved_pixels,
 )
 from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
@@ -85,15 +83,7 @@ def run(options: Options) -> int:
         seconds: dict[str, float] = {}
         tracked = recording.tracked
         with stage(console, "detecting motion"):
-            anchor = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, options.anchor)
-            discover = options.parts.discover
-            moved = moved_pixels(
-                tracked.image,
-                anchor,
-                tracked.num_cameras,
-                frames=discover.frames,
-                threshold=discover.threshold,
-            )
+            anchor, moved = detect_motion(tracked, options.parts, options.anchor)
         masks = _masks(tracked, anchor, moved, options)
         folder.write_config(settings)  # from here on an earlier run is gone
         notes.add(

@@ -121,7 +121,7 @@ class Tracking:
         return np.stack([np.concatenate([pose.means[:count], still]) for pose in self.poses])
 
     def quats(self) -> Float[np.ndarray, "T M 4"]:
-        """The orientations of the moving Gaussians, which stand first, over time."""
+        """The orientations of the moving Gaussians, which come first, over time."""
         return np.stack([pose.quats[: self.scene.num_moving] for pose in self.poses])
 
     def at(self, t: int) -> tuple[TrackedScene, Pose]:

@@ -123,7 +123,9 @@ def _true_paths(
 ) -> dict[str, np.ndarray]:
     """The paths of the same centroids under the true motion."""
     truth, true = recording.tracked.truth, {}
-    for i, label in enumerate(() if truth is None else truth.label_ids):
+    if truth is None:
+        return true
+    for i, label in enumerate(truth.label_ids):
         name = names.get(int(label))
         if name in paths:
             motion = relative_motion(truth.poses[: tracking.num_frames, i])

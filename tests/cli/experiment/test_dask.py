@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     os.killpg(going.pid, signal.SIGINT)  # as a terminal does it: to all of them
     _, err = going.communicate(timeout=60)
     assert going.returncode == 130, err
-    assert "stopped: by Ctrl-C after 1 of 3 cells; the same command goes on from there" in err
+    assert "stopped: by Ctrl-C after 1 of 3 cells; the same command continues from there" in err
     assert "Traceback" not in err
     assert len(cell_files()) == 1
 
