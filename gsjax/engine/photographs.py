@@ -86,11 +86,7 @@ def smaller(photographs: Photographs, scale: float) -> Photographs:
 
 
 def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) -> Photographs:
-    """The photographs of a fit, by the settings of its config.yml.
-
-    Args:
-        settings: the contents of config.yml.
-        dataset: where the photographs are now (default: where they were).
+    """The photographs of a fit, by the settings of its config.yml; `dataset` is their path if it has changed.
 
     Raises:
         DataError: they cannot be read.

@@ -54,12 +54,7 @@ def print_table(table: Table) -> None:
 
 
 def print_facts(facts: Mapping[str, str], title: str = "") -> None:
-    """Print facts on stdout, a line each, with their names in bold.
-
-    Args:
-        facts: name -> text.
-        title: stands above them.
-    """
+    """Print facts on stdout below a title, a line each, with their names in bold."""
     console = Console(highlight=False)
     if title:
         console.print(Text(title, style="bold cyan"))

@@ -49,11 +49,8 @@ class Config:
 
 
 def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Figure]:
-    """Read a config.yaml and check all of it but the sweep, which `read_experiment` checks.
-
-    Args:
-        path: the file.
-        root: the folder of all experiments, which must contain the script.
+    """Read the config.yaml at `path` and check all of it but the sweep, which `read_experiment` checks. The
+    folder of all experiments, `root`, must contain the script.
 
     Raises:
         ValueError: it is no YAML, or a key is invalid.

@@ -85,12 +85,7 @@ class Judge:
         )
 
     def compare(self, gaussians: Gaussians, frame: Frame) -> "Compared":
-        """A rendered view beside its photograph.
-
-        Args:
-            gaussians: the scene.
-            frame: of one camera, on the host.
-        """
+        """The Gaussians as seen in a frame of one camera, which is on the host, beside its photograph."""
         size = frame.images.shape
         drawn, self.plans[size] = self.draw(gaussians, frame.cameras, self.plans.get(size))
         image, truth = np.clip(np.asarray(drawn.colors[0]), 0, 1), frame.images[0] / 255

@@ -54,11 +54,7 @@ class Saver:
 
 
 def load(folder: Path, config: TrackConfig) -> Tracking:
-    """The tracking that a run had saved, to resume from.
-
-    Args:
-        folder: RUN/resume.
-        config: the settings of the tracker.
+    """The tracking saved in a folder RUN/resume by a run with this config.
 
     Raises:
         ValueError: nothing was saved there, or it is damaged, or of another version of gsjax.

@@ -65,15 +65,8 @@ class Options(FirstMasks, OfRecording):
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options, with the defaults of the preset that is named; a budget implies the preset `fast`, which
-    starts from fewer Gaussians.
-
-    Args:
-        arguments: those of the command line.
-
-    Returns:
-        The class of options, and the arguments to parse.
-    """
+    """The class of options, with the defaults of the preset that is named, and the arguments to parse. A
+    budget implies the preset `fast`, which starts from fewer Gaussians."""
     flags = [argument.split("=")[0].replace("_", "-") for argument in arguments]
     if "--budget-ms" in flags and "--preset" not in flags:
         return preset_options(Options, [*arguments, "--preset", "fast"], "track", PRESETS)

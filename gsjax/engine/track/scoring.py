@@ -31,12 +31,8 @@ def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> n
 
 
 def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarray:
-    """The label of each group, [K+1]: its mask value, or without files the segmenter's own.
-
-    Args:
-        tracking: the scene.
-        values: from `group_values`.
-    """
+    """The label of each group of a tracking, [K+1]: its value from `group_values`, or if that is None the
+    segmenter's own."""
     return np.asarray(tracking.scene.label_ids) if values is None else values
 
 

@@ -16,12 +16,7 @@ _MOST_NAMES = 24
 
 
 def heading(scene: Viewable, sent: int) -> str:
-    """A short description of the scene.
-
-    Args:
-        scene: the scene that is shown.
-        sent: number of Gaussians sent to the browser.
-    """
+    """A short description of a scene of which `sent` Gaussians are sent to the browser."""
     count = scene.gaussians.num
     lines = [", ".join([f"**{count:,}** Gaussians", *contents(scene)]) + "."]
     if sent < count:
@@ -111,12 +106,16 @@ def legend(
 
 def _chip(label: int, scene: Viewable) -> str:
     color = "rgb({}, {}, {})".format(*(label_color(label) if label >= 0 else (38, 40, 44)))
-    name = scene.names.get(label, "background" if label == 0 else f"object {label}")
+    name = scene.name_of_label(label)
     dot = f'<span style="color: {color}; font-size: 1.3em; vertical-align: -0.08em">&#9679;</span>'
     return f'<span style="white-space: nowrap; margin-right: 0.5em">{dot} {html.escape(name)}</span>'
 
 
-def as_lines(sentences: Sequence[str], color: str = "inherit") -> str:
+RED, AMBER, GREEN = "#ff6b6b", "#f5b041", "#51cf66"
+"""Colours of errors, warnings and successes."""
+
+
+def as_lines(*sentences: str, color: str = "inherit") -> str:
     """Sentences as HTML, one per line."""
     return _small("".join(f'<div style="color: {color}">{html.escape(line)}</div>' for line in sentences))
 
