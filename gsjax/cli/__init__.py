@@ -1,6 +1,6 @@
-"""`gsjax COMMAND ...`: what can be done from a command line.
+"""The command line, `gsjax COMMAND ...`.
 
-Commands are imported when they are called, so that `gsjax --help` answers at once.
+Commands are imported when they are called, so that `gsjax --help` is fast.
 """
 
 import os
@@ -12,51 +12,51 @@ from importlib import import_module
 from rich.console import Console
 
 GROUPS = {
-    "Look at data": {
-        "info": ("gsjax.cli.info", "say what is understood of a recording or of photographs"),
-        "poses": ("gsjax.cli.poses", "find where photographs or a video were taken, for fit"),
+    "Inspect data": {
+        "info": ("gsjax.cli.info", "describe a recording or a set of photographs"),
+        "poses": ("gsjax.cli.poses", "find the cameras of photographs or of a video, for fit"),
     },
     "Reconstruct": {
-        "track": ("gsjax.cli.track", "follow the objects of a recording from RGB-D cameras"),
-        "live": ("gsjax.cli.live", "follow objects while frames arrive, at a rate you name"),
+        "track": ("gsjax.cli.track", "track the objects of a recording from RGB-D cameras"),
+        "live": ("gsjax.cli.live", "track objects while frames arrive, at a given rate"),
         "fit": ("gsjax.cli.fit", "fit a static scene to posed photographs"),
         "parts": ("gsjax.cli.parts", "find the parts of a moving scene, and their joints"),
-        "deform": ("gsjax.cli.deform", "reconstruct what deforms, from an endoscope say"),
+        "deform": ("gsjax.cli.deform", "reconstruct a deforming scene, such as from an endoscope"),
     },
-    "Give a meaning, and ask": {
-        "distill": ("gsjax.cli.distill", "give the Gaussians of a run or a PLY file a meaning"),
+    "Distil and query": {
+        "distill": ("gsjax.cli.distill", "distil a semantic field for a run or a PLY file"),
         "query": ("gsjax.cli.query", "find what a text means: objects of a run, or Gaussians"),
-        "ask": ("gsjax.cli.ask", "answer a question on a scene that deforms"),
+        "ask": ("gsjax.cli.ask", "answer a question about a deforming scene"),
         "grasp": ("gsjax.cli.grasp", "find the best grasp of what a text means, in every frame"),
     },
-    "See and change": {
-        "view": ("gsjax.cli.view", "look at a run or a PLY file in a browser"),
+    "View and edit": {
+        "view": ("gsjax.cli.view", "view a run or a PLY file in a browser"),
         "edit": ("gsjax.cli.edit", "change when, where and how parts move, and film it"),
     },
-    "Judge and measure": {
-        "eval": ("gsjax.cli.evaluate", "score a scene that was fitted, again or in more ways"),
-        "compare": ("gsjax.cli.compare", "set runs side by side: scores, curves, pictures"),
-        "experiment": ("gsjax.cli.experiment", "sweep what a claim rests on, and collect tables"),
-        "bench": ("gsjax.cli.bench", "measure the rasterizer and every method's step here"),
+    "Evaluate and measure": {
+        "eval": ("gsjax.cli.evaluate", "score a fitted scene again, or with more metrics"),
+        "compare": ("gsjax.cli.compare", "compare runs side by side: scores, curves, pictures"),
+        "experiment": ("gsjax.cli.experiment", "run the sweep behind a claim, and collect its tables"),
+        "bench": ("gsjax.cli.bench", "benchmark the rasterizer and every method's step"),
     },
 }
 COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
-"""Each command's module, which has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
-which returns the exit code, perhaps `HELP`, more to say of it, and perhaps `options_for(arguments)`: the
-options where defaults depend on what is given, and the arguments that are left to parse."""
+"""Each command's module. It has `Options`, a dataclass or a union of them (subcommands), `run(options)`,
+which returns the exit code, perhaps `HELP`, a further description, and perhaps `options_for(arguments)`: the
+options, if defaults depend on the arguments, and the arguments to parse."""
 
 
 def entry() -> None:
-    """The program. After Ctrl-C it leaves without waiting for XLA, which may still be compiling in a thread
-    and would crash while Python takes it down. Where nobody reads on (`gsjax track --help | head`) it ends
+    """The program. After Ctrl-C it exits without waiting for XLA, which may still be compiling in a thread
+    and would crash as Python shuts down. If its output is closed (`gsjax track --help | head`), it ends
     quietly, with the code of a program that SIGPIPE ended."""
     try:
         try:
             code = main()
         finally:
-            sys.stdout.flush()  # later nobody could catch it
+            sys.stdout.flush()  # later, an error could not be caught
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes there
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the rest of the output
         code = 141
     if code == 130:
         sys.stdout.flush()
@@ -66,10 +66,13 @@ def entry() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that `arguments` (those of the process unless given) ask for; returns the exit code.
+    """Run a command; returns the exit code.
 
-    0: done. 1: a fault of gsjax. 2: the user's mistake, said in a sentence. 3: done, but what was looked for
-    is not there (no feasible grasp). 130: Ctrl-C.
+    0: done. 1: a fault of gsjax. 2: the user's mistake, reported in a sentence. 3: done, but nothing was
+    found (no feasible grasp). 130: Ctrl-C.
+
+    Args:
+        arguments: command and options (default: those of the process).
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
@@ -81,8 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if command not in COMMANDS:
         known, meant = ", ".join(COMMANDS), get_close_matches(command, COMMANDS, 1)
-        told = f"no command {command!r}; " + (f"did you mean {meant[0]}? There are" if meant else "there are")
-        Console(stderr=True).print(f"[bold red]error:[/] {told}: {known}")
+        hint = f"did you mean {meant[0]}? There are" if meant else "there are"
+        Console(stderr=True).print(f"[bold red]error:[/] no command {command!r}; {hint}: {known}")
         return 2
     from gsjax.engine.interrupts import heard_interrupts
 
@@ -92,23 +95,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             return run_politely(command, rest, COMMANDS[command])
     except KeyboardInterrupt:
-        Console(stderr=True).print("[bold red]stopped:[/] by Ctrl-C; what is on disk stays")
+        Console(stderr=True).print("[bold red]stopped:[/] by Ctrl-C; files on disk are kept")
         return 130
 
 
 _SHARED = {
     "--out RUN": "the folder of the run, with report.html and metrics.json",
-    "--frames 0:60:2": "which frames or photographs, as Python slices them",
-    "--cameras 0 1": "which cameras are looked through",
-    "--eval-cameras 2": "which are held out, and only judge",
+    "--frames 0:60:2": "frames or photographs to use, as a Python slice",
+    "--cameras 0 1": "cameras to use",
+    "--eval-cameras 2": "cameras to hold out for evaluation",
     "--scale 0.5": "pictures at half their width and height",
-    "--preset NAME": "whose settings; any of them is an option too: --fit.steps",
-    "--seed 1": "of all that is random",
-    "--minutes 5": "stop then, with what there is",
-    "--resume": "go on with a run that was stopped",
-    "--overwrite": "replace a run that is finished",
+    "--preset NAME": "default settings; each is an option too: --fit.steps",
+    "--seed 1": "random seed",
+    "--minutes 5": "stop after this time, and write the result so far",
+    "--resume": "resume a run that was stopped",
+    "--overwrite": "replace a finished run",
 }
-"""Options that mean the same wherever they stand."""
+"""Options that mean the same in all commands."""
 
 
 def _print_help() -> None:
@@ -118,10 +121,10 @@ def _print_help() -> None:
     sections = {
         title: {f"gsjax {name}": does for name, (_, does) in group.items()} for title, group in GROUPS.items()
     }
-    for title, rows in (*sections.items(), ("Options, the same wherever they stand", _SHARED)):
+    for title, rows in (*sections.items(), ("Options with the same meaning in all commands", _SHARED)):
         console.print(f"\n[bold]{title}[/]")
         for name, does in rows.items():
             console.print(f"  [cyan]{name:<18}[/] {does}")
-    console.print("\nAll options of one: [bold]gsjax track --help[/]. A first run, which needs no data:\n")
+    console.print("\nAll options of a command: [bold]gsjax track --help[/]. A first run, without data:\n")
     console.print("  gsjax track simulated:tabletop --out runs/demo --frames 0:30")
     console.print("  gsjax view runs/demo")

@@ -2,5 +2,5 @@
 
 from gsjax.cli import entry
 
-if __name__ == "__main__":  # and not where a process that it started looks for its functions
+if __name__ == "__main__":  # not when a subprocess imports the module
     entry()

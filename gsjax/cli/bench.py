@@ -1,4 +1,4 @@
-"""`gsjax bench`: the benchmark suite of a checkout, on this machine."""
+"""`gsjax bench`: run the benchmark suite of a checkout on this machine."""
 
 from gsjax.engine.bench import Options, run
 

@@ -1,4 +1,4 @@
-"""`gsjax edit`: changes when, where and how parts of a run move, and films it."""
+"""`gsjax edit`: change when, where and how the parts of a run move, and film it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -33,22 +33,21 @@ class Options(Common, Overwriting):
     script: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCRIPT]")] = None
     """A YAML file of edits."""
     op: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OP:KEY=VALUE,...")] = ()
-    """One edit, after those of the script: "speed:parts=drawer,factor=2". Can be given again and again."""
+    """An edit, after those of the script: "speed:parts=drawer,factor=2"."""
     out: Path | None = None
-    """Folder for the film. RUN/edit/NAME unless given, NAME being the script's, or without one "ops", "ops_2"
-    and so on."""
+    """Folder for the film; default: RUN/edit/NAME, with the name of the script, or without one ops, ops_2 and
+    so on."""
     camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the camera to film from. The one to which the edits change most, unless given."""
+    """Id of the camera to film from; default: the one in which the edits change most."""
     ply: bool = False
-    """Write the Gaussians of each frame of the film too, as ply/000000.ply and so on."""
+    """Write the Gaussians of each frame too, as ply/000000.ply and so on."""
 
 
 def run(options: Options) -> int:
-    """Edit, and film what comes of it; returns the exit code. Of a film that Ctrl-C stops, what there is
-    can be watched.
+    """Edit a run, and film the result; returns the exit code. A film that Ctrl-C stops can be watched so far.
 
     Raises:
-        ValueError, OSError: there is no such run or part, or the edits cannot be read or done.
+        ValueError, OSError: there is no such run or part, or the edits cannot be read or applied.
     """
     console = Console(stderr=True, highlight=False)
     with Notes(console) as notes:
@@ -70,13 +69,13 @@ def run(options: Options) -> int:
     part = f" of {asked} (stopped by Ctrl-C)" if stopped else ""
     pace = f"; rendered at {found['render_hz']:.1f} a second" if found["render_hz"] else ""
     print(f"{found['seconds']:.2f} s, {found['frames']} frames{part}, seen by camera {camera}{pace}")
-    print(f"edits   {'; '.join(_said(edit, saved.names) for edit in script.edits)}")
+    print(f"edits   {'; '.join(_described(edit, saved.names) for edit in script.edits)}")
     print(f"film    {folder / VIDEO}")
     return 130 if stopped else 0
 
 
-def _said(edit: Edit, names: Names) -> str:
-    """An edit in short, "freeze: drawer (2)"; parts of another run as the script has them."""
+def _described(edit: Edit, names: Names) -> str:
+    """An edit in short, "freeze: drawer (2)"; parts of another run as in the script."""
     if isinstance(edit, Composite):
         return f"{edit.operation()}: {', '.join(map(str, edit.parts))} of {edit.from_run}"
     called = {number: name for name, number in names.items()}
@@ -86,10 +85,10 @@ def _said(edit: Edit, names: Names) -> str:
 
 
 def read_script(options: Options) -> Script:
-    """The edits that are asked for.
+    """The edits of the options.
 
     Raises:
-        ValueError: there are none, or they are not as they should be; the message names the file or option.
+        ValueError: there are none, or one is invalid; the message names the file or option.
         OSError: the script cannot be read.
     """
     if options.script is None and not options.op:
@@ -114,10 +113,10 @@ def read_script(options: Options) -> Script:
 
 
 def _folder(options: Options) -> Path:
-    """Where the film goes.
+    """The folder of the film.
 
     Raises:
-        FileExistsError: something is there that is no film, or one that may not be replaced.
+        FileExistsError: it holds something that is no film, or a film that may not be replaced.
         NotADirectoryError: it is a file.
     """
     if options.out is None and options.script is None and not options.overwrite:

@@ -1,14 +1,14 @@
-"""`gsjax fit`: a static scene from posed photographs."""
+"""`gsjax fit`: fit a static scene to posed photographs."""
 
 from gsjax.engine.fit.run import Options, run
 from gsjax.engine.options import preset_options
 from gsjax.methods.fit import PRESETS
 
-HELP = " All frames of a recording are taken as photographs of one scene."
+HELP = " The frames of a recording are used as photographs of one scene."
 
 __all__ = ["HELP", "Options", "options_for", "run"]
 
 
 def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
-    """The options whose defaults are those of the preset that is named."""
+    """The options, with the defaults of the preset that is named."""
     return preset_options(Options, arguments, "fit", PRESETS)

@@ -1,4 +1,4 @@
-"""`gsjax parts`: from synchronised cameras to the parts of a moving scene."""
+"""`gsjax parts`: find the parts of a moving scene in a recording by synchronised cameras."""
 
 from gsjax.engine.parts.run import Options, run
 

@@ -19,6 +19,7 @@ from gsjax.io.atomic import write_new
 from gsjax.io.pictures import write_png
 from gsjax.optim.compiler import host_options
 from gsjax.viz.viewer import Viewable, Viewer, open_viewer
+from gsjax.viz.viewer.markup import contents
 from gsjax.viz.viewer.server import PORT, is_loopback, load_viser
 
 _UP = {sign + axis: s * np.eye(3)[i] for sign, s in (("", 1), ("-", -1)) for i, axis in enumerate("xyz")}
@@ -27,34 +28,34 @@ _NUMBERED = re.compile(r"(\d+)_")
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What `gsjax view` is told."""
+    """Options of `gsjax view`."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FIELD|FILE.ply")]
     """Folder of a run of `gsjax fit`, `gsjax track`, `gsjax parts` or `gsjax deform`; of a field (`gsjax
     distill`); or a PLY file of Gaussians. A field, a fit with one and a deforming scene with names can be
-    asked."""
+    queried."""
     host: str = "127.0.0.1"
-    """Address to listen on. Only this machine can look unless it is another than the default."""
+    """Address to listen on. With the default, only this machine can connect."""
     port: int | None = None
-    """Port to listen on. 8080, or the next one that is free, unless given."""
+    """Port to listen on; default: 8080, or the next free one."""
     max_gaussians: int = 500_000
-    """The browser gets so many Gaussians at most, the most opaque ones; our render has all."""
+    """Most Gaussians that the browser receives, the most opaque ones; our render draws all."""
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """Which way is up; as photographs were held, else z, unless given."""
+    """The up direction; auto: that of the photographs, else z."""
     scene: Path | None = None
-    """Of a field: the PLY file of its scene, where it is now."""
+    """Present path of a field's scene, a PLY file."""
     images: str | None = None
-    """Of a field or a fit: where the photographs are now."""
+    """Present path of the photographs of a field or a fit."""
     weights: Path | None = None
-    """Of what CLIP taught: the folder of its weights, where it is now."""
+    """Present folder of CLIP's weights, for features of CLIP."""
 
 
 def run(options: Options) -> int:
-    """Show it until Ctrl-C, whose exit code it returns.
+    """Show the scene until Ctrl-C; returns its exit code.
 
     Raises:
         MissingExtra: viser is not installed.
-        ValueError, OSError: there is nothing to look at, or nothing can listen at that address.
+        ValueError, OSError: there is no such scene, or nothing can listen at that address.
     """
     load_viser()  # before anything is read
     console = Console(stderr=True, highlight=False)
@@ -72,16 +73,16 @@ def run(options: Options) -> int:
             save=screenshots(folder / "screenshots"),
             compiler_options=host_options(),
         ) as viewer:
-            _say(options, scene, viewer, notes)
+            _announce(options, scene, viewer, notes)
             try:
                 viewer.wait()
             except KeyboardInterrupt:
-                say_error("nobody can look any more", word="stopped")
+                say_error("the page is no longer served", word="stopped")
     return 130
 
 
-def _say(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -> None:
-    """Where it can be looked at, and by whom."""
+def _announce(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -> None:
+    """Print the address, and who can connect."""
     num = scene.gaussians.num
     if num > options.max_gaussians:
         notes.warn(
@@ -92,28 +93,25 @@ def _say(options: Options, scene: Viewable, viewer: Viewer, notes: Notes) -> Non
         notes.warn(f"port {PORT} is in use; this is {viewer.port} (--port names one)")
     if not is_loopback(options.host):
         notes.warn(
-            f"--host {options.host}: everyone who reaches this machine over the network can look, and save "
-            "screenshots and films here; there is no password"
+            f"--host {options.host}: everyone who reaches this machine over the network can view the scene, "
+            "and save screenshots and films here; there is no password"
         )
     console = Console(highlight=False)
-    console.print(f"[bold]scene[/]   {in_words(scene)}", soft_wrap=True)
+    console.print(f"[bold]scene[/]   {', '.join(_facts(scene))}", soft_wrap=True)
     console.print(f"[bold]view[/]    {viewer.url}   (Ctrl-C ends it)", soft_wrap=True)
 
 
-def in_words(scene: Viewable) -> str:
-    """How much there is to see."""
-    told = [f"{scene.gaussians.num:,} Gaussians", f"SH degree {scene.gaussians.sh_degree}"]
-    if scene.num_frames > 1:
-        told.append(f"{scene.num_frames} frames")
-    if scene.shots is not None:
-        told.append(f"{len(scene.shots.names)} {'cameras' if scene.num_frames > 1 else 'photographs'}")
-    if scene.asking is not None:
-        told.append("can be asked")
-    return ", ".join(told)
+def _facts(scene: Viewable) -> list[str]:
+    return [
+        f"{scene.gaussians.num:,} Gaussians",
+        *contents(scene),
+        *(["can be queried"] if scene.asking else []),
+    ]
 
 
 def screenshots(folder: Path) -> Callable[[str, np.ndarray], Path]:
-    """Keeps pictures in a folder as NUMBER_KIND.png, numbered on; none is written over."""
+    """A function that saves pictures in a folder as NUMBER_KIND.png, with the next number; none is
+    replaced."""
 
     def save(kind: str, picture: np.ndarray) -> Path:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The benchmark suite of a checkout, as `gsjax bench` and `python -m benchmarks` run it."""
+"""The benchmark suite of a checkout, as run by `gsjax bench` and `python -m benchmarks`."""
 
 import sys
 from dataclasses import dataclass
@@ -20,30 +20,30 @@ class Options(Common):
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = ()
     """Only these workloads: a name, its part before the first hyphen (garden), or a pattern (ball-1e6*)."""
     quick: bool = False
-    """Small scenes, a few calls of each: under two minutes."""
+    """Use small scenes and few calls of each: under two minutes."""
     repeats: int | None = None
-    """Timed calls of each program. 15 unless given, and 5 with --quick."""
+    """Number of timed calls of each program; default: 15, or 5 with --quick."""
     check: bool = False
-    """Exit with 1 if a figure is worse than the baseline by more than its tolerance."""
+    """Exit with code 1 if a figure is worse than the baseline by more than its tolerance."""
     update_baseline: bool = False
-    """Make what was measured the baseline."""
+    """Save the measured figures as the baseline."""
     out: Path | None = None
-    """Folder for bench.json, results.md and growth.png. benchmarks/results for the whole suite, which is
-    committed, and runs/bench for a part of it."""
+    """Folder for bench.json, results.md and growth.png; default: benchmarks/results, which is committed, for
+    the whole suite, and runs/bench for a part of it."""
 
 
 def run(options: Options) -> int:
     """Run the suite; returns the exit code: 1 if --check found something worse, 130 after Ctrl-C.
 
     Raises:
-        ValueError: this is no checkout of gsjax, or what was asked cannot be done.
+        ValueError: the working directory is no checkout of gsjax, or an option cannot be met.
     """
     if not SUITE.is_file():
         raise ValueError(
             f"gsjax bench: expected {SUITE} in the working directory, found none in {Path.cwd()}. The suite "
-            "is part of the source, not of the installed package: go to a checkout of gsjax and call it there"
+            "is part of the source, not of the installed package: run it in a checkout of gsjax"
         )
     folder = str(Path.cwd())
-    if folder not in sys.path:  # a console script does not look where it is called
+    if folder not in sys.path:  # a console script does not search the working directory
         sys.path.insert(0, folder)
     return import_module("benchmarks.suite").run(options)

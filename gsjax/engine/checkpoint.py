@@ -9,12 +9,12 @@ from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoi
 
 
 def save(path: str | os.PathLike, now: Tick) -> None:
-    """Write what a method has come to, its configuration and its result; atomic.
+    """Write the state of a method, its configuration and its result; atomic.
 
     Args:
-        path: where; `.npz` by custom.
-        now: a tick, the newest one: the arrays of those before it are given away. Custom losses are functions
-            and are not stored; give them again when you go on.
+        path: the file; `.npz` by convention.
+        now: the newest tick: the arrays of earlier ones have been donated. Custom losses are functions and
+            are not stored; pass them again to continue.
     """
     method = now.method
     if getattr(method, "extra_losses", ()):
@@ -25,8 +25,8 @@ def save(path: str | os.PathLike, now: Tick) -> None:
 
 
 def load(path: str | os.PathLike) -> Tick:
-    """The tick that `save` wrote. Its `result` is there at once; to go on, give it to the verb that made it:
-    `gsjax.fit(photographs, now.method.config, after=now)`.
+    """The tick that `save` wrote. Its `result` is available at once; to continue, pass it to the verb that
+    made it: `gsjax.fit(photographs, now.method.config, after=now)`.
 
     Raises:
         FileNotFoundError: there is no file at `path`.
@@ -35,8 +35,8 @@ def load(path: str | os.PathLike) -> Tick:
     stored, times = load_checkpoint(path)
     if not isinstance(stored, dict) or set(stored) != {"method", "run", "result", "info"}:
         raise CheckpointError(
-            f"{path}: expected what gsjax.save writes, found another checkpoint; the resume folder of a run "
-            "is gone on with by --resume"
+            f"{path}: expected what gsjax.save writes, found another checkpoint; to continue from the resume "
+            "folder of a run, use --resume"
         )
     result: Any = stored.pop("result")
     now = Tick(problem=None, **stored, **times)

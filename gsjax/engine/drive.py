@@ -1,5 +1,5 @@
-"""The one loop over steps. It alone owns compiler options, the donation of buffers, overflow, what is compile
-time, skipped steps, keys, headroom, and when Ctrl-C may strike.
+"""The one loop over steps. It alone owns compiler options, the donation of buffers, overflow, compile time,
+random keys, headroom, and when Ctrl-C may interrupt.
 
     ticks = drive(method, problem, run)
     for now in ticks:
@@ -23,7 +23,7 @@ from gsjax.rasterize.plan import HEADROOM
 
 
 class Clock:
-    """Wall time since it was made, with compiling apart."""
+    """Wall time since its creation, with compiling apart."""
 
     def __init__(self):
         self._begun, self._compiled = perf_counter(), compile_seconds()
@@ -39,14 +39,13 @@ class Tick:
     """A method after one more step.
 
     Attributes:
-        method: the method, with its configuration; the tracker, which takes frames and not steps, is none but
-            has `config` and `result` as well.
+        method: the method, with its configuration; of the tracker, an object with `config` and `result`.
         problem: what does not change; None after `gsjax.load`.
-        run: what there is to go on from. The next step takes over its arrays: copy what is to be kept.
+        run: the state to continue from. The next step donates its arrays: copy what is to be kept.
         info: losses and diagnostics of this step by name, on the device; see `gsjax.optim.step`.
-        seconds: wall time of the step, compiling apart.
-        compile_seconds: time that went into tracing and compiling.
-        progress: how far the schedule was before this step, 0 to 1.
+        seconds: wall time of the step, without compiling.
+        compile_seconds: time of tracing and compiling.
+        progress: progress of the schedule before this step, 0 to 1.
     """
 
     method: Method | Any
@@ -59,20 +58,20 @@ class Tick:
 
     @property
     def step(self) -> int:
-        """How many steps were made."""
+        """Number of steps so far."""
         return self.run.step
 
     @cached_property
     def result(self) -> Any:
-        """What the method is for: Gaussians, parts, a field that answers queries, a scene over time."""
+        """The method's result: Gaussians, parts, a field that answers queries, or a scene over time."""
         return self.method.result(self.problem, self.run)
 
 
 class Drive(Iterator[Tick]):
-    """Steps of a method, made as they are asked for; see `drive`.
+    """Iterates over the steps of a method; see `drive`.
 
     Attributes:
-        run: the newest run, whatever became of the tick that had it: Ctrl-C strikes between steps only.
+        run: the newest run. Ctrl-C interrupts between steps only, so it is always valid.
         tick: the newest tick; None before the first step.
     """
 
@@ -85,7 +84,8 @@ class Drive(Iterator[Tick]):
         headroom: float = HEADROOM,
     ):
         self.method, self.problem, self.run, self.tick = method, problem, run, None
-        self._progress = self._of_total if progress is None else progress
+        total = method.total(problem)
+        self._progress = (lambda step: step / total if total else 1.0) if progress is None else progress
         self._headroom = headroom
         self._advance = _compiled(method)
         self._key = jax.random.key(method.config.seed)
@@ -101,12 +101,8 @@ class Drive(Iterator[Tick]):
 
     @property
     def result(self) -> Any:
-        """What the method has come to, also before the first step."""
+        """The present result, also before the first step."""
         return self.method.result(self.problem, self.run) if self.tick is None else self.tick.result
-
-    def _of_total(self, step: int) -> float:
-        total = self.method.total(self.problem)
-        return step / total if total else 1.0
 
     def _one_step(self, progress: float) -> Tick:
         clock, method, problem = Clock(), self.method, self.problem
@@ -132,23 +128,23 @@ def drive(
     progress: Callable[[int], float] | None = None,
     headroom: float = HEADROOM,
 ) -> Drive:
-    """Step by step, until all is done. The same run, problem and progress give the same bits, wherever the
-    run was begun or resumed.
+    """Run a method step by step. The same run, problem and progress give the same bits, also if the run is
+    resumed.
 
     Args:
-        method: which steps.
+        method: the method.
         problem: from the method's `start`.
-        run: from `start`, or that of an earlier tick. Its arrays are given away in the first step.
-        progress: step -> how far the schedule is before that step, 0 to 1; at 1 it ends. By default the
-            share of the method's steps.
-        headroom: how many times as much as was needed a plan holds after an overflow.
+        run: from `start`, or of an earlier tick. Its arrays are donated to the first step.
+        progress: step -> progress of the schedule before that step, 0 to 1; it ends at 1 (default: the
+            fraction of the method's steps).
+        headroom: capacity of a plan after an overflow, relative to what was needed.
     """
     return Drive(method, problem, run, progress, headroom)
 
 
 @lru_cache(maxsize=4)
 def _compiled(method: Method) -> Callable:
-    """The jitted update of a method, kept so that a second problem like the first starts at once."""
+    """The jitted update of a method, cached so that a second problem like the first starts at once."""
     update = method.step.update
 
     @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))

@@ -1,5 +1,5 @@
-"""What commands that work on a run read back of it, whichever command made it: arrays, the scene, the
-recording. `again` is what each advises where a file is not as it was written."""
+"""Files of a run read back, whichever command made it: arrays, the scene, the recording. `again` is the
+advice of error messages if a file is not as it was written."""
 
 import zipfile
 import zlib
@@ -22,12 +22,12 @@ _SETTINGS = ("dataset", "cameras", "frames")
 
 
 def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file, those that are wanted among them.
+    """The arrays of a .npz file.
 
     Args:
         file: a .npz.
-        wanted: names.
-        again: what to do where one is missing, for the error.
+        wanted: names of arrays that must be there.
+        again: what to do if one is missing, for the error.
 
     Raises:
         ValueError: it cannot be read, or lacks one of them.
@@ -48,19 +48,19 @@ def read_arrays(file: Path, wanted: Sequence[str], again: str) -> dict[str, np.n
 def check_arrays(
     file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[str | int]], again: str
 ) -> dict[str, int]:
-    """Check that arrays of a file hold finite numbers and fit each other.
+    """Check that arrays of a file hold finite numbers and have matching shapes.
 
     Args:
-        file: where they are from, for the error.
-        arrays: by name.
-        again: what to do where one is wrong, for the error.
-        shapes: of each that is checked. A letter is as many as where it first stands, one at least.
+        file: their file, for the error.
+        arrays: the arrays by name.
+        shapes: shape of each array to check. A letter stands for one size throughout, at least 1.
+        again: what to do if one is wrong, for the error.
 
     Returns:
-        How many each letter is.
+        The size of each letter.
 
     Raises:
-        ValueError: one has another shape, is of something else, or is not finite everywhere.
+        ValueError: an array has another shape, holds no numbers, or is not finite everywhere.
     """
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
@@ -83,7 +83,7 @@ def check_arrays(
 
 
 def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
-    """The Gaussians of a PLY file that can be drawn, and what else it held; says how many cannot.
+    """The drawable Gaussians of a PLY file, and what else it held; warns of those that cannot be drawn.
 
     Raises:
         FileNotFoundError, PlyError: as `read_ply`.
@@ -98,13 +98,13 @@ def read_drawable(file: Path, notes: Notes) -> tuple[Gaussians, PlyReport]:
 
 
 def read_scene(path: Path, count: int, arrays: str, again: str) -> Gaussians:
-    """The Gaussians of a run's scene.ply, as many as its file `arrays` tells of.
+    """The Gaussians of a run's scene.ply.
 
     Args:
-        path: of the run.
-        count: how many there have to be.
-        arrays: the name of the file that says so.
-        again: what to do where they differ, for the error.
+        path: folder of the run.
+        count: the expected number.
+        arrays: the name of the file with that number.
+        again: what to do if they differ, for the error.
 
     Raises:
         ValueError: there are not as many, or not all of them can be drawn.
@@ -122,17 +122,16 @@ def reopen(
     also: Callable[[Mapping[str, Any]], Any] = lambda settings: None,
     opened: Opener | None = None,
 ) -> tuple[Recording, Any]:
-    """The recording of a run, by what its config.yml says, and what else is wanted of the settings. `opened`
-    opens it, as that command does.
+    """The recording of a run, by its config.yml, and something else of its settings.
 
     Args:
         config: the file.
-        again: what to do where it cannot be used, for the error.
-        also: takes what else is wanted out of the settings.
-        opened: as above; `open_sequence` unless given.
+        again: what to do if it cannot be used, for the error.
+        also: settings -> what else to return.
+        opened: opens the dataset, as the run's command does (default: `open_sequence`).
 
     Raises:
-        ValueError: these are no such settings, or the recording cannot be opened.
+        ValueError: the settings are not those of a run, or the recording cannot be opened.
     """
     try:
         settings = yaml.safe_load(config.read_text(encoding="utf-8"))
@@ -147,20 +146,20 @@ def reopen(
         raise ValueError(f"{config}: expected a run's settings ({listed}), found others; {again}") from error
     except DataError as error:
         raise ValueError(
-            f"{config}: its recording cannot be opened: {error} A path that is not absolute is looked for "
-            "from the folder you are in."
+            f"{config}: its recording cannot be opened: {error} A path that is not absolute is relative to "
+            "the working directory."
         ) from error
 
 
 def read_options(stored: Mapping[str, Any]) -> ReadOptions:
-    """What a config.yml tells of how the dataset was read; what this version does not know is left out."""
+    """The options by which a dataset was read, from a config.yml; unknown ones are left out."""
     known = {field.name for field in fields(ReadOptions)}
     plain = {name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()}
     return ReadOptions(**{name: value for name, value in plain.items() if name in known})
 
 
 def chosen_camera(recording: Recording, camera: int | None, run: Path) -> int:
-    """The id of a camera of a run; the first held out one, else the first, unless given.
+    """The id of a camera of a run; default: the first held-out one, else the first.
 
     Raises:
         ValueError: the run had no such camera.

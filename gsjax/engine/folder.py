@@ -1,4 +1,4 @@
-"""The folder of one run: what lies where, and who may write over it."""
+"""The folder of a run: its files, and when it may be written over."""
 
 import dataclasses
 import enum
@@ -15,43 +15,34 @@ import yaml
 
 from gsjax.io.atomic import atomic_write, write_json, write_npz
 
-_FILES = ("config.yml", "metrics.json", "metrics.jsonl", "report.html")
-_FILES += ("trajectory.npz", "scene.ply", "cameras.npz", "poses.npz", "parts.npz")
-_FILES += ("field.npz", "deformation.npz")
-_FOLDERS = (
-    "canonical",
-    "renders",
-    "plots",
-    "query",
-    "grasp",
-    "eval",
-    "edit",
-    "field",
-    "tensorboard",
-    "test",
+_WRITTEN = (
+    *("config.yml", "metrics.json", "metrics.jsonl", "report.html", "trajectory.npz", "scene.ply"),
+    *("cameras.npz", "poses.npz", "parts.npz", "field.npz", "deformation.npz", "video_*.mp4", ".*.partial*"),
+    *("canonical", "renders", "plots", "query", "grasp", "eval", "edit", "field", "tensorboard", "test"),
     "resume",
 )
-_PATTERNS = ("video_*.mp4", ".*.partial*")
-# What a run that was stopped has come to.
-_VALUABLE = ("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz")
-_VALUABLE += ("deformation.npz",)
-# What it can go on from; `gsjax parts` has a fit within, which may be all that there is.
+"""All that a run, and what is made from it, writes into its folder; `screenshots` are kept."""
+_VALUABLE = (
+    *("metrics.json", "trajectory.npz", "scene.ply", "canonical/scene.ply", "field.npz"),
+    "deformation.npz",
+)
+"""Results that make an unfinished run worth keeping."""
 _RESUMED = ("resume/*", "canonical/resume/*", "canonical/scene.ply")
+"""What a run resumes from; `gsjax parts` contains a fit, which may be all that is there."""
 OF_QUERY = ("query.json", "selection.npz", "masks", "frames", "video.mp4", "overview.png")
 OF_QUERY += ("object.ply", "without.ply", "recolored.ply", "moved.ply")
-"""What `gsjax query` writes into its folder."""
+"""The files that `gsjax query` writes."""
 SIGNATURE = "# gsjax run"  # the first line of config.yml: other programs write files of that name too
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a run has written its settings there."""
+    """Whether a folder holds the settings of a run."""
     config = folder / "config.yml"
     return config.is_file() and config.read_bytes().startswith(SIGNATURE.encode())
 
 
 def expect_run(path: Path, made_by: str = "") -> None:
-    """Raises FileNotFoundError where there is no folder of a run, which is then said to be `made_by` a
-    command."""
+    """Raises FileNotFoundError if this is no folder of a run, `made_by` a command."""
     expect_folder(path, made_by)
     if not is_run(path):
         found = "other files" if any(path.iterdir()) else "an empty folder"
@@ -62,7 +53,7 @@ def expect_run(path: Path, made_by: str = "") -> None:
 
 
 def expect_folder(path: Path, made_by: str = "") -> None:
-    """Raises FileNotFoundError where there is no folder that could be a run's."""
+    """Raises FileNotFoundError if this is no folder."""
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing there"
         raise FileNotFoundError(f"{_wanted(path, made_by)}, found {found}; name its --out")
@@ -73,29 +64,29 @@ def _wanted(path: Path, made_by: str) -> str:
 
 
 def expect_dataset(path: str) -> None:
-    """Raises ValueError where a run's folder, or a PLY file, stands in place of a dataset."""
+    """Raises ValueError if the path is a run's folder or a PLY file instead of a dataset."""
     if is_run(Path(path)):
         raise ValueError(
-            f"{path}: expected a dataset, found the folder of a run; open its report.html, or look at it by "
+            f"{path}: expected a dataset, found the folder of a run; open its report.html, or view it with "
             f"gsjax view {path}"
         )
     if path.lower().endswith(".ply") and Path(path).is_file():
-        raise ValueError(f"{path}: expected a dataset, found a PLY file; look at it by gsjax view {path}")
+        raise ValueError(f"{path}: expected a dataset, found a PLY file; view it with gsjax view {path}")
 
 
 class RunFolder:
-    """One run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
+    """A run on disk. Files are replaced whole, so a run that was stopped is as readable as a finished one.
 
         RUN/
           config.yml              the settings, written first; its first line marks the folder as a run's
           metrics.json            every score; what could not be computed is null
-          metrics.jsonl           of a fit: loss, PSNR, count of Gaussians while it goes on, a line each
+          metrics.jsonl           of a fit: loss, PSNR, number of Gaussians during the fit, one row per line
           trajectory.npz          means [T,N,3], quats [T,M,4], normals [M,3], labels [N], label_ids [K+1],
                                   times [T], update_s [T], lost [T,K], turn_known [T,K]
           parts.npz               of `gsjax parts`: anchor, means0 [N,3], weights [N,P], labels [N],
                                   centres [P,3], R [T,P,3,3], t [T,P,3], times [T]
           field.npz               of `gsjax distill`: features of places, and what they mean
-          deformation.npz         of `gsjax deform`: the canonical scene, its features, and what moves it
+          deformation.npz         of `gsjax deform`: the canonical scene, its features, and its motion
           scene.ply               the Gaussians: of a fit, or of the first (or canonical) frame with labels
           canonical/              of `gsjax parts`: the fit of its canonical frame, a run of its own
           cameras.npz             of a fit that learned them: names [V], viewmats [V,4,4], exposures [V,3,4]
@@ -103,42 +94,48 @@ class RunFolder:
           renders/CAM/FRAME.png   rendered images; of a fit renders/held_out/NUMBER.png, beside the truth
           video_CAM.mp4           input, render, error and labels side by side; of a fit video_orbit.mp4
           plots/NAME.svg|png      update time, error over frames, ...
-          report.html             all of it on one page, written last
-          screenshots/            what was saved from `gsjax view`; --overwrite keeps it
-          resume/                 what an unfinished run goes on from; a finished one has none
-          query/, grasp/, eval/   what `gsjax query`, `gsjax grasp` and `gsjax eval` found afterwards
+          report.html             everything on one page, written last
+          screenshots/            pictures saved from `gsjax view`; --overwrite keeps them
+          resume/                 what an unfinished run resumes from; a finished one has none
+          query/, grasp/, eval/   results of `gsjax query`, `gsjax grasp` and `gsjax eval`
           field/                  of `gsjax distill`: a run of its own
-          test/FRAME.png          of `gsjax deform`: held-out frames as the scene has them
+          test/FRAME.png          of `gsjax deform`: held-out frames as the scene renders them
           edit/NAME/              of `gsjax edit`: video.mp4, edit.yaml, metrics.json, perhaps ply/FRAME.ply
           tensorboard/            of a fit with --tensorboard: its event files
 
-    A run is finished when it has its report, and metrics.json does not say that it was stopped.
+    A run is finished when it has its report, and its metrics.json does not say that it was stopped.
 
     Attributes:
         path: the folder, which exists once settings are written.
+        config, metrics, metrics_lines, scene, report: paths of its files, as above.
+        resume: folder of what an unfinished run resumes from.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False, resume: bool | None = False):
-        """Claims the folder. It is made, and what an earlier run left there is cleared, when this run writes
+        """Claim the folder. It is made, and what an earlier run left there is removed, when this run writes
         its settings.
 
         Args:
             path: a folder that does not exist, is empty, or holds an earlier run.
-            overwrite: clear an earlier run although it is finished, or could be resumed. What a run does
-                not write beside it is kept; its folders are cleared whole.
-            resume: keep an unfinished run. None for commands that cannot go on with one.
+            overwrite: replace an earlier run although it is finished, or could be resumed. Files that no run
+                writes are kept.
+            resume: keep an unfinished run. None for commands that cannot resume.
 
         Raises:
             FileNotFoundError: `resume` is on and no run is there.
-            FileExistsError: a finished run is there and `overwrite` is off, or an unfinished one that
-                has come to something and both are off.
-            FileExistsError: something that is not a run is there; nothing of it is touched.
+            FileExistsError: a finished run is there and `overwrite` is off, or an unfinished one with results
+                and both are off; or something that is not a run is there. Nothing of it is touched.
             NotADirectoryError: `path` is a file.
             ValueError: both `resume` and `overwrite` are on.
         """
         self.path, self._stale = Path(path), False
+        self.config, self.resume = self.path / "config.yml", self.path / "resume"
+        self.metrics, self.metrics_lines = self.path / "metrics.json", self.path / "metrics.jsonl"
+        self.scene, self.report = self.path / "scene.ply", self.path / "report.html"
         if resume and overwrite:
-            raise ValueError("--resume and --overwrite: one goes on with a run, the other replaces it")
+            raise ValueError(
+                "--resume and --overwrite: one continues a run, the other replaces it; choose one"
+            )
         if resume and not self.config.is_file():
             raise FileNotFoundError(f"{self.path}: expected a run to resume, found none; leave out --resume")
         if self.path.exists() and not self.path.is_dir():
@@ -147,7 +144,7 @@ class RunFolder:
             self._claim(overwrite, resume)
 
     def _claim(self, overwrite: bool, resume: bool | None) -> None:
-        # config.yml is written first, so a folder without ours is none of a run: delete nothing there.
+        # config.yml is written first, so a folder without it is no run's: delete nothing there.
         if not is_run(self.path):
             raise FileExistsError(
                 f"{self.path}: expected a new folder, an empty one or one of a run (whose config.yml begins "
@@ -160,9 +157,9 @@ class RunFolder:
                 "--overwrite"
             )
         resumable = any(any(self.path.glob(pattern)) for pattern in _RESUMED)
-        worth = resumable or any((self.path / name).exists() for name in _VALUABLE)
-        if worth and not (resume or overwrite):
-            advice = "go on with it by --resume, or " if resumable and resume is not None else ""
+        valuable = resumable or any((self.path / name).exists() for name in _VALUABLE)
+        if valuable and not (resume or overwrite):
+            advice = "continue it with --resume, or " if resumable and resume is not None else ""
             raise FileExistsError(
                 f"{self.path}: holds an unfinished run; {advice}replace it with --overwrite"
             )
@@ -170,66 +167,40 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether a run that was not stopped has written all that it writes here: its report comes last."""
-        metrics = self.path / "metrics.json"
-        if not metrics.is_file():
+        """Whether a run that was not stopped has written everything: its report comes last."""
+        if not self.metrics.is_file():
             return False
-        found = json.loads(metrics.read_text(encoding="utf-8"))
+        found = json.loads(self.metrics.read_text(encoding="utf-8"))
         return found.get("complete", True) and (self.report.is_file() or not found.get("report", True))
 
-    @property
-    def config(self) -> Path:
-        """Where the settings belong."""
-        return self.path / "config.yml"
-
-    @property
-    def metrics_lines(self) -> Path:
-        """Where the rows of a run that learns belong, a line each."""
-        return self.path / "metrics.jsonl"
-
-    @property
-    def resume(self) -> Path:
-        """Where an unfinished run keeps what it can go on from."""
-        return self.path / "resume"
-
     def forget_resume(self) -> None:
-        """Removes what only an unfinished run needs."""
+        """Remove what only an unfinished run needs."""
         shutil.rmtree(self.resume, ignore_errors=True)
 
-    @property
-    def report(self) -> Path:
-        """Where the report belongs."""
-        return self.path / "report.html"
-
-    @property
-    def scene(self) -> Path:
-        """Where the Gaussians belong."""
-        return self.path / "scene.ply"
-
     def render(self, camera: int | str, frame: int) -> Path:
-        """Where the rendered image of a camera (its cam_id) at a frame belongs; its folder exists."""
+        """Path of the rendered image of a camera (its id) at a frame; its folder exists."""
         path = self.path / "renders" / str(camera) / f"{frame:06d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def video(self, camera: int | str) -> Path:
-        """Where the side-by-side video of a camera belongs."""
+        """Path of the side-by-side video of a camera."""
         return self.path / f"video_{camera}.mp4"
 
     def plot(self, name: str, suffix: str = ".svg") -> Path:
-        """Where the plot `name` belongs; its folder exists."""
+        """Path of the plot `name`; its folder exists."""
         path = self.path / "plots" / f"{name}{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def write_config(self, config: Any) -> None:
-        """Writes config.yml from a dataclass instance, nested ones included, in place of an earlier run.
+        """Write config.yml from a dataclass instance, nested ones included, and remove an earlier run.
 
         Raises:
             TypeError: `config` is not a dataclass instance.
         """
         text = yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False, allow_unicode=True)
-        for name in (*_FILES, *_FOLDERS, *_PATTERNS) if self._stale else ():
+        for name in _WRITTEN if self._stale else ():
             for entry in self.path.glob(name):
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         self._stale = False
@@ -237,12 +208,12 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise type(error)(f"{self.path}: cannot make this folder ({error.strerror})") from error
-        self.report.unlink(missing_ok=True)  # that of a part: a run is finished when it has its own
+        self.report.unlink(missing_ok=True)  # of an incomplete run: it is finished when it has its own
         with atomic_write(self.config) as temporary:
             temporary.write_text(f"{SIGNATURE}\n{text}", encoding="utf-8")
 
     def check_config(self, config: Any, *, but: tuple[str, ...]) -> None:
-        """Raises ValueError where config.yml says something else than `config`, the settings `but` apart."""
+        """Raises ValueError if config.yml differs from `config` in settings other than `but`."""
         stored = _flat(yaml.safe_load(self.config.read_text(encoding="utf-8")))
         given = _flat(plain(dataclasses.asdict(config)))
         names = [n for n in dict.fromkeys([*given, *stored]) if n.split(".")[0] not in but]
@@ -255,11 +226,11 @@ class RunFolder:
             )
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
-        """Writes metrics.json; numbers that are not finite become null."""
-        write_json(self.path / "metrics.json", metrics)
+        """Write metrics.json; numbers that are not finite become null."""
+        write_json(self.metrics, metrics)
 
     def write_trajectory(self, **arrays: Any) -> None:
-        """Writes trajectory.npz."""
+        """Write trajectory.npz."""
         write_npz(self.path / "trajectory.npz", arrays)
 
 
@@ -267,8 +238,8 @@ def fresh_folder(path: Path, written: Sequence[str]) -> Path:
     """An empty folder; what gsjax left there earlier is removed.
 
     Args:
-        path: where it belongs.
-        written: what gsjax writes there, names or patterns; the first is always there.
+        path: the folder.
+        written: names or patterns of what gsjax writes there; the first is always there.
 
     Raises:
         FileExistsError: something else is there; nothing of it is touched.
@@ -282,14 +253,14 @@ def fresh_folder(path: Path, written: Sequence[str]) -> Path:
 
 @contextmanager
 def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
-    """A new folder to write into, which takes the place of what gsjax left at `path` earlier when the block
-    ends well. Until then, and after an exception (Ctrl-C too), that is as it was.
+    """A new folder to write into, which replaces what gsjax left at `path` earlier when the block succeeds.
+    Until then, and after an exception (Ctrl-C too), the earlier folder stays as it was.
 
     Args, raises: as `fresh_folder`.
     """
     path = expect_ours(path, written)
     new, old = (path.with_name(f".{path.name}.{os.getpid()}.partial{which}") for which in ("", "_old"))
-    for stale in (new, old):  # of a process that was killed, and had our number
+    for stale in (new, old):  # of a killed process with the same number
         shutil.rmtree(stale, ignore_errors=True)
     try:
         new.mkdir(parents=True)
@@ -307,7 +278,7 @@ def replaced_folder(path: Path, written: Sequence[str]) -> Iterator[Path]:
 
 
 def expect_ours(path: Path, written: Sequence[str]) -> Path:
-    """The folder itself where `path` is a link, if it may be replaced.
+    """The folder, with links resolved, if it may be replaced.
 
     Raises:
         FileExistsError: something is there that gsjax did not write.
@@ -321,13 +292,13 @@ def expect_ours(path: Path, written: Sequence[str]) -> Path:
         return path
     found = "a file" if not path.is_dir() else (others or [f"no {written[0]}"])[0]
     raise FileExistsError(
-        f"{path}: expected what gsjax writes there or nothing, for it is replaced; found {found}; move it "
+        f"{path}: expected nothing, or only what gsjax writes there and replaces; found {found}; move it "
         "elsewhere"
     )
 
 
 def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
-    """Nested settings by the names that options have on the command line: fit.start.count."""
+    """Nested settings by the names of their options on the command line: fit.start.count."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= _flat(value, f"{within}{name}.") if isinstance(value, Mapping) else {within + name: value}
@@ -335,7 +306,7 @@ def _flat(settings: Mapping[str, Any], within: str = "") -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """`value` in the types that YAML has words for: paths as text, enums as their values, tuples as lists."""
+    """`value` in the types of YAML: paths as text, enums as their values, tuples as lists."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

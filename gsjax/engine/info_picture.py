@@ -1,4 +1,4 @@
-"""The picture that `gsjax info --picture` draws: cameras by what becomes of them, and points."""
+"""The picture of `gsjax info --picture`: cameras, coloured by their use, and points."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,22 +8,21 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.data import Photographs, Sequence
+from gsjax.engine.options import HeldOutFrames
+from gsjax.engine.photographs import split
 from gsjax.geometry.cameras import unproject
 from gsjax.io.atomic import atomic_write
 
-_DEPTHS, _PIXELS = 12, 3000  # depth images that points come from, where there are none, and points of each
+_DEPTHS, _PIXELS = 12, 3000  # depth images from which points are made, if there are none, and points of each
 _MOST_COLORS = 8
 _OTHERS = "not used"
 
 Groups = Mapping[str, np.ndarray]
-"""Indices of photographs by what a legend calls them."""
+"""Indices of photographs, by their name in the legend."""
 
 
 def by_split(photographs: Photographs) -> Groups:
-    """What `gsjax fit` does with each photograph unless it is told otherwise."""
-    from gsjax.engine.options import HeldOutFrames
-    from gsjax.engine.photographs import split
-
+    """The use of each photograph in `gsjax fit`, by default."""
     fitted, held_out = split(photographs, HeldOutFrames.test_every)
     others = np.setdiff1d(np.arange(photographs.num), np.concatenate([fitted, held_out]))
     groups = {"fitted": fitted, "held out": held_out, _OTHERS: others}
@@ -31,7 +30,7 @@ def by_split(photographs: Photographs) -> Groups:
 
 
 def by_camera(sequence: Sequence) -> Groups:
-    """The frames of each camera of a recording, counted as `photographs_of` counts them."""
+    """The frames of each camera of a recording, by their indices in `photographs_of`."""
     indices = np.arange(sequence.num_frames * sequence.num_cameras)
     if sequence.num_cameras > _MOST_COLORS:
         return {"cameras": indices}
@@ -39,7 +38,7 @@ def by_camera(sequence: Sequence) -> Groups:
 
 
 def write_picture(path: Path, photographs: Photographs, groups: Groups) -> None:
-    """Draw cameras and points into a file of the kind that its suffix says."""
+    """Draw cameras and points into a file, in the format of its suffix."""
     from gsjax.viz.cameras import CameraGroup, cameras_and_points
     from gsjax.viz.colors import BACKGROUND, label_color
     from gsjax.viz.plots import save
@@ -70,7 +69,7 @@ def write_picture(path: Path, photographs: Photographs, groups: Groups) -> None:
 def scene_points(
     photographs: Photographs,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | tuple[None, None]:
-    """Points with colours, 0 to 1: those of the data, else of some of its depth images; None where it has
+    """Points with colours, 0 to 1: those of the data, else from some of its depth images; None if it has
     neither."""
     if photographs.cloud is not None and len(photographs.cloud.points):
         return photographs.cloud.points, photographs.cloud.colors

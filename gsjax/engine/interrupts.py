@@ -1,8 +1,8 @@
 """Ctrl-C that is not lost.
 
 Python raises KeyboardInterrupt wherever it happens to be. In a finalizer, or a callback of the garbage
-collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on
-as if nobody had asked. Here Ctrl-C is raised again until it gets through.
+collector (JAX has one) or of a weak reference, the exception is printed and dropped, and the program goes on.
+Here Ctrl-C is raised again until it gets through.
 """
 
 import signal
@@ -16,26 +16,27 @@ from typing import Any, no_type_check
 UNINTERRUPTIBLE = frozenset({"called_by_xla", "shielded"})
 """Functions that Ctrl-C waits for: callbacks of XLA, which drops exceptions, and `shielded` calls."""
 RETRY_S = 0.01
-_waiting = threading.Event()  # signals are the process's, and so is whether one waits
+_waiting = threading.Event()  # one per process, as signals are
 
 
 @no_type_check  # a wrapper that checks types could be interrupted between the call's end and its own
 def shielded(call: Callable[..., Any], *arguments: Any) -> Any:
     """The result of `call`. Ctrl-C waits until it has returned, and is raised by `raise_if_interrupted` at
-    the latest. It is for steps that give away the buffers they replace: to stop in the middle of one would
+    the latest. It is for steps that donate the buffers they replace: an interrupt in the middle of one would
     lose both the old and the new."""
     return call(*arguments)
 
 
 def raise_if_interrupted() -> None:
-    """Raises KeyboardInterrupt if Ctrl-C is pending: shielded calls leave too little time between them."""
+    """Raises KeyboardInterrupt if Ctrl-C is pending: between shielded calls, the timer has too little
+    time."""
     if _waiting.is_set():
         _forget()
         raise KeyboardInterrupt
 
 
 def _forget() -> None:
-    """Nothing is pending any more: once raised, Ctrl-C must not strike again during the clean-up."""
+    """Clear what is pending: once raised, Ctrl-C must not be raised again during the clean-up."""
     signal.setitimer(signal.ITIMER_REAL, 0)
     _waiting.clear()
 
@@ -51,9 +52,9 @@ def is_uninterruptible(frame: FrameType | None) -> bool:
 
 @contextmanager
 def heard_interrupts() -> Iterator[None]:
-    """While the block runs, Ctrl-C raises KeyboardInterrupt where it gets through, if a little later.
+    """While the block runs, Ctrl-C raises KeyboardInterrupt where it gets through, perhaps a little later.
 
-    Where SIGINT is ignored or handled by somebody else, or there are no timers, nothing changes.
+    If SIGINT is ignored or handled by something else, or there are no timers, nothing changes.
     """
     main = threading.current_thread() is threading.main_thread()
     usual = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler

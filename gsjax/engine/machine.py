@@ -1,4 +1,4 @@
-"""The machine: what a result was made on (no name that someone gave it), and which cores to keep to."""
+"""The machine: a description for results (without its host name), its memory, and the cores to use."""
 
 import os
 import platform
@@ -9,11 +9,12 @@ from typing import Any
 
 import jax
 
+from gsjax.engine.messages import counted
 from gsjax.optim.compiler import has_avx512
 
 
 def describe() -> dict[str, Any]:
-    """Processor and the cores that this process may use, JAX's devices, and versions."""
+    """The processor, the number of cores that this process may use, JAX's devices, and versions."""
     devices, cpuinfo = jax.devices(), Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
@@ -29,15 +30,15 @@ def describe() -> dict[str, Any]:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def keep_to_cores(count: int | None) -> None:
-    """Have this process run on `count` of the cores that it may use, the last of them; None changes nothing.
+    """Restrict this process to the last `count` of the cores that it may use; None changes nothing.
 
-    XLA starts a thread for each core that it finds, so call it before JAX computes anything. Threads that
-    there are already are kept to them too.
+    XLA starts a thread for each core that it finds, so call it before JAX computes anything. Existing threads
+    are restricted too.
 
     Raises:
         ValueError: there are fewer, or this system does not let a process choose.
@@ -51,12 +52,12 @@ def keep_to_cores(count: int | None) -> None:
     allowed = sorted(os.sched_getaffinity(0))
     if not 1 <= count <= len(allowed):
         most = "1 core" if len(allowed) == 1 else f"1 to {len(allowed)} cores"
-        raise ValueError(f"--cores: expected {most}, which is what this process may use, found {count}")
+        raise ValueError(f"--cores: expected {most}, which this process may use, found {count}")
     keep_to(allowed[-count:])
 
 
 def keep_to(cores: Iterable[int]) -> None:
-    """Have this process run on these cores, by their numbers; threads that there are already too."""
+    """Restrict this process, and its existing threads, to the cores with these numbers."""
     tasks = Path("/proc/self/task")
     for thread in [int(task.name) for task in tasks.iterdir()] if tasks.is_dir() else [0]:
         with suppress(ProcessLookupError):  # it has ended meanwhile
@@ -64,55 +65,48 @@ def keep_to(cores: Iterable[int]) -> None:
 
 
 def resident_mb() -> float:
-    """Memory that this process holds now, MB; the most it ever held where the system tells only that."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        kilobytes = next(
-            line for line in status.read_text().splitlines() if line.startswith("VmRSS")
-        ).split()[1]
-        return int(kilobytes) / 1e3
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # macOS counts bytes
+    """Memory of this process, MB; on systems that only report its peak, that."""
+    return _size_mb("/proc/self/status", "VmRSS") or _largest_mb()
 
 
 def peak_memory_mb() -> dict[str, float | None]:
-    """The most memory that this process ever held, and that JAX ever held on the first device, MB; None where
-    the device does not tell (a CPU, whose memory is the process's)."""
-    status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    peak = next((int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM")), None)
-    if peak is None:
-        import resource
-
-        unit = 1e6 if platform.system() == "Darwin" else 1e3
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    """The peak memory of this process, and of JAX on the first device, MB; None if the device does not report
+    it (a CPU, whose memory is the process's)."""
     on_device = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-    return {"process": peak, "device": None if on_device is None else on_device / 1e6}
+    return {
+        "process": _size_mb("/proc/self/status", "VmHWM") or _largest_mb(),
+        "device": None if on_device is None else on_device / 1e6,
+    }
 
 
 def available_mb() -> float:
-    """Memory that a program may still take, MB; infinity where the system does not tell."""
-    meminfo = Path("/proc/meminfo")
-    if not meminfo.exists():
-        return float("inf")
-    fields = dict(line.split(":") for line in meminfo.read_text().splitlines())
-    return int(fields["MemAvailable"].split()[0]) / 1e3
+    """Memory that is still available, MB; infinity if the system does not report it."""
+    return _size_mb("/proc/meminfo", "MemAvailable") or float("inf")
+
+
+def _size_mb(file: str, name: str) -> float | None:
+    """A size in one of Linux's tables, MB; None if it is not there."""
+    lines = Path(file).read_text().splitlines() if Path(file).exists() else []
+    return next((int(line.split()[1]) / 1e3 for line in lines if line.startswith(f"{name}:")), None)
+
+
+def _largest_mb() -> float:
+    """The peak memory of this process by POSIX, MB."""
+    import resource
+
+    unit = 1e6 if platform.system() == "Darwin" else 1e3  # macOS counts bytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def name(machine: dict[str, Any]) -> str:
-    """What two runs must share for their milliseconds to be compared: processor, cores and device."""
+    """Processor, cores and device, which two runs must share for their times to be comparable."""
     device = "" if machine["device"] == "cpu" else f", {machine['device']}"
-    return f"{machine['processor']}, {_cores(machine)}{device}"
+    return f"{machine['processor']}, {counted(machine['cores'], 'core')}{device}"
 
 
 def in_words(machine: dict[str, Any]) -> str:
-    """On one line, for people."""
+    """The description in one line."""
     extra = ", AVX-512" if machine["avx512"] else ""
     devices = f"{machine['devices']} x " if machine["devices"] > 1 else ""
     versions = f"JAX {machine['jax']}, Python {machine['python']}, {devices}{machine['device']}"
-    return f"{machine['processor']}, {_cores(machine)}{extra}; {versions}"
-
-
-def _cores(machine: dict[str, Any]) -> str:
-    return "1 core" if machine["cores"] == 1 else f"{machine['cores']} cores"
+    return f"{machine['processor']}, {counted(machine['cores'], 'core')}{extra}; {versions}"

@@ -1,4 +1,4 @@
-"""What goes wrong is said in a sentence: errors of the user's making, and warnings, each kind once."""
+"""Messages of commands: stages, errors in a sentence, and warnings, each kind once."""
 
 import re
 import sys
@@ -21,7 +21,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 @contextmanager
 def stage(console: Console, words: str) -> Iterator[None]:
-    """Say what takes a while: a spinner for people, a line for a log."""
+    """Announce what takes a while: a spinner in a terminal, a line in a log."""
     if console.is_terminal:
         with console.status(words):
             yield
@@ -31,36 +31,36 @@ def stage(console: Console, words: str) -> Iterator[None]:
 
 
 def describe(error: BaseException) -> str:
-    """An exception as one paragraph, without Python's own words where there are better ones."""
+    """The message of an exception as one paragraph; errors of files begin with the path."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def say_error(text: str, word: str = "error") -> None:
-    """Print one paragraph on stderr. It is wrapped for people only, so that programs can search it."""
+    """Print one paragraph on stderr, wrapped only in a terminal, so that programs can search it."""
     console = Console(stderr=True, highlight=False)
     line = Text.assemble((f"{word}: ", "bold red"), text.removeprefix(f"{word} "))
     console.print(line, soft_wrap=not console.is_terminal)
 
 
 def counted(count: int, noun: str) -> str:
-    """So many of something: "1 part", "2 parts"."""
+    """A number with its noun: "1 part", "2 parts"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def reason(stopped: BaseException) -> str:
-    """What stopped a run, in words."""
+    """The reason why a run was stopped."""
     return "Ctrl-C" if isinstance(stopped, KeyboardInterrupt) else describe(stopped)
 
 
 class Notes:
-    """Collects what a run has to say for itself, and shows each kind of warning once.
+    """Collects the notes and warnings of a run, and prints each kind of warning once.
 
         with Notes(console) as notes: ...
 
-    While the block runs, warnings of gsjax are printed plainly to the console. Two that differ in numbers
-    only (one for each frame, say) are of one kind.
+    While the block runs, warnings of gsjax are printed plainly to the console. Two that differ only in
+    numbers (one per frame, say) are of one kind.
     """
 
     def __init__(self, console: Console):
@@ -74,7 +74,7 @@ class Notes:
         self._added.append(text)
 
     def warn(self, text: str) -> None:
-        """Print a warning, unless one of its kind was printed before, and note it."""
+        """Note a warning, and print it unless one of its kind was printed before."""
         kind = re.sub(r"\d+(\.\d+)?", "#", text)
         self._counts[kind] += 1
         if kind not in self._first:
@@ -84,12 +84,12 @@ class Notes:
 
     @property
     def warnings(self) -> list[str]:
-        """The warnings, of each kind the first."""
+        """The first warning of each kind."""
         return list(self._first.values())
 
     @property
     def all(self) -> list[str]:
-        """The notes, then the warnings; of many of one kind the first, with their number."""
+        """The notes, then the first warning of each kind, with the number of the others."""
         more = {kind: count - 1 for kind, count in self._counts.items()}
         tail = {k: f" (and {n} more like it)" if n else "" for k, n in more.items()}
         return [*self._added, *(f"Warning: {text}{tail[kind]}" for kind, text in self._first.items())]
@@ -106,7 +106,7 @@ class Notes:
                 issubclass(category, UserWarning) and Path(filename).is_relative_to(_PACKAGE)
             ):
                 self.warn(" ".join(str(message).split()))
-            elif sys.warnoptions:  # who asked Python for warnings gets the others too
+            elif sys.warnoptions:  # with python -W, other warnings are shown as usual
                 show(message, category, filename, lineno, file, line)
 
         warnings.showwarning = showwarning

@@ -1,5 +1,5 @@
-"""What commands are told alike: an option has one name, one meaning and one line of help, whichever command
-it is given to. A command's `Options` inherits what it has a use for, and adds its own."""
+"""Options that commands share: each has one name, one meaning and one help text. A command's `Options`
+inherits those that it uses, and adds its own."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -12,117 +12,118 @@ import tyro
 
 from gsjax.data import ReadOptions
 
-Told = TypeVar("Told")
+AnyOptions = TypeVar("AnyOptions")
 Ids = Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID [ID ...]")]
 Frames = Annotated[str, tyro.conf.arg(metavar="START:STOP[:STEP]")]
 
 RESUME_MAY_CHANGE = ("out", "minutes", "resume", "overwrite", "cores", "debug")
-"""On what is computed: a run may be resumed with others."""
+"""Options that do not affect what is computed, so that a run may be resumed with others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Common:
-    """What every command has."""
+    """Options of every command."""
 
     cores: int | None = None
-    """How many of the processor's cores to use, for everything; the tracker's updates are steadiest on 1. All
-    unless given. They are the last ones: for two programs at once, taskset each to its own."""
+    """Number of processor cores to use, the last ones; default: all. The tracker's updates are steadiest on
+    1. To run two programs at once, give each its own cores by taskset."""
     debug: bool = False
     """Show Python's traceback when something fails."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overwriting:
-    """What those have that write a folder of their own."""
+    """Options of commands that write a folder."""
 
     overwrite: bool = False
-    """Replace what an earlier run left in the same folder, and what was made of it since: a field, films."""
+    """Replace what an earlier run left in the same folder, and what was made from it since: a field,
+    films."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resuming(Overwriting):
-    """What those have that may be stopped and go on."""
+    """Options of commands that can be stopped and resumed."""
 
     resume: bool = False
-    """Go on with the unfinished run in the same folder, given the same options."""
+    """Resume the unfinished run in the same folder, with the same options."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timed:
-    """What those have that learn step by step."""
+    """Options of commands that learn step by step."""
 
     minutes: float | None = None
-    """Stop after so many minutes of steps, compiling included; what was learned by then is scored and
-    written. The first run on a machine compiles for a minute or so; programs are kept for later ones."""
+    """Stop after this many minutes of steps, compiling included, and score and write what was learned by
+    then. The first run on a machine compiles for a minute or so; later ones find the compiled programs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
-    """What those have that draw at random."""
+    """Options of commands that draw random numbers."""
 
     seed: int | None = None
-    """Of all that is random; 0 unless given."""
+    """Random seed; default: 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How a dataset is read."""
+    """Options of commands that read a dataset."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
-    """What the layout of the data leaves open."""
+    """Details that the layout of the data leaves open."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection(Reading):
-    """Which part of a recording is looked at."""
+    """The part of a recording to use."""
 
     frames: Frames = ":"
-    """Which frames, or photographs, as Python slices them: 0:60, 0:60:2, :30; 4:5 is the fifth alone."""
+    """Frames, or photographs, to use, as a Python slice: 0:60, 0:60:2, :30; 4:5 is the fifth alone."""
     cameras: Ids = ()
-    """Ids of the cameras to look through. All that are not held out, unless given."""
+    """Ids of the cameras to use; default: all that are not held out."""
     scale: float = 1.0
-    """Look at pictures at this fraction of their size (width and height), as in 0.5; time goes with the
-    number of pixels."""
+    """Size of the pictures (width and height) relative to the original, as in 0.5; time is proportional to
+    the number of pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOut:
-    """What is kept from the method, to judge it by."""
+    """What is held out for evaluation."""
 
     eval_cameras: Ids = ()
-    """Ids of cameras that are held out: only judged, in the end."""
+    """Ids of cameras to hold out: they are used for evaluation only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutFrames(HeldOut):
-    """The same where frames, or photographs, may be held out too."""
+    """The same, where frames or photographs may be held out too."""
 
     test_every: int = 8
-    """Hold out every N-th photograph or frame, to judge by, where the data has no split; 0 holds out none."""
+    """Hold out every N-th photograph or frame for evaluation, if the data has no split; 0 holds out none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstMasks:
-    """What those have that follow what a first mask names."""
+    """Options of commands that follow the objects of a first mask."""
 
     mask_camera: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None
-    """Id of the tracked camera whose first mask names the objects. The first that has masks, unless given."""
+    """Id of the tracked camera whose first mask names the objects; default: the first that has masks."""
     masks: Literal["auto", "files", "segment"] = "auto"
-    """Who makes the first mask: the files, a segmenter without weights, or (auto) the first there is."""
+    """Source of the first mask: the files, a segmenter without weights, or (auto) the first available."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SamWeights:
-    """What those have that may let SAM segment."""
+    """Options of commands that can segment with SAM."""
 
     sam: Path | None = None
-    """Folder of SAM's weights (as of facebook/sam-vit-base): let it segment, and not the segmenter that needs
-    none. Takes the extra `foundation`."""
+    """Folder of SAM's weights (such as facebook/sam-vit-base), to segment with SAM instead of the segmenter
+    without weights. Requires the extra `foundation`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClipWeights:
-    """What those have that may ask CLIP."""
+    """Options of commands that can use CLIP."""
 
     weights: Path | None = None
     """Folder of CLIP's weights, in the layout of Hugging Face."""
@@ -130,17 +131,17 @@ class ClipWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectText:
-    """How a text is understood that means an object of a tracked run."""
+    """How a text that means an object of a tracked run is matched."""
 
     encoder: Literal["closed", "clip"] = "closed"
-    """Who understands the text: a closed vocabulary without weights, or CLIP."""
+    """Text encoder: a closed vocabulary without weights, or CLIP."""
     min_score: float | None = None
-    """Cosine below which the text means none of the objects. The encoder's own unless given."""
+    """Cosine similarity below which the text matches none of the objects; default: the encoder's own."""
 
 
 @dataclass(frozen=True)
 class OneDataset:
-    """From what."""
+    """The dataset."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
     """Folder of a recording or of photographs, or a built-in scene such as simulated:tabletop."""
@@ -148,7 +149,7 @@ class OneDataset:
 
 @dataclass(frozen=True)
 class DatasetAndOut(OneDataset):
-    """From what, to where."""
+    """The dataset, and the folder of the run."""
 
     out: Path
     """Folder for the run: a new one, or that of an earlier run with --resume or --overwrite."""
@@ -156,19 +157,19 @@ class DatasetAndOut(OneDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class OfRecording(Common, Resuming, HeldOut, Selection, DatasetAndOut):
-    """What those have that make a run of a recording."""
+    """Options of commands that make a run from a recording."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfDataset(Common, Resuming, Timed, Seeded, HeldOutFrames, Selection, DatasetAndOut):
-    """What those have that make a run of a dataset by learning, step by step."""
+    """Options of commands that make a run from a dataset by learning step by step."""
 
 
-def checked(options: Told) -> Told:
+def checked(options: AnyOptions) -> AnyOptions:
     """The options, with `--seed` in each configuration that has one.
 
     Raises:
-        ValueError: one that commands share cannot be.
+        ValueError: a shared option is out of range.
     """
     expect_positive(options, "minutes")
     test_every = getattr(options, "test_every", 0)
@@ -187,7 +188,7 @@ def checked(options: Told) -> Told:
 
 
 def expect_positive(options: Any, *names: str) -> None:
-    """Raises ValueError where one of these options is given, and not above 0."""
+    """Raises ValueError if one of these options is given and not above 0."""
     for name in names:
         value = getattr(options, name, None)
         if value is not None and not value > 0:
@@ -195,22 +196,22 @@ def expect_positive(options: Any, *names: str) -> None:
 
 
 def preset_options(
-    kind: type[Told], arguments: list[str], name: str, presets: Mapping[str, Any]
-) -> tuple[type[Told], list[str]]:
-    """The options whose configuration is that of the preset that is named, where one is.
+    kind: type[AnyOptions], arguments: list[str], name: str, presets: Mapping[str, Any]
+) -> tuple[type[AnyOptions], list[str]]:
+    """The options, with the defaults of the preset that is named, if any.
 
     Args:
         kind: the command's options.
-        arguments: what is given on the command line.
-        name: of the field that is the configuration.
-        presets: configurations, by the names that `--preset` has for them.
+        arguments: those of the command line.
+        name: the field that holds the configuration.
+        presets: configurations by the names that `--preset` takes.
 
     Returns:
-        The options, and the arguments to parse.
+        The class of options, and the arguments to parse.
     """
     named = [word for before, word in pairwise(arguments) if before == "--preset"]
     named += [a.removeprefix("--preset=") for a in arguments if a.startswith("--preset=")]
-    if not named or named[-1] not in presets:  # tyro says what there is
+    if not named or named[-1] not in presets:  # tyro reports an unknown one
         return kind, arguments
     chosen = presets[named[-1]]
     changed = (name, type(chosen), field(default=chosen, kw_only=True))

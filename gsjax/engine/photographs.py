@@ -1,16 +1,14 @@
-"""Which photographs a static scene is fitted to and judged by: chosen, split, and read."""
+"""The photographs that a static scene is fitted to and evaluated on: selected, split, and read."""
 
 import warnings
 from collections.abc import Mapping
 from collections.abc import Sequence as Indices
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 from rich.console import Console
-from rich.progress import track
 
 from gsjax.data.errors import DataWarning
 from gsjax.data.open import ReadOptions, is_photographs, is_recording, open_photographs
@@ -18,7 +16,7 @@ from gsjax.data.photographs import Photographs, photographs_of
 from gsjax.engine.files import read_options
 from gsjax.engine.folder import expect_dataset
 from gsjax.engine.machine import available_mb
-from gsjax.engine.recording import expect_enough_left, open_recording, parse_frames
+from gsjax.engine.recording import expect_enough_left, in_threads, open_recording, parse_frames
 from gsjax.scene.frame import Frame
 
 _LARGE = 1600  # pixels, a side
@@ -38,16 +36,16 @@ def choose_photographs(
 
     Args:
         dataset: a folder, or a built-in scene.
-        read: what its layout leaves open.
-        scale: how much smaller they shall be.
-        frames: which ones, or which frames of a recording, as Python slices them.
-        cameras: ids of those of a recording; all, unless given.
-        eval_cameras: ids of those whose frames are the split "test"; then all others are "train".
+        read: details that its layout leaves open.
+        scale: their size relative to the original.
+        frames: the photographs, or the frames of a recording, as a Python slice.
+        cameras: ids of the cameras of a recording; if empty, all.
+        eval_cameras: ids of the cameras whose frames are the split "test"; then all others are "train".
 
     Raises:
         DataError: the dataset cannot be read.
-        ValueError: none is chosen, a camera is not there, or photographs are asked for by camera; it is the
-            folder of a run.
+        ValueError: none is selected, a camera does not exist, photographs are selected by camera, or the
+            dataset is the folder of a run.
     """
     expect_dataset(dataset)
     if is_photographs(dataset) or not is_recording(dataset):
@@ -78,7 +76,7 @@ def smaller(photographs: Photographs, scale: float) -> Photographs:
     """The same views in smaller photographs.
 
     Raises:
-        ValueError: `scale` is not above 0 and at most 1, or leaves next to nothing of one.
+        ValueError: `scale` is not above 0 and at most 1, or makes one too small.
     """
     scaled = photographs.scaled(scale)
     least = scaled.sizes.min(1).argmin()
@@ -88,11 +86,7 @@ def smaller(photographs: Photographs, scale: float) -> Photographs:
 
 
 def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) -> Photographs:
-    """Those of a fit, by what stands in its config.yml.
-
-    Args:
-        settings: what stands there.
-        dataset: where they are now; where they were, unless given.
+    """The photographs of a fit, by the settings of its config.yml; `dataset` is their path if it has changed.
 
     Raises:
         DataError: they cannot be read.
@@ -108,7 +102,7 @@ def photographs_of_run(settings: Mapping[str, Any], dataset: str | None = None) 
 
 
 def split(photographs: Photographs, every: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
-    """Which photographs are fitted and which are held out: as the data says, else every n-th.
+    """Indices of the photographs to fit and of those held out: by the data's split, else every n-th.
 
     Raises:
         ValueError: none is left to fit.
@@ -130,8 +124,8 @@ def read_frames(photographs: Photographs, console: Console) -> list[Frame]:
     """All photographs in memory, each as a frame of one camera.
 
     Raises:
-        DataError: one is bad.
-        ValueError: they are too many for this machine's memory.
+        DataError: one cannot be read.
+        ValueError: they do not fit in this machine's memory.
     """
     wanted, free = photographs.sizes.prod(1).sum() * _BYTES_A_PIXEL / 1e6, available_mb()
     if wanted > free:
@@ -139,19 +133,11 @@ def read_frames(photographs: Photographs, console: Console) -> list[Frame]:
             f"{photographs.name}: {photographs.num} photographs need some {wanted / 1e3:.1f} GB, and "
             f"{free / 1e3:.1f} GB are free; try --scale, or fewer --frames"
         )
-
-    with ThreadPoolExecutor(2) as executor:
-        jobs = [executor.submit(photographs.frame, i) for i in range(photographs.num)]
-        try:
-            shown = track(jobs, "reading photographs", console=console, transient=True)
-            return [job.result() for job in shown]
-        except BaseException:
-            executor.shutdown(cancel_futures=True)
-            raise
+    return in_threads(photographs.frame, range(photographs.num), "reading photographs", console)
 
 
-def say_if_large(photographs: Photographs) -> None:
-    """A DataWarning where photographs are larger than a fit on a CPU has time for."""
+def warn_if_large(photographs: Photographs) -> None:
+    """Give a DataWarning if photographs are too large for a fit on a CPU to be fast."""
     width, height = photographs.sizes.max(0)
     if max(width, height) > _LARGE:
         scale = 2.0 ** np.floor(np.log2(_LARGE / max(width, height)))

@@ -1,4 +1,4 @@
-"""How a command is run: its options are parsed, and a user's mistake becomes one sentence."""
+"""Running a command: its options are parsed, and a user's mistake becomes one sentence."""
 
 import select
 import sys
@@ -10,9 +10,9 @@ from gsjax.engine.machine import keep_to_cores
 from gsjax.engine.messages import describe, say_error
 from gsjax.extras import MissingExtra
 
-# ValueError covers DataError and PlyError, and whatever an argument is checked for.
+# ValueError covers DataError and PlyError, and every check of an argument.
 USER_ERRORS = (ValueError, OSError, MissingExtra)
-_COMPILE_ANEW = ("bench", "experiment")  # they measure how long that takes
+_COMPILE_ANEW = ("bench", "experiment")  # they measure compile time
 
 
 def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> int:
@@ -20,12 +20,12 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
 
     Args:
         command: its name.
-        arguments: what stands behind the name.
+        arguments: the arguments after the name.
         entry: its module, and what it does.
     """
     try:
         options = parse_options(command, arguments, entry)
-        keep_to_cores(getattr(options, "cores", None))  # before JAX looks how many there are
+        keep_to_cores(getattr(options, "cores", None))  # before JAX counts them
         compiler = import_module("gsjax.optim.compiler")
         compiler.keep_freed_memory()
         if command not in _COMPILE_ANEW:
@@ -37,13 +37,13 @@ def run_politely(command: str, arguments: list[str], entry: tuple[str, str]) -> 
         if isinstance(error, USER_ERRORS):
             say_error(describe(error))
             return 2
-        told = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
-        say_error(f"{told}. Please report it with what --debug shows")
+        fault = f"a fault of gsjax itself: {type(error).__name__}: {describe(error)}"
+        say_error(f"{fault}. Please report it with the output of --debug")
         return 1
 
 
 def is_unread() -> bool:
-    """Whether what is printed goes into a pipe that nobody reads any more, as after `| head`."""
+    """Whether stdout is a pipe whose reader has gone, as after `| head`."""
     if not hasattr(select, "poll"):
         return False
     output = select.poll()
@@ -55,13 +55,11 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
     """The options of a command, without running it.
 
     Args:
-        command: its name.
-        arguments: what stands behind the name.
-        entry: its module, and what it does.
+        command, arguments, entry: as for `run_politely`.
 
     Raises:
-        ValueError: a list was begun and left empty.
-        SystemExit: the arguments were not understood, or ask for help; what there is to say is printed.
+        ValueError: an option that takes a list has no values.
+        SystemExit: the arguments are invalid, or ask for help; the message is printed.
     """
     import tyro
 
@@ -81,7 +79,7 @@ def parse_options(command: str, arguments: list[str], entry: tuple[str, str]) ->
 
 
 def _expect_values(options: Any, arguments: list[str]) -> None:
-    """Raises a ValueError for a list that was begun and left empty, where that would mean all there is."""
+    """Raises a ValueError for a list without values, where the default would mean all."""
     given = {argument.replace("_", "-") for argument in arguments}
     for field in fields(options):
         flag = "--" + field.name.replace("_", "-")

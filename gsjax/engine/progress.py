@@ -1,4 +1,4 @@
-"""How a run of steps goes on: rows of scores, time, a bar for people and lines for a log, and what is saved.
+"""The progress of a run of steps: logged rows, time, a progress bar or lines of a log, and checkpoints.
 
 `watch` drives a method to its end for a command; saving, rows and the bar listen to its ticks.
 """
@@ -27,24 +27,24 @@ from gsjax.io.checkpoints import CheckpointError, load_checkpoint, save_checkpoi
 from gsjax.optim.method import Run
 
 KEPT = 2
-"""Checkpoints that are kept: one that is damaged leaves the one before."""
+"""Number of checkpoints kept: if one is damaged, the one before is left."""
 _SHOWN_EVERY_S = 0.2
 _LINES = 10  # of a log
 
 
 @dataclass
 class Progress:
-    """How a run has gone so far.
+    """The progress of a run.
 
     Attributes:
-        about: digests of what the run is made from, by what they are of, in words.
-        rows: one every few steps: step, seconds, and what the schedule makes of the steps since the last.
+        about: digests of the run's inputs, by their descriptions.
+        rows: one every few steps: step, seconds, and the schedule's summary of the steps since the last.
         recent: info of the steps since the last row.
-        seconds: of all steps, compiling apart.
-        compile_seconds: of tracing and compiling.
-        skipped: steps up to the last row that changed nothing, for a number in them was not finite.
-        stopped: what ended it early, or None.
-        pace: steps a second of late; 0 before any is known.
+        seconds: time of all steps, without compiling.
+        compile_seconds: time of tracing and compiling.
+        skipped: number of steps up to the last row that changed nothing, because a number was not finite.
+        stopped: what ended the run early, or None.
+        pace: recent steps per second; 0 before any is known.
     """
 
     about: Mapping[str, str | None] = field(default_factory=dict)
@@ -58,34 +58,35 @@ class Progress:
 
     @property
     def used_seconds(self) -> float:
-        """Of the time that was given: steps and compiling."""
+        """Time used of --minutes: steps and compiling."""
         return self.seconds + self.compile_seconds
 
     def is_over(self, minutes: float | None) -> bool:
-        """Whether this many minutes are used up."""
+        """Whether these minutes are used up."""
         return minutes is not None and self.used_seconds >= 60 * minutes
 
     def add(self, tick: Tick) -> None:
-        """One step more."""
+        """Record a step."""
         self.seconds += tick.seconds
         self.compile_seconds += tick.compile_seconds
         if tick.seconds and not tick.compile_seconds:
             now = 1 / tick.seconds
             self.pace = 1 / (0.95 / self.pace + 0.05 / now) if self.pace else now
-        self.recent.append({name: tick.info[name] for name in _scalars(tick.info)})
+        scalars = {name: value for name, value in tick.info.items() if getattr(value, "shape", None) == ()}
+        self.recent.append(scalars)
 
     def metadata(self) -> dict[str, Any]:
-        """What is saved beside the run."""
+        """The metadata of a checkpoint."""
         recent = [{name: float(a) for name, a in info.items()} for info in jax.device_get(self.recent)]
         kept = ("rows", "seconds", "compile_seconds", "skipped")
         return {name: getattr(self, name) for name in kept} | {"about": dict(self.about), "recent": recent}
 
     def found(self, steps: int, begun: float) -> dict[str, Any]:
-        """What metrics.json has of it.
+        """The part of metrics.json about the progress.
 
         Args:
-            steps: that were made.
-            begun: when the command began, by the performance counter.
+            steps: number of steps.
+            begun: start time of the command, by `time.perf_counter`.
         """
         return {
             **ended(self.stopped),
@@ -102,14 +103,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class Schedule:
-    """What is shown and recorded of a run.
+    """What is shown and logged of a run.
 
     Attributes:
-        doing: in a word: "distilling".
-        total: steps, in all.
-        row: (tick, infos of the steps since the last row, on the host, without skipped ones) -> what the row
-            has beside step and seconds. See `means_of`.
-        words: a row in words.
+        doing: the work, such as "distilling".
+        total: total number of steps.
+        row: (tick, infos of the steps since the last row, on the host, without skipped ones) -> the row
+            besides step and seconds. See `means_of`.
+        words: row -> text.
         every: steps between rows.
     """
 
@@ -121,7 +122,7 @@ class Schedule:
 
 
 def means_of(*names: str) -> Callable[[Tick, list[Mapping[str, Any]]], dict[str, Any]]:
-    """The row of a schedule that has the mean of each loss by name, None where no step had it."""
+    """A `Schedule.row` with the mean of each named loss; None if no step had it."""
 
     def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
         found = {}
@@ -143,22 +144,22 @@ def watch(
     *,
     minutes: float | None = None,
     save_every: float | None = None,
-    look: Callable[[Tick], dict[str, Any] | None] | None = None,
+    evaluate: Callable[[Tick], dict[str, Any] | None] | None = None,
     enough: Callable[[Tick, Mapping[str, Any]], bool] | None = None,
     listeners: tuple[Callable[[Mapping[str, Any]], None], ...] = (),
 ) -> Progress:
-    """Go on until all steps are made, the time is up, Ctrl-C or an error; `ticks.run` is what it came to.
+    """Run until all steps are done, the time is up, Ctrl-C or an error; `ticks.run` is then the newest run.
 
     Args:
         ticks: the method, from `drive`.
-        progress: how it has gone so far; it is added to.
-        schedule: what is shown and recorded.
+        progress: the progress so far; it is extended.
+        schedule: what is shown and logged.
         folder: of the run.
-        console: that shows it.
-        minutes: of steps, compiling included, after which it ends.
+        console: shows the progress.
+        minutes: time of steps, compiling included, after which to stop.
         save_every: seconds of work that may be lost when the run is killed.
-        look: a tick -> what its row has beside, or None; a tick that it says something of gets a row.
-        enough: (tick, its row) -> whether to end there; asked where there is a new row.
+        evaluate: tick -> additions to its row, or None; a tick with additions gets a row.
+        enough: (tick, its row) -> whether to stop there; called after each new row.
         listeners: called with each new row.
     """
     saver = Saver(schedule.doing, save_every)
@@ -169,7 +170,7 @@ def watch(
     with _Display(console, schedule, progress, ticks, minutes) as display:
         try:
             while not progress.is_over(minutes) and (now := _next(ticks, progress)) is not None:
-                more = None if look is None else look(now)
+                more = None if evaluate is None else evaluate(now)
                 last = now.step == schedule.total or progress.is_over(minutes)
                 row = None
                 if now.step % schedule.every == 0 or last or more is not None:
@@ -183,14 +184,14 @@ def watch(
                 raise_if_interrupted()
         except (KeyboardInterrupt, Exception) as stopped:
             if any(leaf.is_deleted() for leaf in jax.tree.leaves(ticks.run) if isinstance(leaf, jax.Array)):
-                raise  # a step that failed took the run along: what --resume needs was saved before
+                raise  # a failed step has consumed the run; --resume has an earlier one
             progress.stopped = stopped
         save(last=True)
     return progress
 
 
 def _next(ticks: Drive, progress: Progress) -> Tick | None:
-    """One step more, if there is one to make; it is counted even where Ctrl-C strikes next."""
+    """The next step, if any; it is recorded even if Ctrl-C comes next."""
     before = ticks.tick
     now = next(ticks, None)
     if now is not None and now is not before:
@@ -199,38 +200,38 @@ def _next(ticks: Drive, progress: Progress) -> Tick | None:
 
 
 def note_if_cut_short(progress: Progress, schedule: Schedule, steps: int, notes: Notes) -> None:
-    """Note where `--minutes` ended it before all steps were made."""
+    """Note if `--minutes` ended the run before all steps were done."""
     if steps < schedule.total and progress.stopped is None:
         notes.add(f"Stopped by --minutes after {steps:,} of {schedule.total:,} steps.")
 
 
 def save_run(folder: Path, run: Run, progress: Progress) -> None:
-    """Writes a checkpoint; the newest few are kept.
+    """Write a checkpoint; the newest few are kept.
 
     Args:
         folder: RUN/resume.
         run: the newest run.
-        progress: how it has gone.
+        progress: its progress.
     """
-    save_checkpoint(_path(folder, run.step), run, progress.metadata())
+    save_checkpoint(folder / f"step-{run.step:08d}.npz", run, progress.metadata())
     for old in _saved(folder)[:-KEPT]:
         old.unlink()
 
 
 def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]:
-    """The newest run that is whole, and how it had gone; those given where none was saved.
+    """The newest intact checkpoint: the run and its progress; the given ones if none was saved.
 
     Args:
         folder: RUN/resume.
-        run: before the first step.
-        progress: before the first step, with digests of what it is made from.
+        run: the run before the first step.
+        progress: its progress before the first step, with digests of its inputs.
 
     Raises:
-        CheckpointError: there are only damaged ones, or of another version.
-        ValueError: it is made from something else.
+        CheckpointError: all checkpoints are damaged, or of another version.
+        ValueError: the checkpoint has other inputs.
     """
     wrong, damaged = None, []
-    # A version before saved to state.npz, which is refused rather than overlooked.
+    # An earlier version saved to state.npz, which is refused rather than ignored.
     for path in reversed(_saved(folder) or sorted(folder.glob("state.npz"))):
         try:
             found, stored = load_checkpoint(path)
@@ -245,7 +246,7 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
                 f"--resume: {' and '.join(others)}: expected what the run in {folder.parent} was begun with, "
                 "found something else; put that back, or replace the run with --overwrite instead"
             )
-        for later in damaged:  # else they would count among the newest
+        for later in damaged:  # otherwise they would count among the newest
             later.unlink()
         return found, Progress(about, **stored)
     if wrong is not None:
@@ -253,24 +254,15 @@ def load_run(folder: Path, run: Run, progress: Progress) -> tuple[Run, Progress]
     return run, progress
 
 
-def _path(folder: Path, step: int) -> Path:
-    return folder / f"step-{step:08d}.npz"
-
-
 def _saved(folder: Path) -> list[Path]:
-    """Checkpoints in the order in which they were made."""
+    """Checkpoints in the order of their steps."""
     return sorted(folder.glob("step-*.npz"))
-
-
-def _scalars(info: Mapping[str, Any]) -> list[str]:
-    """Names of what a row may have: numbers."""
-    return [name for name, value in info.items() if getattr(value, "shape", None) == ()]
 
 
 def _add_row(
     now: Tick, progress: Progress, schedule: Schedule, folder: RunFolder, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """A row more, which stands in metrics.jsonl at once."""
+    """Add a row, and write it to metrics.jsonl at once."""
     infos = jax.device_get(progress.recent)
     sound = [info for info in infos if not info["skipped"]]
     progress.skipped += len(infos) - len(sound)
@@ -283,7 +275,7 @@ def _add_row(
 
 
 class _Display:
-    """A bar for people; about ten lines for a log."""
+    """A progress bar in a terminal; about ten lines in a log."""
 
     def __init__(
         self, console: Console, schedule: Schedule, progress: Progress, ticks: Drive, minutes: float | None
@@ -314,7 +306,7 @@ class _Display:
         self._bar.stop()
 
     def show(self) -> None:
-        """A step is made; a log has a line for each tenth of the way, once there is something to say."""
+        """Show a step; a log gets a line for each tenth of the steps, once there is a row."""
         rows, words = self._progress.rows, self._schedule.words
         if rows and perf_counter() - self._at > _SHOWN_EVERY_S:
             share, reached = self._share(), self._reached()
@@ -326,7 +318,7 @@ class _Display:
             self._console.print(f"{self._reached()}: {words(rows[-1])}", soft_wrap=True)
 
     def _share(self) -> float:
-        """How far it is, in steps or in minutes, whichever is more."""
+        """The fraction done, of steps or of minutes, whichever is larger."""
         used = 0.0 if self._minutes is None else self._progress.used_seconds / 60 / self._minutes
         return min(1.0, max(self._ticks.run.step / max(1, self._schedule.total), used))
 

@@ -1,8 +1,8 @@
-"""Which part of a recording is tracked, which is only judged, and what its masks call things."""
+"""The part of a recording that is used, what is held out of it, and the objects that its masks name."""
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Indices
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,7 +21,9 @@ from gsjax.engine.messages import Notes
 from gsjax.engine.options import OfRecording
 
 Opener = Callable[[str, ReadOptions | None], Sequence]
-_LEAST_SIDE = 8  # of a picture that is made smaller, pixels
+_LEAST_SIDE = 8  # of a downscaled picture, pixels
+
+Loaded = TypeVar("Loaded")
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +31,10 @@ class Recording:
     """The chosen frames of a recording.
 
     Attributes:
-        tracked: as its tracked cameras saw them; the others are not even opened while tracking.
-        judged: the same frames with the cameras that are only judged behind the tracked ones.
-        frames_in_data: how many frames there were to choose from.
-        simulated: pictures are drawn when asked for, which takes longer than reading them, and are then kept.
+        tracked: the cameras that methods see; the others are not even opened meanwhile.
+        judged: the same frames with the held-out cameras behind the tracked ones.
+        frames_in_data: number of frames in the data.
+        simulated: whether pictures are drawn on demand, which takes longer than reading them, and then kept.
     """
 
     tracked: Sequence
@@ -42,18 +44,18 @@ class Recording:
 
     @property
     def held_out(self) -> tuple[int, ...]:
-        """Ids of the cameras that are only judged."""
+        """Ids of the held-out cameras."""
         return self.judged.camera_ids[self.tracked.num_cameras :]
 
 
 def located(dataset: str) -> str:
-    """The absolute path of a dataset, by which a run finds it again from elsewhere; of a built-in scene its
+    """The absolute path of a dataset, by which a run finds it again from elsewhere; for a built-in scene, its
     name."""
     return dataset if dataset.startswith(SIMULATED_PREFIX) else os.path.abspath(dataset)
 
 
 def chosen_recording(options: OfRecording) -> Recording:
-    """The recording that a command is told of. Raises: as `open_recording`."""
+    """The recording of a command's options. Raises: as `open_recording`."""
     cameras = (options.cameras, options.eval_cameras)
     return open_recording(options.dataset, *cameras, options.frames, options.read, options.scale)
 
@@ -67,21 +69,20 @@ def open_recording(
     scale: float = 1.0,
     opened: Opener | None = None,
 ) -> Recording:
-    """Open a dataset and choose frames and cameras; without `cameras` all that are not held out. Pictures are
-    made smaller by `scale`. `opened` opens it, whole; `open_sequence` unless given.
+    """Open a dataset and select frames and cameras.
 
     Args:
         dataset: a folder, or a built-in scene.
-        cameras: ids of those to look through.
-        eval_cameras: ids of those held out.
+        cameras: ids of the cameras to use; if empty, all that are not held out.
+        eval_cameras: ids of the held-out cameras.
         frames: START:STOP[:STEP].
-        read: what the layout leaves open.
-        scale: of pictures.
-        opened: as above.
+        read: details that the layout leaves open.
+        scale: size of the pictures relative to the original.
+        opened: opens the whole dataset (default: `open_sequence`).
 
     Raises:
-        ValueError: a camera is not there, is named twice or stands in both lists; no frame is chosen; nothing
-            much would be left of pictures.
+        ValueError: a camera does not exist, is named twice or is in both lists; no frame is selected; or
+            pictures would be too small.
         DataError: the dataset cannot be read.
     """
     sequence = (opened or open_sequence)(dataset, read)
@@ -96,7 +97,7 @@ def open_recording(
             raise ValueError(f"{option}: camera {twice[0]} is named twice.")
     both = [c for c in chosen if c in eval_cameras]
     if both:
-        raise ValueError(f"--eval-cameras: camera {both[0]} stands in --cameras too; a judge must not.")
+        raise ValueError(f"--eval-cameras: camera {both[0]} is in --cameras too; it cannot be held out.")
     if not chosen:
         raise ValueError(f"--cameras: none is left; {sequence.name} has {known}.")
     total = sequence.num_frames
@@ -106,7 +107,10 @@ def open_recording(
     if (chosen_frames.stop or 0) > total:
         message = f"--frames: {frames} goes beyond the last frame of {sequence.name}, {total - 1}"
         warnings.warn(message, DataWarning, stacklevel=2)
-    sequence = _scaled(sequence.select(frames=chosen_frames), scale)
+    whole = sequence.select(frames=chosen_frames)
+    sequence = whole.scaled(scale)
+    sizes = (whole.width, whole.height), (sequence.width, sequence.height)
+    expect_enough_left(scale, "pictures", *sizes)
     simulated = dataset.startswith(SIMULATED_PREFIX)
     if simulated:
         sequence = remembered(sequence)
@@ -118,19 +122,12 @@ def open_recording(
     )
 
 
-def _scaled(sequence: Sequence, scale: float) -> Sequence:
-    smaller = sequence.scaled(scale)
-    sizes = (sequence.width, sequence.height), (smaller.width, smaller.height)
-    expect_enough_left(scale, "pictures", *sizes)
-    return smaller
-
-
 def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: tuple[int, int]) -> None:
-    """Raises ValueError where --scale leaves next to nothing of `what`, by its width and height.
+    """Raises ValueError if --scale makes pictures too small.
 
     Args:
-        scale: what was given.
-        what: is made smaller, in words.
+        scale: the option's value.
+        what: what is scaled, in words.
         before, after: its (width, height).
     """
     if scale < 1 and min(after) < _LEAST_SIDE:
@@ -141,10 +138,10 @@ def expect_enough_left(scale: float, what: str, before: tuple[int, int], after: 
 
 
 def parse_frames(text: str) -> slice:
-    """Frames as Python slices them: "0:60", "0:60:2", ":30", ":".
+    """The slice of a text such as "0:60", "0:60:2", ":30" or ":".
 
     Raises:
-        ValueError: it is none of these, or does not go forward.
+        ValueError: it is no slice, or its step is below 1.
     """
     try:
         parts = [int(part) if part.strip() else None for part in text.split(":")]
@@ -159,7 +156,7 @@ def parse_frames(text: str) -> slice:
 
 
 def remembered(sequence: Sequence) -> Sequence:
-    """The same sequence with what was loaded kept in memory: a simulated picture is slow to draw twice."""
+    """The same sequence, with what was loaded kept in memory: simulated pictures are slow to draw."""
 
     def kept(loader: Callable | None) -> Callable | None:
         if loader is None:
@@ -178,27 +175,39 @@ def remembered(sequence: Sequence) -> Sequence:
 
 def draw_ahead(recording: Recording, console: Console) -> None:
     """Draw the tracked pictures of a simulated recording, so that updates need not share the processor."""
-    if not recording.simulated:
-        return
     sequence = recording.tracked
-    views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
+    if recording.simulated:
+        views = [(t, c) for t in range(sequence.num_frames) for c in range(sequence.num_cameras)]
+        in_threads(lambda view: sequence.image(*view), views, "drawing the simulated scene", console)
+
+
+def in_threads(
+    load: Callable[[Any], Loaded], items: Iterable[Any], words: str, console: Console
+) -> list[Loaded]:
+    """`load` of each item, by two threads, with a progress bar. An exception or Ctrl-C cancels the rest.
+
+    Args:
+        load: item -> result.
+        items: what to load.
+        words: what is being done.
+        console: shows the bar.
+    """
     with ThreadPoolExecutor(2) as executor:
-        jobs = [executor.submit(sequence.image, *view) for view in views]
+        jobs = [executor.submit(load, item) for item in items]
         try:
-            for job in track(jobs, "drawing the simulated scene", console=console, transient=True):
-                job.result()
+            return [job.result() for job in track(jobs, words, console=console, transient=True)]
         except BaseException:
             executor.shutdown(cancel_futures=True)
             raise
 
 
 class FirstMask(NamedTuple):
-    """Labels of one camera's first image, which is all that a tracker is told about objects.
+    """Labels of one camera's first image, the only ones that a tracker is given.
 
     Attributes:
-        labels: [H, W]; 0 is background. None where objects come as shapes.
+        labels: [H, W]; 0 is background. None if objects are given as shapes.
         camera: id of the camera, or None.
-        source: one of "files", "segment" and "shapes".
+        source: "files", "segment" or "shapes".
     """
 
     labels: Int[np.ndarray, "height width"] | None
@@ -207,10 +216,10 @@ class FirstMask(NamedTuple):
 
 
 def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
-    """The mask of the first frame: a file's, or made by the weight-free segmenter.
+    """The mask of the first frame: from a file, or by the weight-free segmenter.
 
     Args:
-        tracked: what is tracked.
+        tracked: the tracked cameras.
         camera: id of the mask's camera; None takes the first that has masks.
         source: "files", "segment", or "auto": files, else the shapes of the recording, else the segmenter.
 
@@ -245,7 +254,7 @@ def first_mask(tracked: Sequence, camera: int | None, source: str) -> FirstMask:
 
 
 def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
-    """Raises DataError where a first mask names nothing, and says whose mask does."""
+    """Raises DataError if a first mask is all background, naming a camera whose mask is not."""
     if labels.any():
         return
     masks = {name: tracked.mask(0, i) for i, name in enumerate(tracked.camera_ids)}
@@ -256,7 +265,7 @@ def _check_not_empty(labels: np.ndarray, tracked: Sequence, c: int) -> None:
 
 
 def label_names(recording: Recording, source: str) -> dict[int, str]:
-    """The name of each mask value that has one. The segmenter's own values have none."""
+    """The name of each mask value that has one; labels of the segmenter have none."""
     names = {0: "background"}
     if source == "segment":
         return names
@@ -269,13 +278,14 @@ def label_names(recording: Recording, source: str) -> dict[int, str]:
 
 
 def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int, ...], notes: Notes) -> None:
-    """Say which objects will not be tracked: truth that the mask lacks, and labels that got no Gaussian.
+    """Warn of objects that will not be tracked: those of the truth without a label in the mask, and labels
+    without Gaussians.
 
     Args:
-        recording: with its truth, where it has one.
+        recording: the recording, perhaps with a truth.
         mask: the first mask.
         scene_ids: labels that the scene has.
-        notes: told of each.
+        notes: collects the warnings.
     """
     if mask.labels is None:
         return
@@ -293,14 +303,11 @@ def warn_of_missing(recording: Recording, mask: FirstMask, scene_ids: tuple[int,
         )
 
 
-Loaded = TypeVar("Loaded")
-
-
 class Prefetched(Generic[Loaded]):
-    """Iterate over `load(0), load(1), ...`, each by a thread, up to `ahead` while one is in use.
+    """Iterates over `load(index)`, loaded by a thread up to `ahead` items before they are used.
 
     Attributes:
-        waited: seconds that the iteration had to wait for a load so far.
+        waited: seconds that the iteration has waited for loads so far.
     """
 
     def __init__(self, load: Callable[[int], Loaded], indices: Indices[int], ahead: int = 2):

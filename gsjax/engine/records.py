@@ -1,4 +1,4 @@
-"""What the files of a run say of it: its settings, its scores, how it went on."""
+"""The record of a run, read from its files: its settings, its scores, its curve."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ from gsjax.engine.folder import expect_run
 
 Kind = Literal["fit", "track", "parts", "distill", "deform"]
 EVALUATION = Path("eval", "metrics.json")
-"""Where `gsjax eval` writes what it found, within the folder of a run."""
+"""Path of the scores of `gsjax eval`, within the folder of a run."""
 _SCORES: dict[Kind, tuple[str, ...]] = {
     "fit": ("dataset", "size", "photographs", "views", "seconds", "steps", "num_gaussians", "machine"),
     "track": (
@@ -32,16 +32,16 @@ _CURVES: dict[Kind, tuple[str, ...]] = {"fit": ("step", "seconds", "alive", "tes
 
 @dataclass(frozen=True)
 class Record:
-    """A run, as its files tell.
+    """A run, as recorded in its files.
 
     Attributes:
         path: its folder.
         kind: the command that made it.
-        config: what config.yml says.
-        metrics: what metrics.json says; None while the run goes on, or where it was killed.
+        config: the contents of config.yml.
+        metrics: the contents of metrics.json; None while the run goes on, or if it was killed.
         curve: the rows of metrics.jsonl, of a fit.
-        evaluation: what `gsjax eval` found for the scene that lies there now; None where nothing did.
-        notes: why something of it is not taken.
+        evaluation: the scores of `gsjax eval` for the present scene; None without any.
+        notes: what was ignored, and why.
     """
 
     path: Path
@@ -54,16 +54,16 @@ class Record:
 
     @property
     def complete(self) -> bool:
-        """Whether it was neither stopped nor killed."""
+        """Whether the run was neither stopped nor killed."""
         return self.metrics is not None and bool(self.metrics.get("complete"))
 
 
 def read_record(path: Path) -> Record:
-    """Read what a run wrote of itself.
+    """Read the record of a run.
 
     Raises:
         FileNotFoundError: there is no such folder, or it is no run's.
-        ValueError: a file of it cannot be read, or the run is of a command whose runs are not compared.
+        ValueError: a file cannot be read, or the run is of a command whose runs are not compared.
     """
     expect_run(path)
     config = read_config(path / "config.yml")
@@ -72,12 +72,14 @@ def read_record(path: Path) -> Record:
     evaluation, notes = _object(path / EVALUATION, ("scene_sha256", "lpips", "views")), ()
     if evaluation is not None and evaluation.get("scene_sha256") != digest(path / "scene.ply"):
         evaluation = None
-        notes = (f"{path}: what `gsjax eval` found is of an earlier scene and is left out; run it again.",)
+        notes = (
+            f"{path}: the scores of `gsjax eval` are of an earlier scene and are left out; run it again.",
+        )
     return Record(path, kind, config, metrics, _lines(path / "metrics.jsonl", kind), evaluation, notes)
 
 
 def digest(file: Path) -> str | None:
-    """SHA-256 of a file, which tells one scene from another; None where there is no file."""
+    """SHA-256 of a file, to identify a scene; None if there is no file."""
     if not file.is_file():
         return None
     with open(file, "rb") as stream:
@@ -88,21 +90,19 @@ def read_config(file: Path) -> dict[str, Any]:
     """The settings of a run.
 
     Raises:
-        ValueError: they are none.
+        ValueError: the file holds something else.
     """
     try:
         config = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{file}: expected the settings of a run, found what is no YAML ({error})"
-        ) from error
+        raise ValueError(f"{file}: expected the settings of a run, found invalid YAML ({error})") from error
     if not isinstance(config, dict):
         raise ValueError(f"{file}: expected the settings of a run, found none")
     return config
 
 
 def _kind(path: Path, config: Mapping[str, Any]) -> Kind:
-    """The command that made a run: `gsjax parts` has the settings of a fit among its own."""
+    """The command that made a run; the settings of `gsjax parts` include those of a fit."""
     marks: dict[Kind, tuple[str, ...]] = {
         "parts": ("parts", "anchor"),
         "distill": ("distill", "features"),
@@ -120,13 +120,13 @@ def _kind(path: Path, config: Mapping[str, Any]) -> Kind:
 
 
 def _object(file: Path, wanted: tuple[str, ...]) -> dict[str, Any] | None:
-    """A JSON file with these entries, if it is there."""
+    """The contents of a JSON file with these entries, if it exists."""
     if not file.is_file():
         return None
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{file}: expected the scores of a run, found what is no JSON ({error})") from error
+        raise ValueError(f"{file}: expected the scores of a run, found invalid JSON ({error})") from error
     _expect(file, found, wanted)
     return found
 
@@ -137,7 +137,7 @@ def _lines(file: Path, kind: Kind) -> list[dict[str, Any]]:
     try:
         rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line]
     except ValueError as error:
-        raise ValueError(f"{file}: expected a line of JSON each, found others ({error})") from error
+        raise ValueError(f"{file}: expected JSON on each line, found something else ({error})") from error
     for row in rows:
         _expect(file, row, _CURVES.get(kind, ()))
     return rows

@@ -1,4 +1,4 @@
-"""What a run that may be killed leaves from time to time, so that another can go on from it."""
+"""Saving the state of a run from time to time, so that it can be resumed if it is killed."""
 
 import warnings
 from collections.abc import Callable
@@ -12,24 +12,24 @@ EVERY_S = 30.0
 
 
 class Saver:
-    """Saves again and again, neither too often nor too seldom.
+    """Saves at most once every few seconds.
 
     Args:
-        goes_on: what does, where nothing can be written: "following".
-        every: seconds of work that a run may lose when it is killed; `EVERY_S` unless given.
+        work: the work that goes on if nothing can be written: "tracking".
+        every: seconds of work that a run may lose when it is killed (default: `EVERY_S`).
     """
 
-    def __init__(self, goes_on: str, every: float | None = None):
-        self._goes_on, self._every, self._at = goes_on, every, perf_counter()
+    def __init__(self, work: str, every: float | None = None):
+        self._work, self._every, self._at = work, every, perf_counter()
 
     def __call__(self, write: Callable[[], None], *, last: bool) -> None:
-        """Write if the last time is long enough ago, or this is the last; where the disk is full, say so."""
+        """Write if the last time is long enough ago, or this is the last; warn if it fails."""
         every = EVERY_S if self._every is None else self._every
         if not last and perf_counter() - self._at < every:
             return
         try:
             write()
         except OSError as error:
-            message = f"could not save what --resume needs ({describe(error)}); {self._goes_on} goes on"
+            message = f"could not save what --resume needs ({describe(error)}); {self._work} goes on"
             warnings.warn(message, DataWarning, stacklevel=2)
         self._at = perf_counter()

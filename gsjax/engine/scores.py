@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from gsjax.data import Sequence
 from gsjax.engine.summary import Column
 from gsjax.engine.views import View
 from gsjax.metrics.image import depth_error, psnr, ssim
 from gsjax.metrics.segmentation import LabelOverlap
-from gsjax.metrics.tracking import ObjectScore
+from gsjax.metrics.tracking import ObjectScore, true_labels
 
 SMALLEST_FOR_SSIM = 11
 CAMERA_SCORES = (
@@ -130,3 +132,23 @@ def motion_metrics(score: ObjectScore | None) -> dict[str, Any]:
     fields = ("centroid_error_mm", "point_error_mm", "median_point_error_mm", "moved_mm", "turned_deg")
     scored = {name: getattr(score, name, None) for name in fields}
     return scored | {"gaussians_scored": 0 if score is None else score.num_scored}
+
+
+def true_labels_at(
+    sequence: Sequence, t: int, points: Float[np.ndarray, "N 3"]
+) -> Int[np.ndarray, "N"] | None:
+    """The true label of each point, by the cameras that have a mask and depth of frame t; -1 where unknown.
+    None if no camera has both.
+
+    Args:
+        sequence: with masks and depth.
+        t: index of the frame.
+        points: positions at that frame, world, metres.
+    """
+    cameras = range(sequence.num_cameras)
+    seen = [
+        (sequence.mask(t, c), sequence.depth(t, c), sequence.viewmats[t, c], sequence.Ks[t, c])
+        for c in cameras
+    ]
+    seen = [one for one in seen if one[0] is not None and one[1] is not None]
+    return true_labels(points, *zip(*seen, strict=True)) if seen else None

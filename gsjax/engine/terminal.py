@@ -1,6 +1,6 @@
 """A summary in the terminal: its brief tables, its cards, and where the report is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -40,17 +40,36 @@ def print_summary(
     for note in summary.notes if notes else ():
         console.print(Text(note, style="dim"), soft_wrap=not console.is_terminal)
     if not summary.complete:
-        console.print("[bold yellow]partial run[/]; go on with --resume")
+        console.print("[bold yellow]partial run[/]; continue with --resume")
     lines = [*summary.hints, *([] if report is None else [("report", str(report))])]
     for label, text in lines:
         console.print(Text.assemble((label, "bold"), "  ", text), soft_wrap=True)
 
 
-def _cards(cards: Sequence[Card]) -> Grid:
+def print_table(table: Table) -> None:
+    """Print a table on stdout, below its title."""
+    console = Console(highlight=False)
+    console.print(Text(f"\n{table.title}", style="bold"))
+    console.print(_grid(table, console.width))
+
+
+def print_facts(facts: Mapping[str, str], title: str = "") -> None:
+    """Print facts on stdout below a title, a line each, with their names in bold."""
+    console = Console(highlight=False)
+    if title:
+        console.print(Text(title, style="bold cyan"))
+    console.print(_facts(facts))
+
+
+def _facts(facts: Mapping[str, str]) -> Grid:
     grid = Grid.grid(padding=(0, 3, 0, 0))
-    for card in cards:
-        grid.add_row(Text(card.head, style="bold"), Text(f"{card.text} {card.unit}".strip()))
+    for name, text in facts.items():
+        grid.add_row(Text(name, style="bold"), Text(text, overflow="fold"))
     return grid
+
+
+def _cards(cards: Sequence[Card]) -> Grid:
+    return _facts({card.head: f"{card.text} {card.unit}".strip() for card in cards})
 
 
 def _grid(table: Table, width: int) -> Grid:

@@ -1,7 +1,7 @@
 """The five verbs: `gsjax.fit`, `track`, `parts`, `distill` and `deform`.
 
-Data goes in as it was opened. Each yields a `Tick` a step (a frame, for `track`), and what the user came for
-is its `result`:
+Each takes data as it was opened and yields a `Tick` per step (per frame, for `track`), whose `result` is the
+scene so far:
 
     for now in gsjax.fit(photographs, gsjax.FitConfig(steps=2000)):
         print(now.step, now.info["psnr"], now.seconds)
@@ -21,7 +21,7 @@ from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
 from gsjax.methods.fit import Fit, FitConfig, without_needless
-from gsjax.methods.parts import Parts, PartsConfig, begin, choose_anchor, moved_pixels
+from gsjax.methods.parts import Parts, PartsConfig, begin
 from gsjax.methods.parts.pictures import problem_of
 from gsjax.methods.protocols import Segmenter
 from gsjax.scene.gaussians import Gaussians
@@ -42,9 +42,9 @@ def fit(
     """Fit a static scene to posed photographs (3D Gaussian Splatting, Kerbl et al. 2023).
 
     Args:
-        photographs: from `gsjax.open_photographs`; all of them are fitted (`select` chooses).
-        config: how; the default settings unless given.
-        after: a tick of an earlier fit of the same photographs, to go on from.
+        photographs: from `gsjax.open_photographs`; all of them are fitted (see `select`).
+        config: settings (default: those of `FitConfig`).
+        after: a tick of an earlier fit of the same photographs, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
@@ -78,19 +78,19 @@ def deform(
     """Reconstruct a scene that deforms, seen by one camera (SurstSplat, GaussianClin).
 
     Args:
-        sequence: from `gsjax.open_sequence`; all frames of its first camera are learned from (`select`
-            chooses). Depth is the camera's own, else matched with the second camera's pictures, else the
-            scene begins on a plane.
-        config: how it is learned; the default settings unless given.
-        teacher: whose features are learned beside colours: "classes" of masks, "closed", a folder of feature
-            files, "none", or a `TeacherChoice` with weights and masks. By default classes, where there are
-            two or more among the pixels that count.
+        sequence: from `gsjax.open_sequence`; all frames of its first camera are learned from (see `select`).
+            Depth is the camera's own, else matched with the second camera's pictures, else the scene begins
+            on a plane.
+        config: settings (default: those of `DeformConfig`).
+        teacher: source of the features learned beside colours: "classes" of masks, "closed", a folder of
+            feature files, "none", or a `TeacherChoice` with weights and masks (default: classes, if there are
+            two or more among the pixels that count).
         tools: whether tools, by the names of mask values, are left out ("leave-out") or drawn ("draw").
-        tool_values: mask values that are tools, whatever their names are.
-        first: index of the frame that the canonical scene is like (default: with classes the earliest that
-            shows most of them, else the first in which a pixel counts).
-        gaussians: canonical scene to begin with (default: made of depth).
-        after: a tick of an earlier reconstruction of the same sequence, to go on from.
+        tool_values: mask values that are tools, whatever their names.
+        first: index of the frame of the canonical scene (default: with classes the earliest that shows most
+            of them, else the first in which a pixel counts).
+        gaussians: initial canonical scene (default: from depth).
+        after: a tick of an earlier reconstruction of the same sequence, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
@@ -123,14 +123,14 @@ def distill(
 
     Args:
         scene: the Gaussians, from any fit; they do not change.
-        photographs: views of the scene, posed in its world; all of them teach (`select` chooses).
+        photographs: views of the scene, posed in its world; all of them are used (see `select`).
         teacher: features of the photographs' pixels: "classes" of their masks, "closed" for colours and
             outlines of masks, "auto" (classes where there are masks, else closed), a folder of feature files,
-            a `TeacherChoice` with weights of CLIP or SAM, or your own `Teacher` of the same photographs.
-            Outputs of encoders and segmenters are kept in the user's cache folder.
+            a `TeacherChoice` with weights of CLIP or SAM, or a custom `Teacher` of the same photographs.
+            Outputs of encoders and segmenters are cached in the user's cache folder.
         config: settings (default: the paper's).
         rasterize_mode: "antialiased" for a scene that was fitted with it.
-        after: a tick of an earlier distillation of the same scene and photographs, to go on from.
+        after: a tick of an earlier distillation of the same scene and photographs, to continue from.
 
     Returns:
         ticks, whose `result` is a `DistillResult`: `query(text)` scores the Gaussians, `write(path)` makes a
@@ -165,13 +165,13 @@ def parts(
 
     Args:
         sequence: from `gsjax.open_sequence`, of synchronised cameras.
-        config: how; the default settings unless given.
-        eval_cameras: ids of cameras that are held out.
-        anchor: the canonical frame; by default the one that differs most from the others.
-        gaussians: the scene at `anchor`, which must then be given; by default it is fitted here, which takes
-            minutes.
-        segmenter: finds what belongs together in a picture; by default one that needs no weights.
-        after: a tick of an earlier discovery in the same sequence, to go on from.
+        config: settings (default: those of `PartsConfig`).
+        eval_cameras: ids of the cameras to hold out.
+        anchor: index of the canonical frame (default: the one that differs most from the others).
+        gaussians: the scene at `anchor`, which must then be given (default: it is fitted, which takes
+            minutes).
+        segmenter: divides a picture into pieces (default: one without weights).
+        after: a tick of an earlier discovery in the same sequence, to continue from.
         extra_losses: custom losses `loss(scene, rendered, frame)`; see `gsjax.losses.extra`.
 
     Returns:
@@ -182,7 +182,7 @@ def parts(
             nothing is found that moves.
         DataError: a picture cannot be read.
     """
-    from gsjax.engine.parts.start import FIT
+    from gsjax.engine.parts.start import FIT, detect_motion
     from gsjax.perception.segmenters import PieceSegmenter  # slow to import
 
     method = Parts(PartsConfig() if config is None else config, extra_losses)
@@ -192,11 +192,7 @@ def parts(
         return drive(method, problem_of(tracked), after.run, headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
-    chosen = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, anchor)
-    discover = config.discover
-    moved = moved_pixels(
-        tracked.image, chosen, tracked.num_cameras, frames=discover.frames, threshold=discover.threshold
-    )
+    chosen, moved = detect_motion(tracked, config, anchor)
     if gaussians is None:
         photographs = photographs_of(tracked.select(frames=[chosen.frame]))
         fitting = fit(photographs, FIT)

@@ -1,4 +1,4 @@
-"""What `gsjax view` opens: a run of any kind, or a PLY file."""
+"""The scenes that `gsjax view` opens: a run of any kind, or a PLY file."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -25,17 +25,17 @@ from gsjax.viz.viewer import Shots, Viewable, moved
 
 
 def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tuple[Viewable, Path]:
-    """What there is to see, and the folder that screenshots belong to.
+    """The scene at a path, and the folder for screenshots.
 
     Args:
-        path: of a run, a field, or a PLY file.
-        notes: told what is odd.
-        now: where things of a field or a fit are.
+        path: a run, a field, or a PLY file.
+        notes: collects warnings.
+        now: the present paths of what a field or a fit refers to.
 
     Raises:
         FileNotFoundError: there is no such file, or the folder is no run with a scene.
-        ValueError: the file holds no Gaussians, or something else than a run writes; or it has no use for
-            something in `now`.
+        ValueError: the file holds no Gaussians, or is not as the run wrote it; or a path in `now` does not
+            apply.
     """
     if path.is_file():
         if path.suffix.lower() != ".ply":
@@ -54,28 +54,28 @@ def open_viewable(path: Path, notes: Notes, now: Whereabouts = AS_IT_WAS) -> tup
     if not (path / "scene.ply").is_file():
         raise FileNotFoundError(
             f"{path}: expected a run with scene.ply, found none: it is not finished, or of a command that "
-            "keeps no scene; let it finish (--resume goes on)"
+            "keeps no scene; finish it with --resume"
         )
     for file, of_run in (("parts.npz", _of_parts), ("trajectory.npz", _of_track)):
         if (path / file).is_file():
             _expect_only((), now, f"{path} is a run that moves")
             if (field := field_of(path)) is not None:
                 notes.warn(
-                    f"its field is not asked while it moves; gsjax view {field} shows what its field is of"
+                    f"a moving scene cannot be queried; gsjax view {field} shows the scene of its field"
                 )
             return of_run(path, notes), path
     return _of_fit(path, notes, now), path
 
 
 def _expect_only(used: tuple[str, ...], now: Whereabouts, because: str) -> None:
-    """Raises a ValueError where something is said to be elsewhere that is not looked for."""
+    """Raises a ValueError if a path is given that does not apply."""
     unused = [f.name for f in fields(now) if f.name not in used and getattr(now, f.name) is not None]
     if unused:
-        raise ValueError(f"--{unused[0]}: {because}, which has no use for it; leave it out")
+        raise ValueError(f"--{unused[0]}: {because}, to which it does not apply; leave it out")
 
 
 def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
-    """The scene of a field, with the photographs that taught it where they still are."""
+    """The scene of a field, with its photographs if they are still there."""
     run = open_field_run(path, notes, now)
     folder = path.absolute()
     return Viewable(
@@ -90,7 +90,7 @@ def _of_field(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
 
 
 def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None:
-    """The field of a fit's scene, where it has one that can be asked."""
+    """The field of a fit's scene, if it has one that can be queried."""
     folder = field_of(path)
     if folder is None:
         _expect_only(("images",), now, f"{path} has no field")
@@ -99,16 +99,16 @@ def _field_of_fit(path: Path, notes: Notes, now: Whereabouts) -> FieldRun | None
     try:
         run = open_field_run(folder, notes, now, photographs=False)
     except (ValueError, OSError) as error:
-        notes.warn(f"its field cannot be asked: {describe(error)}")
+        notes.warn(f"its field cannot be queried: {describe(error)}")
         return None
     if not run.file.samefile(path / "scene.ply"):
-        notes.warn(f"its field is of another scene, {run.file}; gsjax view {folder} shows that")
+        notes.warn(f"its field belongs to another scene, {run.file}; gsjax view {folder} shows it")
         return None
     return run
 
 
 def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
-    """The scene of a run of `gsjax fit`, with its photographs where they still are, and its field."""
+    """The scene of a run of `gsjax fit`, with its field, and its photographs if they are still there."""
     field, config = _field_of_fit(path, notes, now), path / "config.yml"
     if field is None:
         gaussians, report = read_drawable(path / "scene.ply", notes)
@@ -124,7 +124,9 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
             photographs = photographs_of_run(settings, now.images)
             shots = _shots_of(photographs)
         except (ValueError, OSError) as error:
-            notes.warn(f"its photographs are not shown: {describe(error)} (--images says where they are now)")
+            notes.warn(
+                f"its photographs are not shown: {describe(error)} (--images gives their present path)"
+            )
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{config}: expected the settings of a fit, found others ({error})") from error
     background = photographs.background if photographs is not None and behind == "data" else None
@@ -142,13 +144,13 @@ def _of_fit(path: Path, notes: Notes, now: Whereabouts) -> Viewable:
 
 
 def _of_track(path: Path, notes: Notes) -> Viewable:
-    """The scene of a run of `gsjax track` over time, with its cameras where its recording still is."""
+    """The scene of a run of `gsjax track` over time, with its cameras if the recording is still there."""
     names: dict[int, str] = {}
     shots, times = None, None
     try:
         saved = open_run(path)
     except ValueError as error:
-        tracking = read_tracking(path)  # what is damaged there is an error
+        tracking = read_tracking(path)  # if that is damaged, it is an error
         notes.warn(f"its recording is not shown: {error}")
     else:
         tracking, names = saved.tracking, saved.names
@@ -168,7 +170,7 @@ def _of_track(path: Path, notes: Notes) -> Viewable:
 
 
 def _of_parts(path: Path, notes: Notes) -> Viewable:
-    """The scene of a run of `gsjax parts` over time, with its cameras where its recording still is."""
+    """The scene of a run of `gsjax parts` over time, with its cameras if the recording is still there."""
     layer, names = read_parts(path)
     saved, shots = None, None
     try:
@@ -179,7 +181,7 @@ def _of_parts(path: Path, notes: Notes) -> Viewable:
         if saved.complete:
             shots = _shots_of_recording(saved.recording)
         else:
-            notes.warn("it is a partial run: only the frames that were followed are there, and no cameras")
+            notes.warn("a partial run: it has only the frames that were followed, and no cameras")
     times, blend = np.asarray(layer.trajectory.times), blend_of(path) if saved is None else saved.blend
     filmed = Filmed(path.absolute().name, names, blend, times - times[0], shots)
     return filmed.viewable((layer,), None if saved is None else editing_of(saved, filmed))

@@ -1,7 +1,7 @@
-"""What a scene that moves looks like from each camera, frame by frame, beside what the camera saw."""
+"""Rendered views of a moving scene beside the recorded ones, frame by frame."""
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -11,12 +11,12 @@ from jaxtyping import Float, Int
 
 from gsjax.engine.recording import Prefetched, Recording
 from gsjax.optim.compiler import host_options
-from gsjax.rasterize.plan import Plan
+from gsjax.rasterize.plan import Plan, with_room
 from gsjax.scene.frame import Frame
 from gsjax.scene.render import plan_render
 
 OPAQUE = 0.5
-"""Pixels with less alpha show nothing: they have no label and no depth."""
+"""Pixels with less alpha have no label and no depth."""
 _DRAWN = ("render", "render_depth", "groups", "covered")
 
 
@@ -24,13 +24,13 @@ class View(NamedTuple):
     """One camera at one frame.
 
     Attributes:
-        t: frame, counted from 0 in the run.
+        t: index of the frame in the run, from 0.
         camera: the camera's id.
-        held_out: whether it is only judged.
-        image, depth, mask: what the camera saw; None where there is no such file.
-        render, render_depth: the scene; depth 0 where nothing is drawn.
+        held_out: whether the camera is held out.
+        image, depth, mask: the recording; None if there is no such file.
+        render, render_depth: the scene; depth is 0 where nothing is drawn.
         groups: the group on top in each pixel, 0 for background.
-        covered: where something is drawn.
+        covered: whether something is drawn there.
     """
 
     t: int
@@ -48,11 +48,13 @@ class View(NamedTuple):
 def views_of(
     recording: Recording, chosen: range, at: Callable, draw: Callable, placed: Callable
 ) -> Iterator[list[View]]:
-    """Views of the frames in `chosen`.
+    """The views of all cameras, a list per frame.
 
     Args:
-        at: frame -> (scene, pose).
-        draw: (scene, pose, frame, plan) -> Rendered, whose features are 1 where a group shows.
+        recording: the frames and cameras.
+        chosen: indices of the frames.
+        at: index of a frame -> (scene, pose).
+        draw: (scene, pose, frame, plan) -> Rendered, whose features are the share of each group.
         placed: (scene, pose) -> Gaussians.
     """
     sequence = recording.judged
@@ -67,12 +69,8 @@ def views_of(
         scene, pose = at(t)
         if plan is None:
             plan = plan_render(placed(scene, pose), frame.cameras)
-        while True:
-            *drawn, overflow, needed = jax.device_get(drawing(scene, pose, frame, plan))
-            if not overflow:
-                break
-            plan = plan.grown(int(needed))
-        images = np.asarray(frame.images)
+        drawn, plan = with_room(partial(drawing, scene, pose, frame), plan)
+        drawn, images = jax.device_get(drawn), np.asarray(frame.images)
         depths = None if frame.depths is None else np.asarray(frame.depths)
         yield [
             View(
@@ -90,18 +88,13 @@ def views_of(
 
 @cache
 def _compiled(draw: Callable) -> Callable:
-    """The jitted render; made late, because its options ask which machine this is, and once."""
+    """The jitted render; made on first use, because its options depend on the machine."""
 
     def drawn(scene, pose, frame: Frame, plan: Plan):
         rendered = draw(scene, pose, frame, plan)
         covered = rendered.alphas > OPAQUE
-        return (
-            rendered.colors,
-            jnp.where(covered, rendered.depths, 0.0),
-            jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0),
-            covered,
-            rendered.meta.overflow.any(),
-            rendered.meta.needed.max(),
-        )
+        depths = jnp.where(covered, rendered.depths, 0.0)
+        groups = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
+        return (rendered.colors, depths, groups, covered), rendered.meta._replace(features=None)
 
     return jax.jit(drawn, compiler_options=host_options())

@@ -5,13 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from gsjax.viz.plots import FAINT, INK, style_axes
 from gsjax.viz.viewer.cameras import up_direction
 
-_INK, _FAINT, _GRID = "#22262b", "#6b7280", "#e4e7eb"
 _FRUSTUM = 0.05  # length of a drawn frustum, as a fraction of the extent of the picture
 _DRAWN_CAMERAS, _DRAWN_POINTS = 200, 30_000
 _OUTER = 2.0  # percent of the points that may lie beyond each edge
@@ -68,12 +67,13 @@ def cameras_and_points(
     span = high - low
     tall = np.clip(_PANEL * max(span[1], span[2]) / span[0], *_HEIGHTS)
     figure = Figure(figsize=(2 * _PANEL + 1, tall + 1.2), facecolor="white", layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=_INK)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     above, side = figure.subplots(1, 2)
     length = _FRUSTUM * float(np.max(span))
     order = _thinned(np.flatnonzero(inside), _DRAWN_POINTS)
     for panel, (i, j), subtitle in ((above, (0, 1), "from above"), (side, (0, 2), "from the side")):
-        _style(panel, f"{names[i]} ({unit})", f"{names[j]} ({unit})", subtitle)
+        panel.set_title(subtitle, loc="left", fontsize=11, color=INK)
+        style_axes(panel, f"{names[i]} ({unit})", f"{names[j]} ({unit})")
         if len(order):
             shade = "#9aa1ab" if colors is None else np.clip(colors[order], 0, 1)
             panel.scatter(*shown[order][:, [i, j]].T, c=shade, s=1.2, lw=0, rasterized=True)
@@ -89,7 +89,7 @@ def cameras_and_points(
     figure.legend(handles, labels, loc="outside lower left", ncols=6, frameon=False, fontsize=9.5)
     if len(shown):
         beyond = f", {np.mean(~inside):.1%} of them beyond the edges" if not inside.all() else ""
-        figure.text(0.995, 0.015, f"{len(shown):,} points{beyond}", ha="right", fontsize=9.5, color=_FAINT)
+        figure.text(0.995, 0.015, f"{len(shown):,} points{beyond}", ha="right", fontsize=9.5, color=FAINT)
     return figure
 
 
@@ -148,14 +148,3 @@ def _frusta(group: CameraGroup, length: float) -> Float[np.ndarray, "lines 2 3"]
     centers = np.broadcast_to(to_world[:, None, :3, 3], ends.shape)
     edges, sides = np.stack([centers, ends], axis=2), np.stack([ends, np.roll(ends, 1, axis=1)], axis=2)
     return np.concatenate([edges, sides], axis=1).reshape(-1, 2, 3)
-
-
-def _style(panel: Axes, xlabel: str, ylabel: str, subtitle: str) -> None:
-    panel.set_title(subtitle, loc="left", fontsize=11, color=_INK)
-    panel.set_xlabel(xlabel, color=_FAINT, fontsize=10)
-    panel.set_ylabel(ylabel, color=_FAINT, fontsize=10)
-    panel.tick_params(colors=_FAINT, labelsize=9.5, length=0)
-    panel.grid(color=_GRID, lw=0.8)
-    panel.set_axisbelow(True)
-    for spine in panel.spines.values():
-        spine.set_color(_GRID)

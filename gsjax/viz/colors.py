@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Integer, Num, UInt8
 BACKGROUND = (158, 160, 164)  # label 0
 INVALID = (38, 40, 44)  # pixels without depth
 _INK = (245, 245, 245)
+_LARGE_ERROR, _LABEL_WEIGHT = 0.3, 0.65
 
 # Okabe and Ito's colours, then darker ones from Tol's muted scheme: any two neighbours are distinct to
 # colour-blind readers, and each is dark enough for a line on white (so yellow comes late and is deepened).
@@ -151,15 +152,13 @@ def with_heat_scale(
     return picture
 
 
-def error_heatmap(
-    a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"], limit: float = 0.3
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Mean absolute difference over the channels, black where equal and brightest from `limit` (of 1) on.
+def error_heatmap(a: Num[np.ndarray, "h w c"], b: Num[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Mean absolute difference over the channels, black where equal and brightest from 0.3 (of 1) on.
 
     Pixels that are not finite in one of the images cannot be compared and are shown as no error.
     """
     error = np.abs(_to_float(a) - _to_float(b)).mean(axis=-1)
-    return heat(error / limit)
+    return heat(error / _LARGE_ERROR)
 
 
 def to_uint8(image: Num[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -216,18 +215,13 @@ def in_rows(
 
 
 def overlay_labels(
-    image: Num[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"], strength: float = 0.65
+    image: Num[np.ndarray, "h w 3"], labels: Integer[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Labels as colours over a grey copy of the image, so that the shapes below still show.
-
-    Args:
-        image: uint8, or floats 0 to 1.
-        labels: labels of the pixels; those of 0 and below stay grey.
-        strength: weight of the label's colour, 0 to 1.
-    """
+    """Labels as colours over a grey copy of the image, so that the shapes below still show; 0 and below stay
+    grey."""
     grey = to_uint8(image).mean(axis=-1, keepdims=True) * 0.75
     inside: Bool[np.ndarray, "h w 1"] = (labels > 0)[..., None]
-    mixed = np.where(inside, strength * colorize_labels(labels) + (1 - strength) * grey, grey)
+    mixed = np.where(inside, _LABEL_WEIGHT * colorize_labels(labels) + (1 - _LABEL_WEIGHT) * grey, grey)
     return np.broadcast_to(mixed, (*labels.shape, 3)).astype(np.uint8)
 
 

@@ -5,7 +5,6 @@ Only matplotlib's object interface is used: no window, no pyplot, no state share
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -16,21 +15,15 @@ from matplotlib.ticker import MaxNLocator
 
 from gsjax.viz.colors import label_color
 
-_INK, _FAINT, _GRID = "#22262b", "#6b7280", "#e4e7eb"
+INK, FAINT, GRID = "#22262b", "#6b7280", "#e4e7eb"
+"""Colours of text, of secondary text, and of grids and frames."""
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
+_DASHED, _TARGET_HZ = (0, (5, 3)), 30
 
 
-def update_time(
-    update_s: Float[np.ndarray, "frames"], target_hz: float = 30.0, title: str = "Time of one update"
-) -> Figure:
-    """Update times over frames, with their median and 95th percentile, against a target rate.
-
-    Args:
-        update_s: seconds of each update; NaN where there was none.
-        target_hz: the rate drawn as a dashed line.
-        title: above the plot.
-    """
-    figure, axes = _new(title, "frame", "ms")
+def update_time(update_s: Float[np.ndarray, "frames"]) -> Figure:
+    """Update times over frames, with their median and 95th percentile, against 30 Hz; NaN is left out."""
+    figure, axes = _new("Time of one update", "frame", "ms")
     ms = np.asarray(update_s, float) * 1e3
     axes.plot(ms, color=_BLUE, lw=1.1, marker="o", ms=2.2, mew=0)
     if np.isfinite(ms).any():
@@ -43,8 +36,8 @@ def update_time(
         if np.nanmax(ms) > 8 * p95:  # the first update compiles
             axes.set_yscale("log")
             axes.minorticks_off()
-    axes.axhline(1e3 / target_hz, color=_ORANGE, lw=1.2, ls=(0, (5, 3)))
-    _margin_label(axes, 1e3 / target_hz, f"{target_hz:.0f} Hz", _ORANGE)
+    axes.axhline(1e3 / _TARGET_HZ, color=_ORANGE, lw=1.2, ls=_DASHED)
+    _margin_label(axes, 1e3 / _TARGET_HZ, f"{_TARGET_HZ} Hz", _ORANGE)
     if axes.get_yscale() == "linear":
         axes.set_ylim(bottom=0)
     return figure
@@ -54,7 +47,6 @@ def error_over_frames(
     errors_mm: Mapping[str, Float[np.ndarray, "frames"]],
     labels: Mapping[str, int] | None = None,
     limit_mm: float | None = None,
-    title: str = "Centroid error",
 ) -> Figure:
     """Position error of each object in mm, one line per object.
 
@@ -62,36 +54,38 @@ def error_over_frames(
         errors_mm: name to error in each frame; NaN where there is no ground truth.
         labels: name to label, which gives the line its colour (default: counted from 1).
         limit_mm: a target, drawn dashed.
-        title: above the plot.
     """
-    figure, axes = _new(title, "frame", "mm")
+    figure, axes = _new("Centroid error", "frame", "mm")
     for i, (name, error) in enumerate(errors_mm.items()):
         axes.plot(error, color=_rgb(labels[name] if labels else i + 1), lw=1.6, label=name)
     if limit_mm is not None:
-        axes.axhline(limit_mm, color=_FAINT, lw=1.0, ls=(0, (5, 3)))
-        _margin_label(axes, limit_mm, f"{limit_mm:g} mm", _FAINT)
+        axes.axhline(limit_mm, color=FAINT, lw=1.0, ls=_DASHED)
+        _margin_label(axes, limit_mm, f"{limit_mm:g} mm", FAINT)
     axes.set_ylim(bottom=0)
     _legend(figure, axes)
     return figure
 
 
-def fit_curve(rows: Sequence[Mapping[str, float | None]], title: str = "Held-out PSNR") -> Figure:
+def fit_curve(rows: Sequence[Mapping[str, float | None]]) -> Figure:
     """PSNR of held-out views and, behind it, the number of Gaussians, over minutes.
 
     Args:
         rows: `seconds`, `alive` and `test_psnr` (None if not evaluated) of each row of the log.
     """
-    figure, axes = _new(title, "minutes", "dB")
-    minutes = np.array([row["seconds"] for row in rows], float) / 60
-    psnr = np.array([np.nan if row["test_psnr"] is None else row["test_psnr"] for row in rows], float)
-    known = np.isfinite(psnr)
+    figure, axes = _new("Held-out PSNR", "minutes", "dB")
     behind = axes.twinx()
-    behind.plot(minutes, [row["alive"] for row in rows], color=_FAINT, lw=1.0)
-    behind.set_ylabel("Gaussians", color=_FAINT)
+    behind.plot([row["seconds"] / 60 for row in rows], [row["alive"] for row in rows], color=FAINT, lw=1.0)
+    behind.set_ylabel("Gaussians", color=FAINT)
     behind.set_ylim(bottom=0)
     behind.spines[["top"]].set_visible(False)
-    axes.plot(minutes[known], psnr[known], color=_BLUE, lw=1.6, marker="o", ms=3)
+    axes.plot(*_held_out_psnr(rows), color=_BLUE, lw=1.6, marker="o", ms=3)
     return figure
+
+
+def _held_out_psnr(rows: Sequence[Mapping[str, float | None]]) -> Float[np.ndarray, "2 n"]:
+    """Minutes and PSNR of the evaluated rows."""
+    evaluated = [(row["seconds"], row["test_psnr"]) for row in rows if row["test_psnr"] is not None]
+    return np.array(evaluated, float).reshape(-1, 2).T / [[60], [1]]
 
 
 def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
@@ -112,19 +106,15 @@ def losses_over_steps(rows: Sequence[Mapping[str, float | None]]) -> Figure:
     return figure
 
 
-def fit_curves(
-    runs: Mapping[str, Sequence[Mapping[str, float | None]]], title: str = "Held-out PSNR"
-) -> Figure:
+def fit_curves(runs: Mapping[str, Sequence[Mapping[str, float | None]]]) -> Figure:
     """PSNR of held-out views over minutes, one line per run, with a ring at its end.
 
     Args:
         runs: name to rows of `seconds` and `test_psnr` (None if not evaluated).
     """
-    figure, axes = _new(title, "minutes", "dB")
+    figure, axes = _new("Held-out PSNR", "minutes", "dB")
     for i, (name, rows) in enumerate(runs.items()):
-        evaluated = [row for row in rows if row["test_psnr"] is not None]
-        minutes = np.array([row["seconds"] for row in evaluated], float) / 60
-        psnr = np.array([row["test_psnr"] for row in evaluated], float)
+        minutes, psnr = _held_out_psnr(rows)
         axes.plot(minutes, psnr, color=_rgb(i + 1), lw=1.6, marker="o", ms=2.6, mew=0, label=name)
         axes.plot(minutes[-1:], psnr[-1:], color=_rgb(i + 1), marker="o", ms=7, mfc="white", mew=1.6)
     axes.set_xlim(left=0)
@@ -135,16 +125,14 @@ def fit_curves(
 def psnr_over_frames(
     tracked: Mapping[str, Float[np.ndarray, "frames"]],
     held_out: Mapping[str, Float[np.ndarray, "frames"]] | None = None,
-    title: str = "PSNR",
 ) -> Figure:
     """PSNR in dB over frames, one line per camera: solid for tracked cameras, dashed for held-out ones.
 
     Args:
         tracked: camera to PSNR of each frame.
         held_out: the same for cameras that the method did not see.
-        title: above the plot.
     """
-    figure, axes = _new(title, "frame", "dB")
+    figure, axes = _new("PSNR", "frame", "dB")
     lines = [(n, v, "-", "tracked") for n, v in tracked.items()]
     lines += [(n, v, (0, (4, 2)), "held out") for n, v in (held_out or {}).items()]
     for i, (name, values, style, kind) in enumerate(lines):
@@ -157,33 +145,26 @@ def trajectories(
     centroids: Mapping[str, Float[np.ndarray, "frames 3"]],
     labels: Mapping[str, int] | None = None,
     truth: Mapping[str, Float[np.ndarray, "frames 3"]] | None = None,
-    view: Literal["top", "3d"] = "top",
-    title: str = "Paths of the objects",
 ) -> Figure:
-    """Paths of the centroids in metres: a ring at the start, a dot at the end, the true path thin below.
+    """Paths of the centroids from above, in metres: a ring at the start, a dot at the end, the true path thin
+    below.
 
     Args:
         centroids: name to position in each frame; NaN where there is none.
         labels: name to label, which gives the line its colour (default: counted from 1).
         truth: name to true position in each frame.
-        view: "top" looks along the world's z axis; "3d" shows all three.
-        title: above the plot.
     """
-    figure, axes = _new(title, "x (m)", "y (m)", projection="3d" if view == "3d" else None)
-    take = 3 if view == "3d" else 2
+    figure, axes = _new("Paths of the objects", "x (m)", "y (m)")
     for i, (name, path) in enumerate(centroids.items()):
         color = _rgb(labels[name] if labels else i + 1)
         if truth and name in truth:
-            axes.plot(*np.asarray(truth[name])[:, :take].T, color=_INK, lw=0.9, alpha=0.55)
-        axes.plot(*np.asarray(path)[:, :take].T, color=color, lw=2.0, label=name)
-        finite = np.asarray(path)[np.isfinite(path).all(axis=1), :take]
+            axes.plot(*np.asarray(truth[name])[:, :2].T, color=INK, lw=0.9, alpha=0.55)
+        axes.plot(*np.asarray(path)[:, :2].T, color=color, lw=2.0, label=name)
+        finite = np.asarray(path)[np.isfinite(path).all(axis=1), :2]
         if len(finite):
             axes.plot(*finite[:1].T, color=color, marker="o", ms=7, mfc="white", mew=1.6)
             axes.plot(*finite[-1:].T, color=color, marker="o", ms=6, mew=0)
-    # Three-dimensional axes accept "equal" too, but their box then no longer fills the figure.
-    axes.set_aspect("equal", adjustable="datalim" if view == "top" else "box")
-    if view == "3d":
-        axes.set_zlabel("z (m)", color=_FAINT, fontsize=10)  # pyright: ignore[reportAttributeAccessIssue]
+    axes.set_aspect("equal", adjustable="datalim")
     _legend(figure, axes)
     return figure
 
@@ -202,21 +183,26 @@ def save(figure: Figure, path: str | Path) -> Path:
     return path
 
 
-def _new(title: str, xlabel: str, ylabel: str, projection: str | None = None) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(6.4, 5.0 if projection else 3.4), facecolor="white", layout="constrained")
-    axes = figure.add_subplot(projection=projection)
-    axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=10)
-    axes.set_xlabel(xlabel, color=_FAINT, fontsize=10)
-    axes.set_ylabel(ylabel, color=_FAINT, fontsize=10)
-    axes.tick_params(colors=_FAINT, labelsize=9.5, length=0)
+def _new(title: str, xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(6.4, 3.4), facecolor="white", layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=10)
+    style_axes(axes, xlabel, ylabel)
     if xlabel == "frame":
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(color=_GRID, lw=0.8)
-    axes.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
-    axes.spines["bottom"].set_color(_GRID)
+    axes.spines[["top", "right", "left"]].set_visible(False)
     return figure, axes
+
+
+def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Label axes, with a faint grid behind the data."""
+    axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
+    axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
+    axes.tick_params(colors=FAINT, labelsize=9.5, length=0)
+    axes.grid(color=GRID, lw=0.8)
+    axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color(GRID)
 
 
 def _margin_label(axes: Axes, y: float, text: str, color: str) -> None:
@@ -230,7 +216,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     columns = 5 if max(map(len, names), default=0) < 14 else 3
     if names:
-        text = {"fontsize": 9.5, "labelcolor": _INK}
+        text = {"fontsize": 9.5, "labelcolor": INK}
         spacing = {"columnspacing": 1.3, "handlelength": 1.4, "frameon": False}
         figure.legend(handles, names, loc="outside lower left", ncols=columns, **text, **spacing)
 

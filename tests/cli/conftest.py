@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.cli import main, track
+from gsjax.cli import main
 from gsjax.data import open_sequence, write_panoptic
 from gsjax.data.simulated import tabletop
 from gsjax.engine.distill.scene import SceneOptions
@@ -18,7 +18,7 @@ from gsjax.engine.distill.source import Source
 from gsjax.engine.drive import Tick
 from gsjax.engine.folder import RunFolder, plain
 from gsjax.engine.records import digest
-from gsjax.engine.track import loop
+from gsjax.engine.track import loop, run
 from gsjax.geometry.cameras import OPENGL_TO_OPENCV
 from gsjax.methods.distill import DistillResult, FeatureField
 from gsjax.methods.track import PLAN, Kept, Track, Tracked, first_pose, start_scene
@@ -85,7 +85,7 @@ def standing_still(scene, first, frames, config, **how):
 @pytest.fixture
 def still(monkeypatch):
     """Tracking is replaced by standing still, which compiles nothing; that is given."""
-    monkeypatch.setattr(track, "start_scene", unfitted)
+    monkeypatch.setattr(run, "start_scene", unfitted)
     monkeypatch.setattr(loop, "track", standing_still)
     return standing_still
 

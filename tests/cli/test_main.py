@@ -84,7 +84,7 @@ def test_info_of_a_ply_file_points_to_view(say, tmp_path):
     (tmp_path / "scene.ply").write_bytes(b"ply")
     code, _, err = say("info", str(tmp_path / "scene.ply"))
     assert code == 2
-    assert f"expected a dataset, found a PLY file; look at it by gsjax view {tmp_path}" in err
+    assert f"expected a dataset, found a PLY file; view it with gsjax view {tmp_path}" in err
 
 
 def test_info_says_what_is_there(say):

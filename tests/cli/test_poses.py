@@ -127,7 +127,7 @@ def test_folders_that_cannot_be_used(say, tmp_path):
     assert "b.jpg: expected a video" in say(tmp_path / "empty/b.jpg", "--out", out)[1]
     assert not (tmp_path / "new").exists()
     said = say(tmp_path / "empty", "--out", tmp_path / "empty")[1]
-    assert "the photographs themselves lie there; name another folder" in said
+    assert "the photographs themselves are there; name another folder" in said
 
 
 def test_pictures_without_texture_and_one_that_cannot_be_read(say, tmp_path):

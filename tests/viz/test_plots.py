@@ -52,12 +52,11 @@ def test_curves_of_fits_leave_out_rows_without_evaluation():
     assert all(len(line.get_xdata()) == 0 for line in never)
 
 
-@pytest.mark.parametrize("view", ["top", "3d"])
-def test_trajectories_survive_gaps_and_absent_objects(view, tmp_path):
+def test_trajectories_survive_gaps_and_absent_objects(tmp_path):
     path = np.cumsum(np.ones((10, 3)) * 0.01, axis=0)
     path[3] = np.nan
     paths = {"cup": path, "never seen": np.full((10, 3), np.nan)}
-    figure = plots.trajectories(paths, truth={"cup": path}, view=view)
+    figure = plots.trajectories(paths, truth={"cup": path})
     assert plots.save(figure, tmp_path / "plots" / "paths.png").stat().st_size > 5000
 
 

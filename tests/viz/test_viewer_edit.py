@@ -212,7 +212,7 @@ def test_a_new_scene_replaces_what_the_browser_has():
 def test_texts_of_films():
     scene = rising(ball(RED, 0.0), 4)
     assert markup.film_summary(scene) == "0.30 s, 4 frames, 150 Gaussians"
-    assert "&lt;i&gt;" in markup.as_lines(["<i>"], "red")
+    assert "&lt;i&gt;" in markup.as_lines("<i>", color="red")
     assert "<b>to</b>" in markup.operation_help(["It goes on after `to`."])
 
 

@@ -1,8 +1,8 @@
-"""Running cells on the workers of a Dask cluster: processes here, those at an address, or jobs of SLURM.
+"""Running cells on the workers of a Dask cluster: processes here, those at an address, or SLURM jobs.
 
-A worker has a checkout of its own and is told which cell to run. It runs it as it is run here, in a folder of
-its own, and sends all that the cell left: record and files. So no disk need be shared, and what stands in the
-experiment's folder afterwards is what a run here would have left.
+A worker has a checkout of its own and gets the options of a cell. It runs the cell in a temporary folder and
+sends back all that the cell left: record and files. So no disk need be shared, and the experiment's folder
+ends up as after a run in this process.
 """
 
 import io
@@ -24,7 +24,6 @@ from zipfile import ZipFile
 
 from gsjax import extras
 from gsjax.engine.experiments.local import run_cell
-from gsjax.engine.experiments.records import now
 from gsjax.engine.experiments.script import forget_scripts
 from gsjax.engine.experiments.sweep import Cell, Experiment, read_experiment
 from gsjax.engine.machine import keep_to, usable_cores
@@ -36,7 +35,7 @@ PROCESSES, SLURM = "processes", "slurm"
 CONNECT_S = 10
 _POLL_S, _COLLECTED_S = 1, 60
 _KEYS = "gsjax-"
-# A terminal sends Ctrl-C to them too, but who ends them is this process. What a cell starts gets it as ever.
+# A terminal sends Ctrl-C to workers too, but this process ends them. Subprocesses of a cell get it as usual.
 _UNDISTURBED = "import signal; signal.signal(signal.SIGINT, lambda *_: None)"
 
 
@@ -49,28 +48,30 @@ def run_on_cluster(
     connected: Callable[[], Any],
     debug: bool = False,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Run cells on workers and give each with its record, which is on disk by then, as they finish.
+    """Run cells on workers, and yield each with its record, which is on disk by then, as they finish.
 
-    A cell whose worker dies is run by another. One that lost more workers than Dask allows it to
-    (`distributed.scheduler.allowed-failures`) waits until all others are done: it may only have waited for
-    its turn on a worker that another one killed. If it then loses one more, it has failed.
+    A cell whose worker dies is run by another. One that lost more workers than Dask allows
+    (`distributed.scheduler.allowed-failures`) waits until all others are done: it may only have been queued
+    on workers that another cell killed. If it then loses one more, it has failed.
 
     Args:
-        scheduler: `processes`, `slurm`, or the address of one, such as tcp://HOST:8786.
-        workers: how many processes or jobs to start. As many processes as there are cores, unless given.
-        say: is told how many workers there are.
-        connected: is called when there is a scheduler, before any cell is asked for.
-        debug: let through what a cell raises.
+        experiment: the experiment.
+        cells: the cells to run.
+        scheduler: `processes`, `slurm`, or an address such as tcp://HOST:8786.
+        workers: number of processes or jobs to start (default: one process per core).
+        say: called with the number of workers, in words.
+        connected: called when there is a scheduler, before any cell is submitted.
+        debug: whether exceptions of cells are passed on.
 
     Raises:
-        ValueError: there is no such scheduler, or a worker is not as this process is.
-        OSError: the scheduler does not answer, or no longer.
+        ValueError: there is no such scheduler, or a worker differs from this process.
+        OSError: the scheduler does not answer, or no longer does.
     """
     killed_worker = _package("distributed").KilledWorker
     if scheduler == PROCESSES:
         workers = workers or usable_cores()
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
-    with _client(scheduler, workers) as client, _said_if_gone(scheduler):
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # its errors are reported here
+    with _client(scheduler, workers) as client, _reporting_loss(scheduler):
         connected()
         sharing = workers if scheduler == PROCESSES else None
         under_way = {_submit(client, experiment, cell, sharing, debug): cell for cell in cells}
@@ -101,24 +102,24 @@ def run_on_cluster(
 
 
 @contextmanager
-def _said_if_gone(scheduler: str) -> Iterator[None]:
-    """Raises what says so where the scheduler is gone, and all that it was asked for with it."""
+def _reporting_loss(scheduler: str) -> Iterator[None]:
+    """Raises an OSError if the scheduler, and with it every submitted cell, is lost."""
     try:
         yield
     except CancelledError as error:
         raise OSError(
-            f"--scheduler {scheduler}: expected it to stay, found it gone; what was done is kept, and the "
-            "same command goes on from there"
+            f"--scheduler {scheduler}: expected it to stay, found it gone; finished cells are kept, and the "
+            "same command continues from there"
         ) from error
 
 
 def _submit(client: Any, experiment: Experiment, cell: Cell, sharing: int | None, debug: bool) -> Any:
-    """Ask for a cell; returns its future. What is asked again while a worker is still at it joins it."""
+    """Submit a cell; returns its future. A cell submitted again while it runs shares the result."""
     about = (f"{experiment.root}", experiment.name, experiment.fingerprint, experiment.made_with)
     arguments = (*about, cell.options, cell.seed, sharing, debug)
     key = f"{_KEYS}{import_module('dask.base').tokenize(arguments)}"
-    # By its name, and with plain arguments: a worker without this module fails to load it and says so. It
-    # would break over a message that holds what it cannot load.
+    # By its name, and with plain arguments: a worker without this module then reports that it cannot load it,
+    # where unpickling a function of the module would break the worker.
     module = __name__
     return client.submit(lambda: import_module(module).run_there(*arguments), key=key)
 
@@ -133,17 +134,17 @@ def run_there(
     sharing: int | None,
     debug: bool,
 ) -> bytes:
-    """Run a cell; what a worker does.
+    """Run a cell on a worker.
 
     Args:
-        root: the folder of the experiments, from where the worker was started.
-        name: of the experiment.
-        script: the fingerprint that it must have here too.
-        made_with: the gsjax that must be here too.
-        options: those of the cell.
-        seed: that of the cell.
-        sharing: how many workers share this machine's cores; None leaves it to them.
-        debug: let through what the cell raises.
+        root: the folder of the experiments, relative to where the worker was started.
+        name: name of the experiment.
+        script: the fingerprint that its script must have.
+        made_with: the version of gsjax that the worker must have.
+        options: options of the cell.
+        seed: seed of the cell.
+        sharing: number of workers that share this machine's cores; None does not restrict them.
+        debug: whether exceptions of the cell are passed on.
 
     Returns:
         a zip of the cell's record, ID.json, and of its folder, ID.
@@ -158,7 +159,7 @@ def run_there(
             f"{worker.state.nthreads}; start it with --nthreads 1"
         )
     _wait_until_collected(worker)
-    # JAX keeps memory that it has freed. A worker that Dask pauses for that would never go on.
+    # JAX keeps freed memory. A worker that Dask pauses for that would never continue.
     worker.memory_manager.memory_pause_fraction = False
     if sharing is not None:
         _keep_to_share(worker.name, sharing)
@@ -174,8 +175,8 @@ def run_there(
 
 
 def _wait_until_collected(worker: Any) -> None:
-    """Until what this worker computed before is on the disk of who asked: the next cell may end it. Whoever
-    asked may have gone, so not for ever."""
+    """Wait until the client has stored what this worker computed before, because the next cell may kill it;
+    not for ever, because the client may have gone."""
     for _ in range(int(_COLLECTED_S / 0.01)):
         if not any(str(key).startswith(_KEYS) for key in list(worker.data)):
             return
@@ -184,12 +185,12 @@ def _wait_until_collected(worker: Any) -> None:
 
 @lru_cache(maxsize=1)
 def _loaded(root: str, name: str, script: str, made_with: str) -> tuple[Experiment, Callable]:
-    """An experiment, and `run` of its script, which serves all cells; of the one that was run last.
+    """An experiment, and `run` of its script, loaded once for all cells.
 
     Raises:
-        ValueError: it is not what `script` and `made_with` say, or cannot be loaded.
+        ValueError: it does not match `script` and `made_with`, or cannot be loaded.
     """
-    forget_scripts(Path(root))  # another experiment may have helpers of the same name, or they were edited
+    forget_scripts(Path(root))  # other helpers of the same name, or edited ones
     experiment = read_experiment(Path(root), name, Path())
     if experiment.made_with != made_with:
         raise ValueError(
@@ -206,10 +207,8 @@ def _loaded(root: str, name: str, script: str, made_with: str) -> tuple[Experime
 
 @cache
 def _keep_to_share(index: int, sharing: int) -> None:
-    """Keep this process to its part of the cores, so that what it measures is not what others are at.
-
-    More processes than cores share them.
-    """
+    """Restrict this process to its share of the cores, so that workers do not disturb each other's timings.
+    If there are more processes than cores, they share them."""
     if hasattr(os, "sched_getaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         first, end = (n * len(cores) // sharing for n in (index % sharing, index % sharing + 1))
@@ -217,9 +216,9 @@ def _keep_to_share(index: int, sharing: int) -> None:
 
 
 def _finished(client: Any, futures: list[Any], say: Callable[[str], Any]) -> list[Any]:
-    """Those that are, as soon as one is."""
+    """The finished futures, as soon as there is one."""
     while True:
-        with suppress(OSError):  # the client is trying to reach it again, and gives up after a while
+        with suppress(OSError):  # the client is reconnecting, and gives up after a while
             workers = len(client.nthreads())
             say(f"cells on {counted(workers, 'worker')}" if workers else "waiting for a worker")
         with suppress(TimeoutError):
@@ -228,7 +227,7 @@ def _finished(client: Any, futures: list[Any], say: Callable[[str], Any]) -> lis
 
 
 def _unpack(experiment: Experiment, cell: Cell, sent: bytes) -> dict[str, Any]:
-    """Put what a worker sent where a run here would have left it, the record last; returns the record."""
+    """Store what a worker sent, the record last; returns the record."""
     experiment.cells_folder.mkdir(parents=True, exist_ok=True)
     folder, path = experiment.cells_folder / cell.id, experiment.path(cell)
     with TemporaryDirectory(dir=experiment.cells_folder, prefix=".partial-") as temporary:
@@ -244,30 +243,23 @@ def _unpack(experiment: Experiment, cell: Cell, sent: bytes) -> dict[str, Any]:
 
 
 def _killed(experiment: Experiment, cell: Cell, workers: int) -> dict[str, Any]:
-    """Keep the record of a cell that no worker lives to tell of; returns it."""
-    record = {
-        "options": cell.options,
-        "seed": cell.seed,
-        "result": None,
-        "error": f"KilledWorker: {workers} workers died with this cell, the last one while it ran no other: "
-        "perhaps there is too little memory; what ended them is in their logs",
-        "traceback": [],
-        "seconds": None,
-        "finished": now(),
-        "script": experiment.fingerprint,
-        "machine": None,
-        "gsjax": experiment.made_with,
-    }
+    """Write the record of a cell whose workers all died; returns it."""
+    error = (
+        f"KilledWorker: {workers} workers died with this cell, the last one while it ran no other: perhaps "
+    )
+    error += "there is too little memory; the reason is in their logs"
+    record = experiment.new_record(cell, error)
     write_json(experiment.path(cell), record)
     return record
 
 
 @contextmanager
 def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
-    """A client of the scheduler, which is started where it is not an address, and ended with its workers."""
+    """A client of the scheduler, which, unless it is an address, is started here and ended with its
+    workers."""
     distributed, config = _package("distributed"), _package("dask.config")
     with ExitStack() as stack:
-        # Cells take long: none is to wait for a worker while another one is idle.
+        # Cells take long: none should wait for a busy worker while another one is idle.
         stack.enter_context(config.set({"distributed.scheduler.worker-saturation": 1.0}))
         place = scheduler
         if scheduler == PROCESSES:
@@ -296,7 +288,7 @@ def _client(scheduler: str, workers: int | None) -> Iterator[Any]:
 def slurm_cluster() -> Any:
     """Dask's cluster of SLURM jobs, of which none is submitted yet. A job is one worker, with all its cores.
 
-    What a job is stands in Dask's own configuration: `jobqueue.slurm` of ~/.config/dask/*.yaml.
+    Jobs are configured in Dask's own settings: `jobqueue.slurm` of ~/.config/dask/*.yaml.
 
     Raises:
         MissingExtra: dask-jobqueue is not installed.
@@ -309,22 +301,22 @@ def slurm_cluster() -> Any:
             "--scheduler slurm: expected jobqueue.slurm.cores and .memory in Dask's settings, a .yaml in "
             f"{config.PATH}, found no {'cores' if cores is None else 'memory'}"
         )
-    # What Dask calls cores are threads of its own, and would be as many cells at once.
+    # Dask's "cores" are its threads, each of which would run a cell at the same time.
     free_port = {"dashboard_address": ":0", **config.get("jobqueue.slurm.scheduler-options")}
     return jobqueue.SLURMCluster(cores=1, processes=1, job_cpu=cores, scheduler_options=free_port)
 
 
 def check_scheduler(scheduler: str, workers: int | None) -> None:
-    """Raises a ValueError where these cannot be, and MissingExtra where what they need is not installed."""
+    """Raises a ValueError if these options are invalid, and MissingExtra if a package is missing."""
     _package("distributed")
     if workers is not None and workers < 1:
         raise ValueError(f"--workers: expected 1 or more, found {workers}")
     if "://" in scheduler:
         if workers is not None:
-            raise ValueError(f"--workers: expected none given, for {scheduler} has its own, found {workers}")
+            raise ValueError(f"--workers: expected none, because {scheduler} has its own, found {workers}")
     elif scheduler == SLURM:
         if workers is None:
-            raise ValueError("--workers: expected how many jobs to submit to SLURM, found none given")
+            raise ValueError("--workers: expected the number of jobs to submit to SLURM, found none")
         if shutil.which("sbatch") is None:
             raise ValueError("--scheduler slurm: expected SLURM's sbatch on this machine, found none")
     elif scheduler != PROCESSES:
@@ -333,13 +325,13 @@ def check_scheduler(scheduler: str, workers: int | None) -> None:
 
 
 def _package(name: str) -> ModuleType:
-    """A package of the extra `cluster`, or a module of one; Ctrl-C stays with who heard it.
+    """A package of the extra `cluster`, or a module of one, imported without changing the handler of Ctrl-C.
 
     Raises:
         MissingExtra: it is not installed.
     """
-    heard_by = signal.getsignal(signal.SIGINT)
+    handler = signal.getsignal(signal.SIGINT)
     module = extras.load(name, "cluster", "--executor dask")
-    if signal.getsignal(signal.SIGINT) is not heard_by:  # dask-jobqueue takes it as it is imported
-        signal.signal(signal.SIGINT, heard_by)
+    if signal.getsignal(signal.SIGINT) is not handler:  # dask-jobqueue replaces it on import
+        signal.signal(signal.SIGINT, handler)
     return module

@@ -1,4 +1,4 @@
-"""Collecting what is known of an experiment: results.json, .md, .html and the figure."""
+"""Collecting the records of an experiment into results.json, .md, .html and the figure."""
 
 import sys
 from collections.abc import Callable
@@ -17,24 +17,25 @@ from gsjax.engine.summary import Column, Media, Summary, Table
 from gsjax.io.atomic import atomic_write, write_json
 
 SHARED = ("script", "machine", "gsjax")
-"""Of a record: said once in results.json where all rows have the same."""
+"""Keys of a record that results.json holds once if all rows agree."""
 DIGITS = 6
-"""Of collected figures: enough for any table, few enough that noise in the last ones makes no git diff."""
+"""Digits of collected figures: enough for any table, few enough that noise makes no git diff."""
 
 
 def collect(experiment: Experiment, figure: Callable | None, debug: bool) -> int:
     """Write results.json, .md, .html and the figure into the experiment's folder, and print the table.
 
     Args:
+        experiment: the experiment.
         figure: `figure(rows, path)` of the script, or None.
-        debug: let through what it raises.
+        debug: whether its exceptions are passed on.
 
     Returns:
         1 if there is nothing to collect or `figure` failed, else 0.
     """
     records = [_rounded(record) for record in experiment.records()]
     done = [record for record in records if record["error"] is None]
-    # One line of the table does not average over two versions of the script.
+    # A line of the table must not average over two versions of the script.
     present = [record["options"] for record in done if experiment.is_done(record)]
     done = [r for r in done if experiment.is_done(r) or r["options"] not in present]
     if not done:
@@ -71,7 +72,7 @@ def collect(experiment: Experiment, figure: Callable | None, debug: bool) -> int
 
 
 def _rounded(record: dict[str, Any]) -> dict[str, Any]:
-    """The record with figures of few digits; options stay, for the cell is known by them."""
+    """The record with rounded figures; options stay exact, because they identify the cell."""
 
     def few(value: Any) -> Any:
         if isinstance(value, dict):
@@ -84,7 +85,7 @@ def _rounded(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write_json(experiment: Experiment, records: list[dict[str, Any]], done: list[dict[str, Any]]) -> None:
-    """Writes results.json, from which `Experiment.committed` reads the rows again."""
+    """Write results.json, which `Experiment.committed` reads."""
     same = {key: done[0][key] for key in SHARED if all(record[key] == done[0][key] for record in done)}
     keys = ("options", "seed", "result", "seconds", "finished", *(key for key in SHARED if key not in same))
     found = {
@@ -102,7 +103,7 @@ def _write_json(experiment: Experiment, records: list[dict[str, Any]], done: lis
 
 
 def _write_markdown(experiment: Experiment, shown: Shown, notes: list[str], drawing: list[Media]) -> None:
-    """Writes results.md."""
+    """Write results.md."""
     config, line = experiment.config, lambda cells: f"| {' | '.join(map(_escaped, cells))} |"
     rules = line("---:" if right else "---" for right in shown.numeric)
     text = [f"# {experiment.name}", "", _escaped(config.claim), "", f"Source: {_escaped(config.source)}", ""]
@@ -114,12 +115,12 @@ def _write_markdown(experiment: Experiment, shown: Shown, notes: list[str], draw
 
 
 def _escaped(text: str) -> str:
-    """On one line, and without what would end a cell of a Markdown table."""
+    """Text in one line, with bars escaped for Markdown tables."""
     return " ".join(text.split()).replace("|", "\\|")
 
 
 def _write_page(experiment: Experiment, shown: Shown, notes: list[str], drawing: list[Media]) -> None:
-    """Writes results.html."""
+    """Write results.html."""
     config = experiment.config
     pairs = zip(zip(*shown.lines, strict=True), shown.numeric, strict=True)
     columns = [_aligned(column) if numeric else column for column, numeric in pairs]
@@ -136,12 +137,12 @@ def _write_page(experiment: Experiment, shown: Shown, notes: list[str], drawing:
 
 
 def _aligned(column: tuple[str, ...]) -> list[str]:
-    """Numbers with their points in one line, also where a page starts them at the left"""
+    """Numbers with aligned decimal points, also where a page aligns them at the left."""
     lengths = [len(text.partition(" ")[0]) for text in column]
     spaces = ("\u2007" * (max(lengths) - length) for length in lengths)  # each as wide as a digit
     return [space + text for space, text in zip(spaces, column, strict=True)]
 
 
 def stdout() -> Console:
-    """A console that wraps lines for people only."""
+    """A console on stdout that wraps lines only in a terminal."""
     return Console(highlight=False, width=None if sys.stdout.isatty() else 1000)

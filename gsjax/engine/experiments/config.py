@@ -1,4 +1,4 @@
-"""What an experiment's config.yaml may say, and what is said where it says something else."""
+"""The config.yaml of an experiment, and its validation."""
 
 import dataclasses
 import difflib
@@ -18,16 +18,16 @@ _WORDS = {str: "text", int: "a whole number", list: "a list", dict: "key: value 
 class Column:
     """A column of the table."""
 
-    key: str  # of what `run` returns, or seconds
-    label: str = ""  # the key unless given
+    key: str  # of the result of `run`, or seconds
+    label: str = ""  # default: the key
     unit: str = ""
     direction: str = ""  # lower or higher: which is better
-    format: str = ""  # as Python's format() has it, such as .2f; three digits unless given
+    format: str = ""  # for Python's format(), such as .2f; default: three digits
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What `figure(rows, path)` of the script draws."""
+    """The figure that `figure(rows, path)` of the script draws."""
 
     file: str = "figure.png"
     caption: str = ""
@@ -35,35 +35,32 @@ class Figure:
 
 @dataclass(frozen=True)
 class Config:
-    """What config.yaml says; its keys are these names."""
+    """The contents of config.yaml, by its keys."""
 
     claim: str  # one sentence
-    source: str  # where it is made: paper and section, or else
+    source: str  # of the claim: paper and section, or other
     script: str  # path from the config's folder, with `run(options, seed, folder)`; several may share one
     grid: dict = field(default_factory=dict)  # option: [values]; all combinations, the last option fastest
     cases: list = field(default_factory=list)  # of option: value pairs; the grid is swept in each
     seeds: list = field(default_factory=lambda: [0])
     columns: list = field(default_factory=list)  # of Column; none for all figures
     figure: dict = field(default_factory=dict)  # a Figure
-    version: int = 1  # raise it to have all cells measured again
+    version: int = 1  # increase it to run all cells again
 
 
 def read_config(path: Path, root: Path) -> tuple[Config, tuple[Column, ...], Figure]:
-    """Read a config.yaml and check all of it but the sweep; `read_experiment` checks that.
-
-    Args:
-        path: the file.
-        root: the folder of all experiments, within which the script has to be.
+    """Read the config.yaml at `path` and check all of it but the sweep, which `read_experiment` checks. The
+    folder of all experiments, `root`, must contain the script.
 
     Raises:
-        ValueError: it is no YAML, or a key is not as it should be.
+        ValueError: it is no YAML, or a key is invalid.
     """
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        said = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
-        raise ValueError(f"{path}: expected YAML, found {said}") from error
+        fault = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
+        raise ValueError(f"{path}: expected YAML, found {fault}") from error
     config = _fields(Config, found, f"{path}", ": ")
     for key in ("claim", "source", "script"):
         expect(getattr(config, key).strip(), f"{path}: {key}", "text", "none")
@@ -91,7 +88,7 @@ def _column(value: Any, where: str) -> Column:
 
 
 def _fields(kind: type, value: Any, where: str, separator: str = ".") -> Any:
-    """The dataclass of a mapping: its keys are known, types are as annotated, and nothing is missing."""
+    """The dataclass of a mapping; raises a ValueError for unknown keys, wrong types and missing values."""
     fields = {f.name: f for f in dataclasses.fields(kind)}
     expect(isinstance(value, dict), where, f"the keys {', '.join(fields)}", value)
     for key in value:
@@ -107,15 +104,15 @@ def _fields(kind: type, value: Any, where: str, separator: str = ".") -> Any:
 
 
 def expect(holds: Any, where: str, expected: str, found: Any) -> None:
-    """Raises a ValueError that says where what was expected and what was found, unless `holds`."""
+    """Raises a ValueError with the place, what was expected and what was found, unless `holds`."""
     if holds:
         return
     found = "nothing" if found is None else found
-    said = found if isinstance(found, str) else json.dumps(found, default=str)
-    raise ValueError(f"{where}: expected {expected}, found {said}")
+    text = found if isinstance(found, str) else json.dumps(found, default=str)
+    raise ValueError(f"{where}: expected {expected}, found {text}")
 
 
 def expect_unlike(names: list[str], where: str) -> None:
-    """Raises a ValueError that names those that are there more than once."""
+    """Raises a ValueError with the names that occur more than once."""
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     expect(not twice, where, "each once", f"{', '.join(twice)} more than once")

@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from gsjax.engine import machine
-from gsjax.engine.experiments.records import now, read_record
+from gsjax.engine.experiments.records import read_record
 from gsjax.engine.experiments.sweep import RESERVED, Cell, Experiment
 from gsjax.engine.messages import describe
 from gsjax.io.atomic import write_json
@@ -25,12 +25,14 @@ def run_here(
     say: Callable[[str], Any],
     debug: bool = False,
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Run cells in order and give each with its record, which is on disk by then.
+    """Run cells in order, and yield each with its record, which is on disk by then.
 
     Args:
+        experiment: the experiment.
+        cells: the cells to run.
         script_run: `run(options, seed, folder)` of the script.
-        say: is told what is under way.
-        debug: let through what a cell raises.
+        say: called with the cell in progress.
+        debug: whether exceptions of cells are passed on.
     """
     for cell in cells:
         say(str(cell))
@@ -40,15 +42,17 @@ def run_here(
 def run_cell(
     experiment: Experiment, cell: Cell, script_run: Callable, cells_folder: Path, debug: bool = False
 ) -> dict[str, Any]:
-    """Run one cell and keep its record, also if it fails; only Ctrl-C leaves none. Returns the record.
+    """Run one cell and write its record, also if it fails; only Ctrl-C leaves none. Returns the record.
 
     Args:
+        experiment: the experiment.
+        cell: the cell.
         script_run: `run(options, seed, folder)` of the script. The folder is the cell's own, and new.
         cells_folder: gets the record, ID.json, and the cell's folder, ID.
-        debug: let through what it raises.
+        debug: whether its exceptions are passed on.
     """
     folder, path = cells_folder / cell.id, cells_folder / f"{cell.id}.json"
-    shutil.rmtree(folder, ignore_errors=True)  # a run that was stopped may have left half of something
+    shutil.rmtree(folder, ignore_errors=True)  # an interrupted run may have left something
     folder.mkdir(parents=True, exist_ok=True)
     made_with = experiment.made_with
     forget_programs()  # of earlier cells
@@ -62,26 +66,17 @@ def run_cell(
         kind = type(failure).__name__
         result, error = None, f"{kind}: {describe(failure)}".removesuffix(f": {kind}")
         trace = traceback.format_exc().splitlines()
-    record = {
-        "options": cell.options,
-        "seed": cell.seed,
-        "result": result,
-        "error": error,
-        "traceback": trace,
-        "seconds": perf_counter() - begun,
-        "finished": now(),
-        "script": experiment.fingerprint,
-        "machine": machine.describe(),  # asked after the script ran, which may configure JAX first
-        "gsjax": made_with,
-    }
-    write_json(path, record)
-    with contextlib.suppress(OSError):  # files of the script's are in it
+    outcome = {"result": result, "traceback": trace, "seconds": perf_counter() - begun}
+    # The machine is described after the script ran, which may configure JAX first.
+    record = experiment.new_record(cell, error, **outcome, machine=machine.describe())
+    write_json(path, record | {"gsjax": made_with})
+    with contextlib.suppress(OSError):  # the script has left files in it
         folder.rmdir()
-    return read_record(path)  # as a later run will see it: arrays are lists, NaN is null
+    return read_record(path)  # as later runs will read it: arrays are lists, NaN is null
 
 
 def _check_result(result: Any, cell: Cell) -> None:
-    """Raises a TypeError unless it is a dict of what JSON can hold, by names that are not taken."""
+    """Raises a TypeError unless the result is a dict that JSON can hold, by names that are not reserved."""
     if not isinstance(result, Mapping):
         raise TypeError(f"run() returned {type(result).__name__}, expected a dict of figures by name")
     for key, value in result.items():

@@ -1,4 +1,4 @@
-"""The script of an experiment: loading it, and the fingerprint that says what made a row."""
+"""The script of an experiment: loading it, and its fingerprint."""
 
 import ast
 import hashlib
@@ -13,21 +13,21 @@ from pathlib import Path
 from gsjax.engine.experiments.config import CONFIG, expect
 
 SHARED = "shared"
-"""The folder below the root that holds what experiments share."""
+"""Folder below the root with modules that experiments share."""
 
 
 def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Callable, Callable | None]:
     """A script's `run`, and its `figure` or None.
 
-    The script is the module of its path, `experiments.NAME.sweep`, as with `python -m` from the folder that
-    holds the root. So it may import what experiments share, `experiments.shared.recordings`, and what stands
-    beside the root, such as `benchmarks`; and also, as with `python sweep.py`, what stands beside itself.
+    The script is the module of its path, `experiments.NAME.sweep`, as with `python -m` from the parent of the
+    root. So it may import shared modules, `experiments.shared.recordings`, and modules beside the root, such
+    as `benchmarks`; and also, as with `python sweep.py`, modules beside itself.
 
     Args:
         root: the folder of all experiments.
-        path: of the script.
-        text: the script's source; what runs is the text that was fingerprinted.
-        described: whether the config describes a figure, so that there has to be one.
+        path: path of the script.
+        text: the script's source; the text that was fingerprinted is the text that runs.
+        described: whether the config describes a figure, which must then exist.
 
     Raises:
         ValueError: it cannot be loaded, or lacks a function.
@@ -39,7 +39,7 @@ def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Cal
     spec = spec_from_file_location(name, path)
     assert spec is not None
     module = module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses, pickle and other scripts look it up there
+    sys.modules[name] = module  # where dataclasses, pickle and other scripts look it up
     try:
         exec(compile(text, str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
@@ -54,10 +54,10 @@ def load_script(root: Path, path: Path, text: str, described: bool) -> tuple[Cal
 
 
 def _make_importable(root: Path) -> None:
-    """Put what stands beside the root on Python's path, and make the root a package by its name.
+    """Put the parent of the root on Python's path, and make the root a package of its name.
 
     Another folder of that name on the path, such as that of a checkout of gsjax, would otherwise be searched
-    as well. A package with an `__init__.py` stays what it is.
+    as well. A package with an `__init__.py` is left alone.
     """
     if str(root.parent) not in sys.path:
         sys.path.insert(0, str(root.parent))
@@ -73,15 +73,14 @@ def _make_importable(root: Path) -> None:
 
 
 def _module_name(root: Path, path: Path) -> str:
-    """The dotted name of a script, of which the root is the first part."""
+    """The dotted name of a script, which begins with the root's name."""
     root, path = root.resolve(), path.resolve().with_suffix("")
     return ".".join(part.replace(".", "_") for part in (root.name, *path.relative_to(root).parts))
 
 
 def forget_scripts(root: Path) -> None:
-    """Remove the scripts of experiments at `root`, and the modules beside them, from this process, so that
-    they are loaded afresh when they are imported next. Other modules below `root`, as shared ones or those of
-    an environment, stay."""
+    """Unload the scripts of experiments at `root`, and the modules beside them, so that the next import loads
+    them again. Other modules below `root`, such as shared ones or those of an environment, stay."""
     folders = {config.parent.resolve() for config in root.resolve().glob(f"*/{CONFIG}")}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
@@ -93,15 +92,15 @@ def forget_scripts(root: Path) -> None:
 
 
 def fingerprint_of(root: Path, path: Path, text: str, version: int) -> str:
-    """Changes with a script, with what stands beside it and with the config's version.
+    """A fingerprint of a script, the modules beside it and the config's version.
 
-    Not with what changes no row: the script's function `figure`, and lines that only import from gsjax or
-    from the experiments, without `as`, which change where a module moved. Rows say themselves which gsjax
-    and which shared modules made them.
+    It ignores what changes no row: the script's function `figure`, and lines that only import from gsjax or
+    from the experiments, without `as`, which change when a module moves. Rows record the versions of gsjax
+    and of shared modules themselves.
 
     Args:
         root: the folder of all experiments.
-        path: of the script.
+        path: path of the script.
         text: the script's source.
         version: the config's.
     """
@@ -120,8 +119,8 @@ def _is_figure(node: ast.AST) -> bool:
 
 
 def _only_imports(node: ast.AST, packages: tuple[str, ...]) -> bool:
-    """Whether it is an import of nothing but these packages and their modules, under names that are their
-    own: under another name, one thing may stand for another without a change of what uses it."""
+    """Whether a statement only imports from these packages, under the original names: with `as`, one thing
+    may replace another without a change where it is used."""
     if isinstance(node, ast.Import | ast.ImportFrom) and any(alias.asname for alias in node.names):
         return False
     if isinstance(node, ast.ImportFrom):
@@ -132,12 +131,12 @@ def _only_imports(node: ast.AST, packages: tuple[str, ...]) -> bool:
 
 
 def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
-    """A module's text but for the lines of the statements that are left out, if they stand there alone."""
+    """A module's text without the lines of some statements, if these stand alone on their lines."""
     try:
         nodes = [node for node in ast.walk(ast.parse(text)) if left_out(node)]
     except SyntaxError:
-        return text  # loading it says so
-    lines = text.removesuffix("\n").split("\n")  # as Python counts them: others also split at form feeds
+        return text  # loading it reports the error
+    lines = text.removesuffix("\n").split("\n")  # as Python counts them; splitlines also splits at form feeds
     gone = set()
     for node in nodes:
         before = lines[node.lineno - 1].encode()[: node.col_offset]  # columns are counted in bytes
@@ -148,15 +147,15 @@ def _without(text: str, left_out: Callable[[ast.AST], bool]) -> str:
 
 
 def made_with_of(root: Path) -> str:
-    """Version of gsjax, and a hash of its sources and of what experiments share: rows of one table may have
-    been made with several, which is noted below it."""
+    """Version of gsjax, and a hash of its sources and of shared modules. Rows of one table may come from
+    several, which a remark then says."""
     return f"{import_module('gsjax').__version__}+{_hash_of(root.resolve())}"
 
 
 @cache
 def _hash_of(root: Path) -> str:
-    """Hash of gsjax's files, of those at the root of the experiments and of its folder of shared ones, as
-    they are at the first call."""
+    """Hash of gsjax's files, of those at the root of the experiments and of the shared ones, at the first
+    call."""
     package = Path(import_module("gsjax").__file__).parent
     paths = sorted(package.rglob("*.py")) + sorted(root.glob("*.py")) + sorted((root / SHARED).rglob("*.py"))
     return hashlib.sha256(b"\n".join(path.read_bytes() for path in paths)).hexdigest()[:8]

@@ -1,4 +1,4 @@
-"""One experiment: the cells of its sweep, and what is known of each."""
+"""One experiment: the cells of its sweep, and the record of each."""
 
 import hashlib
 import itertools
@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,9 @@ from gsjax.engine.experiments.records import RESULTS, committed_rows, read_recor
 from gsjax.engine.experiments.script import fingerprint_of, load_script, made_with_of
 
 RESERVED = ("seed", "seconds")
-"""What a row holds beside options and figures, so neither may have these names."""
-# YAML 1.1 takes these for text, which nobody means who sweeps a rate.
-_LOOKS_LIKE_A_NUMBER = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
+"""Names that a row uses besides options and figures, so neither may have them."""
+# YAML 1.1 reads these as text, which is not meant in a sweep.
+_NUMBER_AS_TEXT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,13 @@ class Cell:
 
     @property
     def id(self) -> str:
-        """Names the cell's file: the same for the same options in any order, and on any machine."""
+        """Name of the cell's file: the same for the same options in any order, and on any machine."""
         text = json.dumps([self.options, self.seed], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def words(self) -> dict[str, str]:
-        """Options and seed as tables show them."""
+        """Options and seed, as text for tables."""
         return {key: in_words(value) for key, value in {**self.options, "seed": self.seed}.items()}
 
     def __str__(self) -> str:
@@ -66,22 +67,22 @@ class Experiment:
 
     @property
     def folder(self) -> Path:
-        """Where its config is, and its collected results."""
+        """Folder of its config and its collected results."""
         return self.root / self.name
 
     @property
     def script(self) -> Path:
-        """What a cell runs."""
+        """Path of its script."""
         return self.folder / self.config.script
 
     @cached_property
     def fingerprint(self) -> str:
-        """Of its script: what was made under another one is stale."""
+        """Fingerprint of its script: records with another one are stale."""
         return fingerprint_of(self.root, self.script, self.text, self.config.version)
 
     @property
     def made_with(self) -> str:
-        """Which gsjax this is, and what the experiments share."""
+        """Version of gsjax, and of what the experiments share."""
         return made_with_of(self.root)
 
     def load(self) -> tuple[Callable, Callable | None]:
@@ -97,14 +98,27 @@ class Experiment:
         path = self.path(cell)
         return read_record(path) if path.is_file() else None
 
+    def new_record(self, cell: Cell, error: str | None, **outcome: Any) -> dict[str, Any]:
+        """The record of a cell that has just ended.
+
+        Args:
+            cell: the cell.
+            error: why it failed, or None.
+            outcome: `result`, `traceback`, `seconds` and `machine`, as far as they are known.
+        """
+        unknown = {"result": None, "traceback": [], "seconds": None, "machine": None}
+        finished = datetime.now(UTC).isoformat(timespec="seconds")
+        made = {"finished": finished, "script": self.fingerprint, "gsjax": self.made_with}
+        return {"options": cell.options, "seed": cell.seed, "error": error, **unknown, **outcome, **made}
+
     def is_done(self, record: dict[str, Any] | None) -> bool:
-        """Whether nothing is left to do: it ran, by the present script, and did not fail."""
+        """Whether a record is of a cell that ran with the present script and did not fail."""
         return record is not None and record["error"] is None and record["script"] == self.fingerprint
 
     def records(self) -> list[dict[str, Any]]:
-        """All that is known of the cells, in order: this machine's records, else those committed.
+        """All records of the cells, in order: this machine's, else those committed.
 
-        One that is stale or failed gives way to a committed one that is not: others may have measured since.
+        A stale or failed one is replaced by a committed one that is neither: others may have run it since.
         """
         committed, known = self.committed(), []
         for cell in self.cells:
@@ -119,7 +133,7 @@ class Experiment:
 
 
 def in_words(value: Any) -> str:
-    """An option's value as tables show it and `--only` takes it."""
+    """An option's value, as tables show it and `--only` takes it."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -135,13 +149,13 @@ def read_experiment(root: Path, name: str, out: Path) -> Experiment:
     Args:
         root: folder of the experiments.
         name: its folder below that.
-        out: folder for what cells give.
+        out: folder for the records of cells.
 
     Raises:
-        ValueError: there is none, or a key of its config is not as it should be.
+        ValueError: there is none, or its config is invalid.
     """
     names = experiment_names(root)
-    # A shell completes the path of the folder, with a slash at its end.
+    # Shells complete the path of the folder, with a slash at its end.
     name = next((n for n in names if Path(name) in (Path(n), root / n)), name)
     below = [n for n in names if n.startswith(name.rstrip("/") + "/")]
     known = ", ".join(below or names) or f"none; make one as {root}/NAME/{CONFIG}"
@@ -176,11 +190,11 @@ def _cells(config: Config, path: Path) -> tuple[Cell, ...]:
 
 
 def _expect_option(name: Any, values: list, where: str) -> None:
-    """Options have names, and values that JSON can hold, so that a cell can be found again."""
+    """Check an option's name, and that JSON can hold its values, so that a cell can be found again."""
     expect(isinstance(name, str) and name not in RESERVED, where, "an option's name", name)
     for value in itertools.chain.from_iterable(v if isinstance(v, list) else [v] for v in values):
         plain = value is None or isinstance(value, (str, int, float))
         expect(plain, where, "numbers, text, true, false, null, or lists of those", value)
         expect(not isinstance(value, float) or math.isfinite(value), where, "finite numbers", value)
-        text = isinstance(value, str) and _LOOKS_LIKE_A_NUMBER.fullmatch(value)
+        text = isinstance(value, str) and _NUMBER_AS_TEXT.fullmatch(value)
         expect(not text, where, "a number as YAML has it, with a point and a sign (1.0e-3)", value)

@@ -1,4 +1,4 @@
-"""The table of an experiment, and what a reader must know beside it."""
+"""The table of an experiment, and the remarks below it."""
 
 from itertools import chain
 from statistics import fmean, stdev
@@ -21,7 +21,7 @@ class Shown(NamedTuple):
 
 
 def tabulate(experiment: Experiment, rows: list[dict[str, Any]]) -> Shown:
-    """A line for each combination of options, in the order of the sweep."""
+    """A line per combination of options, in the order of the sweep."""
     swept = list(dict.fromkeys(chain(*(cell.options for cell in experiment.cells))))
     columns = [*map(Column, swept), *_columns(experiment, rows)]
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
@@ -38,19 +38,19 @@ def tabulate(experiment: Experiment, rows: list[dict[str, Any]]) -> Shown:
 
 
 def _columns(experiment: Experiment, rows: list[dict[str, Any]]) -> tuple[Column, ...]:
-    """Those of the config, else one for each figure that is not a list."""
+    """The columns of the config, else one per figure that is not a list."""
     known = {key for cell in experiment.cells for key in cell.words} | {"seconds"}
     plain = (key for row in rows for key, value in row.items() if not isinstance(value, (list, dict)))
     return experiment.columns or tuple(Column(key) for key in dict.fromkeys(plain) if key not in known)
 
 
 def figures(column: Column, values: list[Any], num_seeds: int) -> str:
-    """One cell of the table: a figure, or mean ± standard deviation of those there are over the seeds.
+    """One cell of the table: a figure, or mean ± standard deviation over the seeds.
 
     Args:
-        column: says how figures are written.
-        values: those of the cells that a line is of.
-        num_seeds: how many there should be.
+        column: with the format of figures.
+        values: the figures of the seeds that have been run.
+        num_seeds: number of seeds in the sweep.
     """
     numbers = [value for value in values if isinstance(value, (int, float))]
     if not numbers:
@@ -61,12 +61,12 @@ def figures(column: Column, values: list[Any], num_seeds: int) -> str:
 
 
 def remarks(experiment: Experiment, records: list[dict[str, Any]], done: list[dict[str, Any]]) -> list[str]:
-    """What a reader must know beside the table, one sentence each.
+    """Remarks on the table, one sentence each.
 
     Args:
-        experiment: as its config has it.
-        records: of all cells that were run.
-        done: those of them that the table shows.
+        experiment: the experiment.
+        records: the records of all cells that were run.
+        done: the records in the table.
     """
     config, num_cells, notes = experiment.config, len(experiment.cells), []
     if len(config.seeds) > 1:

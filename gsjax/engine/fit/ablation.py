@@ -1,4 +1,4 @@
-"""What each part of a fitted scene is worth: how well it is seen with fewer Gaussians, colours or minutes."""
+"""Ablation of a fitted scene: its scores with fewer Gaussians, lower SH degrees, or fewer minutes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsjax.engine.fit.judge import Judge
-from gsjax.engine.fit.schedule import looks
+from gsjax.engine.fit.schedule import evaluated
 from gsjax.optim.densification import EMPTY_LOGIT
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
@@ -25,15 +25,16 @@ def ablate(
     rows: Sequence[Mapping[str, Any]],
     judge: Judge,
 ) -> list[dict[str, Any]]:
-    """What is left (`part`) of the scene, of how many `gaussians` and which `sh_degree` (None: was not
-    written down), and the mean `psnr` of the views then. Nothing is fitted again: a fit for less does better.
+    """Rows of the `part` of the scene that is kept, its number of `gaussians`, its `sh_degree` (None if it
+    was not logged), and the mean `psnr` of the views. Nothing is fitted again: a fit of that size does
+    better.
 
     Args:
         gaussians: the scene.
-        light: of `light_of`; who sends least is left out first.
-        frames: held-out ones, those that the curve was judged by.
-        rows: how the fit went on.
-        judge: of views.
+        light: from `light_of`; Gaussians with the least light are removed first.
+        frames: the held-out views of the curve.
+        rows: the curve of the fit.
+        judge: scores views.
     """
 
     def row(part: str, scene: Gaussians, count: int, degree: int) -> dict[str, Any]:
@@ -52,10 +53,10 @@ def ablate(
 
 
 def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The same after a part of the time: at the last look before it, where there was one."""
+    """The same after a fraction of the time: at the last evaluation before it, if there was one."""
     found = []
     for name, share in _MINUTES.items():
-        before = [r for r in looks(rows) if r["seconds"] <= share * rows[-1]["seconds"]]
+        before = [r for r in evaluated(rows) if r["seconds"] <= share * rows[-1]["seconds"]]
         if before:
             alive, psnr = before[-1]["alive"], before[-1]["test_psnr"]
             found.append({"part": name, "gaussians": alive, "sh_degree": None, "psnr": psnr})
@@ -63,12 +64,12 @@ def ablate_time(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _emptied(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    """Without some: their slots stay, so that one program draws all parts."""
+    """The scene without some rows; their slots stay, so that one program draws all parts."""
     logits = jnp.asarray(gaussians.logit_opacities).at[rows].set(EMPTY_LOGIT)
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 def _plainer(gaussians: Gaussians, degree: int) -> Gaussians:
-    """With no colours of a higher degree of the spherical harmonics."""
+    """The scene with spherical harmonics of a lower degree."""
     shN = jnp.asarray(gaussians.shN).at[:, (degree + 1) ** 2 - 1 :].set(0)
     return eqx.tree_at(lambda g: g.shN, gaussians, shN)

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import perf_counter
 from typing import Literal
 
@@ -16,14 +17,14 @@ from gsjax.engine.fit.ablation import ablate
 from gsjax.engine.fit.judge import Judge, Scores
 from gsjax.engine.fit.orbit import write_orbit
 from gsjax.engine.fit.results import summarize
-from gsjax.engine.fit.schedule import Budget, Looks, looks, schedule_of
+from gsjax.engine.fit.schedule import Budget, Evaluation, evaluated, schedule_of
 from gsjax.engine.fit.start import start_from
 from gsjax.engine.fit.tensorboard import TensorBoard
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.machine import describe as describe_machine
 from gsjax.engine.messages import Notes, reason, stage
 from gsjax.engine.options import RESUME_MAY_CHANGE, OfDataset, checked, expect_positive
-from gsjax.engine.photographs import choose_photographs, read_frames, say_if_large, split
+from gsjax.engine.photographs import choose_photographs, read_frames, split, warn_if_large
 from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
@@ -34,34 +35,34 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 
 JUDGED_AT_MOST = 4
-"""Held-out views that are looked at while the fit goes on."""
-_MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")  # on what is fitted
+"""Most held-out views that are evaluated during the fit."""
+_MAY_CHANGE = (*RESUME_MAY_CHANGE, "tensorboard", "save_every")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(OfDataset):
-    """What `gsjax fit` is told."""
+    """Options of `gsjax fit`."""
 
     preset: Literal["default", "quick", "classic", "depth", "published"] = "default"
-    """How the scene is fitted unless given: quick (a first look), classic (cloning and splitting, as in
+    """Default settings of the fit: quick (for a first impression), classic (cloning and splitting, as in
     3DGS), depth (for RGB-D), published (those of 3DGS-MCMC, for a GPU or a night)."""
     until_psnr: float | None = None
-    """Stop when held-out photographs are seen with so many dB."""
+    """Stop when held-out photographs reach this PSNR, dB."""
     judge_every: int = 500
-    """Steps between looks at held-out photographs; under --minutes there are ten besides."""
+    """Steps between evaluations of held-out photographs; with --minutes there are ten more."""
     save_every: float = 30.0
     """Seconds of fitting that a run may lose when it is killed."""
     tensorboard: bool = False
     """Write the curve for TensorBoard too, into RUN/tensorboard."""
     fit: FitConfig = field(default_factory=FitConfig)
-    """How the scene is fitted."""
+    """Settings of the fit."""
 
 
 def run(options: Options) -> int:
     """Fit a scene and report on it; returns the exit code.
 
     Raises:
-        ValueError, OSError: what was asked cannot be done; everything fitted before that is on disk.
+        ValueError, OSError: an option cannot be met; everything fitted before that is on disk.
     """
     options = checked(options)
     expect_positive(options, "until_psnr", "judge_every", "save_every")
@@ -82,7 +83,7 @@ def run(options: Options) -> int:
         settings = replace(options, dataset=located(options.dataset))
         if options.resume:
             folder.check_config(settings, but=_MAY_CHANGE)
-        say_if_large(photographs)
+        warn_if_large(photographs)
         frames = read_frames(photographs, console)
         fitted = [frames[i] for i in chosen]
         config, cloud = start_from(photographs, fitted, options.fit, console)
@@ -99,28 +100,32 @@ def run(options: Options) -> int:
         ticks = _fitted(options, method, problem, run, progress, judged, judge, folder, console, board)
         stopped, run = progress.stopped, ticks.run
         if isinstance(stopped, KeyboardInterrupt):
-            console.print("stopping: what there is is written; Ctrl-C again leaves out the scores")
+            console.print("stopping: the scene is scored and written; Ctrl-C again leaves out the scores")
         seconds = {"fit": progress.seconds, "compile": progress.compile_seconds}
-        gaussians, finished, worth = ticks.result, stopped is None, []
+        gaussians, finished, ablation = ticks.result, stopped is None, []
         _note_oddities(options, progress, gaussians, finished, notes)
         found_frames = as_found(problem, run.params)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
-        aside = Aside(seconds, console, notes)
+        optional = partial(_optional, seconds, console, notes)
         light, scores = None, Scores([])
-        if finished:  # who pressed Ctrl-C does not wait for this
-            with aside("pruning", "leaving out what no photograph needs"):
+        if finished:  # after Ctrl-C, nobody waits for this
+            with optional("pruning", "removing Gaussians that no photograph needs"):
                 before = gaussians.num
                 gaussians, light = without_needless(gaussians, found_frames, config)
-                _note_pruning(before, gaussians.num, config, notes)
+                if gaussians.num < before:
+                    notes.add(
+                        f"{before - gaussians.num:,} of {before:,} Gaussians were removed at the end: "
+                        f"together they sent at most {config.prune:.2%} of the light into any photograph."
+                    )
         write_ply(folder.scene, gaussians)
-        with aside("scores", "scoring held-out photographs"):
+        with optional("scores", "scoring held-out photographs"):
             shown = judged or [(photographs.names[i], frames[i]) for i in chosen[:1]]
             scores = judge(gaussians, shown, folder)
         if finished and judged and light is not None and gaussians.num:
-            with aside("parts", "looking at what each part of the scene is worth"):
-                worth = ablate(gaussians, light, some_of(judged), progress.rows, judge)
+            with optional("parts", "ablating parts of the scene"):
+                ablation = ablate(gaussians, light, some_of(judged), progress.rows, judge)
         if finished:
-            with aside("video", "drawing a video of the scene"):
+            with optional("video", "drawing a video of the scene"):
                 write_orbit(folder, found_frames, problem.extent.focus, gaussians, judge)
         found = {
             "kind": "fit",
@@ -141,7 +146,7 @@ def run(options: Options) -> int:
             "machine": describe_machine(),
             "test": scores.mean() if judged and scores.rows else None,
             "views": scores.rows,
-            "parts": worth,
+            "parts": ablation,
             "curve": progress.rows,
             "notes": notes.all,
         }
@@ -152,7 +157,7 @@ def run(options: Options) -> int:
 
 
 def some_of(judged: Sequence[tuple[str, Frame]]) -> Sequence[tuple[str, Frame]]:
-    """The held-out views that are looked at while the fit goes on; all of them are at its end."""
+    """The held-out views that are evaluated during the fit; at its end, all of them are."""
     return judged[:: max(1, len(judged) // JUDGED_AT_MOST)][:JUDGED_AT_MOST]
 
 
@@ -168,19 +173,18 @@ def _fitted(
     console: Console,
     board: TensorBoard | None,
 ) -> Drive:
-    """The fit after the steps, the minutes or the wanted PSNR are reached, or what stopped it."""
+    """The fit until its steps, its minutes or the wanted PSNR are reached, or it is stopped."""
     budget, goal = Budget(method.config.steps, options.minutes, progress), options.until_psnr
     schedule = schedule_of(method.config, progress)
 
     def is_met(run: Run) -> bool:
-        """Whether what is wanted is reached: by some views, and then by all of them."""
-        if goal is None or not any(row["test_psnr"] >= goal for row in looks(progress.rows)[-1:]):
+        """Whether the wanted PSNR is reached: by some views, and then by all of them."""
+        if goal is None or not any(row["test_psnr"] >= goal for row in evaluated(progress.rows)[-1:]):
             return False
         found = judge(run.params.gaussians, judged).mean()["psnr"]
         return found is not None and found >= goal
 
-    met = is_met(run)
-    ticks = drive(method, problem, run, progress=(lambda step: 1.0) if met else budget)
+    ticks = drive(method, problem, run, progress=(lambda step: 1.0) if is_met(run) else budget)
     watch(
         ticks,
         progress,
@@ -189,41 +193,36 @@ def _fitted(
         console,
         minutes=options.minutes,
         save_every=options.save_every,
-        look=Looks(judge, some_of(judged), options.judge_every, budget).begin(run.step),
+        evaluate=Evaluation(judge, some_of(judged), options.judge_every, budget).begin(run.step),
         enough=lambda now, row: row["test_psnr"] is not None and is_met(now.run),
         listeners=() if board is None else (board.add,),
     )
     return ticks
 
 
-class Aside:
-    """What is done with a fit after its last step, and what it can do without: Ctrl-C and errors end it, and
-    the run still has its report."""
-
-    def __init__(self, seconds: dict[str, float], console: Console, notes: Notes):
-        self._seconds, self._console, self._notes = seconds, console, notes
-
-    @contextmanager
-    def __call__(self, name: str, words: str) -> Iterator[None]:
-        """Say what goes on, and how long it took."""
-        begun = perf_counter()
-        try:
-            with stage(self._console, words):
-                yield
-        except (KeyboardInterrupt, OSError, ValueError) as error:
-            self._notes.warn(f"{words} was left out: {reason(error)}")
-        self._seconds[name] = perf_counter() - begun
+@contextmanager
+def _optional(
+    seconds: dict[str, float], console: Console, notes: Notes, name: str, words: str
+) -> Iterator[None]:
+    """A timed stage after the last step. Ctrl-C and errors end it, and the run still gets its report."""
+    begun = perf_counter()
+    try:
+        with stage(console, words):
+            yield
+    except (KeyboardInterrupt, OSError, ValueError) as error:
+        notes.warn(f"{words} was left out: {reason(error)}")
+    seconds[name] = perf_counter() - begun
 
 
 def _note_oddities(
     options: Options, progress: Progress, gaussians: Gaussians, finished: bool, notes: Notes
 ) -> None:
     if progress.skipped:
-        notes.add(f"{progress.skipped} steps met numbers that are not finite and changed nothing.")
+        notes.add(f"{progress.skipped} steps were not finite and changed nothing.")
     compiling, given = progress.compile_seconds, 60 * (options.minutes or np.inf)
     if compiling > given / 3:
         kept = jax.config.jax_enable_compilation_cache and jax.config.jax_compilation_cache_dir
-        later = "; programs are kept, and the next fit at this size finds most of them" if kept else ""
+        later = "; programs are kept, and the next fit of this size finds most of them" if kept else ""
         notes.warn(f"compiling took {compiling:.0f} s, of {given:.0f} given{later}")
     if finished and gaussians.sh_degree < options.fit.sh_degree:
         notes.add(
@@ -233,8 +232,8 @@ def _note_oddities(
 
 
 def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], model: Model) -> None:
-    """Writes cameras.npz, where cameras or exposures were learned: names [V], viewmats [V,4,4] (world to
-    camera, OpenCV axes; those of the frames), exposures [V,3,4] (the affine maps of colours)."""
+    """Write cameras.npz, if cameras or exposures were learned: names [V], viewmats [V,4,4] (world to camera,
+    OpenCV axes; those of the frames), exposures [V,3,4] (the affine maps of colours)."""
     if model.twists is None and model.exposures is None:
         return
     found = {
@@ -245,9 +244,3 @@ def write_cameras(folder: RunFolder, names: list[str], frames: list[Frame], mode
         exposures = np.asarray(model.exposures)
         found["exposures"] = np.eye(3, 4) + exposures - exposures.mean(0)
     write_npz(folder.path / "cameras.npz", found)
-
-
-def _note_pruning(before: int, after: int, config: FitConfig, notes: Notes) -> None:
-    if after < before:
-        some = f"{before - after:,} of {before:,} Gaussians were left out in the end"
-        notes.add(f"{some}: together they sent at most {config.prune:.2%} of the light into any photograph.")

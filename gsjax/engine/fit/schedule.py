@@ -1,4 +1,4 @@
-"""How far a fit is, what its rows hold, and when held-out photographs are looked at."""
+"""The progress of a fit, its logged rows, and when held-out photographs are evaluated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,17 +13,17 @@ from gsjax.methods.fit import FitConfig
 from gsjax.methods.fit.method import shrink_at
 
 _LOGGED_EVERY = 100  # steps
-_LOOKS = 10  # under --minutes, beside those that were asked for
+_EXTRA = 10  # evaluations under --minutes, besides those of --judge-every
 
 
 @dataclass(frozen=True)
 class Budget:
-    """step -> the share of a fit that is done before it: of its steps, or of its minutes, whichever is more.
+    """step -> the fraction of a fit done before it: of its steps, or of its minutes, whichever is larger.
 
     Attributes:
-        steps: that were asked for.
-        minutes: of steps, compiling included; None for no limit.
-        progress: how much time was used.
+        steps: number of steps.
+        minutes: time of steps, compiling included; None for no limit.
+        progress: the time used.
     """
 
     steps: int
@@ -36,8 +36,8 @@ class Budget:
 
 
 def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
-    """Rows of a fit: loss and psnr (of the photograph of that step), the number of Gaussians (alive), by how
-    many times smaller the photograph was (shrink), and test_psnr of held-out photographs, or None."""
+    """Rows of a fit: loss and psnr (of the photograph of that step), the number of Gaussians (alive), the
+    factor by which the photograph was downscaled (shrink), and test_psnr of held-out photographs, or None."""
 
     def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
         last = infos[-1] if infos else {}
@@ -46,7 +46,7 @@ def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
         return shown | {"alive": alive, "shrink": shrink_at(config, now.progress), "test_psnr": None}
 
     def words(row: Mapping[str, Any]) -> str:
-        tested = looks(progress.rows)
+        tested = evaluated(progress.rows)
         test = f", {tested[-1]['test_psnr']:.1f} dB" if tested else ""
         pace = f", {progress.pace:.0f}/s" if progress.pace else ""
         loss = "–" if row["loss"] is None else f"{row['loss']:.2f}"
@@ -56,24 +56,24 @@ def schedule_of(config: FitConfig, progress: Progress) -> Schedule:
 
 
 def _finite(value: Any) -> float | None:
-    """JSON has no infinity: a picture that is hit to the bit has no PSNR."""
+    """A finite number or None: JSON has no infinity, the PSNR of a perfect picture."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
-def looks(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows of steps after which held-out photographs were looked at."""
+def evaluated(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows of steps after which held-out photographs were evaluated."""
     return [row for row in rows if row["test_psnr"] is not None]
 
 
 @dataclass
-class Looks:
-    """When held-out photographs are looked at while a fit goes on, and what is seen.
+class Evaluation:
+    """Evaluates held-out photographs during a fit.
 
     Attributes:
-        judge: of photographs.
-        some: held-out ones that are looked at on the way.
-        every: steps between looks.
-        budget: of the fit; under minutes there are ten looks besides.
+        judge: scores photographs.
+        some: the held-out photographs to evaluate meanwhile.
+        every: steps between evaluations.
+        budget: of the fit; with minutes there are ten evaluations besides.
     """
 
     judge: Judge
@@ -82,17 +82,17 @@ class Looks:
     budget: Budget
     _tenths: int = field(default=0, init=False)
 
-    def begin(self, step: int) -> "Looks":
-        """Tenths of the time that were over before this step get no look."""
-        self._tenths = int(_LOOKS * self.budget(step))
+    def begin(self, step: int) -> "Evaluation":
+        """Skip the tenths of the time before this step."""
+        self._tenths = int(_EXTRA * self.budget(step))
         return self
 
     def __call__(self, now: Tick) -> dict[str, Any] | None:
-        """What the row of a step has of it; None where this is none of those."""
+        """The scores for the row of a step; None if there is no evaluation after it."""
         share = self.budget(now.step)
         due = now.step % self.every == 0 or share >= 1
-        if self.budget.minutes is not None and int(_LOOKS * share) > self._tenths:
-            due, self._tenths = True, int(_LOOKS * share)
+        if self.budget.minutes is not None and int(_EXTRA * share) > self._tenths:
+            due, self._tenths = True, int(_EXTRA * share)
         if not due:
             return None
         return {"test_psnr": self.judge(now.run.params.gaussians, self.some).mean()["psnr"]}

@@ -1,5 +1,5 @@
-"""Where the first Gaussians of a fit come from: the data, or, where it has neither points nor depth, what its
-photographs are found to share."""
+"""The points from which a fit starts: those of the data, or, if it has neither points nor depth, matches
+between its photographs."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -13,24 +13,24 @@ from gsjax.methods.fit import FitConfig
 from gsjax.perception.matching import filled_up, match_points
 from gsjax.scene.frame import Frame
 
-_MOST_MATCHED = 150  # photographs; of more, as many that are spread over them
+_MOST_MATCHED = 150  # photographs; of more, this many evenly spread ones
 LEAST_MATCHED = 100
-"""Points that photographs share, below which they tell too little of where things are."""
+"""Least number of matched points for a start from matches."""
 
 
 def start_from(
     photographs: Photographs, frames: list[Frame], config: FitConfig, console: Console | None = None
 ) -> tuple[FitConfig, tuple[np.ndarray, np.ndarray] | None]:
-    """How to fit, and the points to begin with and their colours; None where these come from elsewhere.
+    """The settings of the fit, and the initial points and their colours; None if they come from elsewhere.
 
     Args:
-        photographs: may have points.
-        frames: those that are fitted.
-        config: says which source is asked for.
-        console: where it is shown that matching takes a while; nowhere by default.
+        photographs: perhaps with points.
+        frames: the photographs to fit.
+        config: names the source of the start.
+        console: announces the matching (default: nothing).
 
     Raises:
-        ValueError: matches are asked for, and photographs share next to nothing.
+        ValueError: matches are required, and the photographs share too few points.
     """
     source, cloud = config.start.source, photographs.cloud
     has_points = cloud is not None and len(cloud.points) > 0
@@ -43,7 +43,7 @@ def start_from(
     masks = [None if frame.masks is None else frame.masks[0] for frame in frames]
     viewmats = np.concatenate([frame.cameras.viewmat for frame in frames])
     Ks = np.concatenate([frame.cameras.K for frame in frames])
-    with nullcontext() if console is None else stage(console, "looking for what photographs share"):
+    with nullcontext() if console is None else stage(console, "matching photographs"):
         matched = match_points(pictures, viewmats, Ks, masks)
     if len(matched.points) < LEAST_MATCHED:
         if source == "matches":

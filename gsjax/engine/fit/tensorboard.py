@@ -11,20 +11,19 @@ import cv2
 from gsjax import extras
 
 TAGS = {"loss": "loss", "psnr": "psnr", "test_psnr": "psnr_held_out", "alive": "gaussians"}
-"""What the values of a curve's row are called there."""
+"""Tags of the values of a row."""
 _FLUSHED_EVERY_S = 1
 
 
 class TensorBoard:
     """Writes event files into RUN/tensorboard, a row of a fit's curve at a time.
 
-    Each row is on disk a second after `add`. Where a run was killed, there may be rows of after the
-    checkpoint from which it is resumed: they are marked as void, as TensorBoard understands it, so none is
-    shown twice.
+    Each row is on disk a second after `add`. If a run was killed, there may be rows from after the checkpoint
+    from which it is resumed: they are purged, so that none is shown twice.
 
     Args:
-        folder: that of the run.
-        rows: those that a resumed run begins with; none begins anew, without what an earlier run left.
+        folder: of the run.
+        rows: the rows of a resumed run; without any, the files of an earlier run are removed.
 
     Raises:
         MissingExtra: tensorboardX is not installed.
@@ -37,26 +36,25 @@ class TensorBoard:
         if path.exists() and not going_on:
             shutil.rmtree(path)
         begun = rows[-1]["step"] + 1 if going_on else None
-        # Files are named by the second, and read in the order of their names.
+        # Files are named by their time in seconds, and read in the order of their names.
         self._writer = writer(
             str(path), purge_step=begun, filename_suffix=f".{begun or 0:08d}", flush_secs=_FLUSHED_EVERY_S
         )
         self._step = 0
         for row in rows:
             self._step = row["step"]
-            if not going_on:  # the run began without event files
+            if not going_on:  # so far the run had no event files
                 self.add(row)
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Writes what a row has: its loss, PSNR, PSNR of held-out views, number of Gaussians."""
+        """Write a row: its loss, PSNR, PSNR of held-out views, and number of Gaussians."""
         self._step = row["step"]
         for key, tag in TAGS.items():
             if row[key] is not None and math.isfinite(row[key]):
                 self._writer.add_scalar(tag, row[key], self._step)
 
     def close(self, pictures: Mapping[str, Path] | None = None) -> None:
-        """Ends the file, after pictures by their names, which stand at the last step; a missing one is left
-        out."""
+        """Close the file, after adding named pictures at the last step; a missing picture is left out."""
         for name, path in (pictures or {}).items():
             picture = cv2.imread(str(path))
             if picture is not None:

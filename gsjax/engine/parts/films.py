@@ -1,10 +1,12 @@
-"""The film that edits make of a run of `gsjax parts`, and its folder."""
+"""Films of an edited run of `gsjax parts`, and their folders."""
 
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -34,22 +36,22 @@ from gsjax.scene.handles import Blend
 from gsjax.scene.render import render_with_room
 
 SCRIPT = "edit.yaml"
-"""What tells the folder of a film from others."""
+"""The edits, whose file marks the folder of a film."""
 VIDEO = "video.mp4"
-"""The film itself, in its folder."""
+"""The video, in the folder of a film."""
 _METRICS, _PLY = "metrics.json", "ply"
-_THUMBNAIL, _LOOKS = 160, 5  # pixels and moments by which cameras are compared ...
-_CHANGED = 0.05  # ... of colours from 0 to 1: what differs less has not changed
-_NAME = re.compile(r"\w[\w .-]*")  # of a folder that lies where it should
+_THUMBNAIL, _COMPARED = 160, 5  # pixels, and number of moments, for comparing cameras
+_CHANGED = 0.05  # smallest difference of colours, 0 to 1, that counts as a change
+_NAME = re.compile(r"\w[\w .-]*")  # a folder name that stays within its parent
 
 
 class Shot(NamedTuple):
     """A frame of a film.
 
     Attributes:
-        image: as the camera sees it.
-        gaussians: what is there.
-        seconds: that both took; None where something was compiled.
+        image: the rendered frame.
+        gaussians: the Gaussians in it.
+        seconds: time of both; None if something was compiled.
     """
 
     image: Float[np.ndarray, "height width 3"]
@@ -58,16 +60,16 @@ class Shot(NamedTuple):
 
 
 Watch = Callable[[Iterable[Shot], int], Iterable[Shot]]
-"""(frames of a film, their number) -> the same frames; a KeyboardInterrupt from it ends the film."""
+"""(frames of a film, their number) -> the same frames; a KeyboardInterrupt ends the film."""
 
 
 def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
-    """The film that a script makes of a run, and what makes it doubtful, a sentence each.
+    """The film of an edited run, and warnings about it, a sentence each.
 
     Raises:
-        ValueError, OSError: there is no such part or other run, or the edits cannot be done.
+        ValueError, OSError: there is no such part or other run, or the edits cannot be applied.
     """
-    known = cache(read_parts)  # other runs are read once
+    known = cache(read_parts)  # each other run is read once
     film = apply(script, saved.layer, saved.names, known)
     recorded, now = saved.layer, film[0].trajectory
     doubts = []
@@ -75,18 +77,18 @@ def edited(script: Script, saved: PartsRun) -> tuple[Film, list[str]]:
         frames = len(recorded.trajectory.times)
         doubts.append(f"{saved.path} is a partial run: only {frames} of its frames are there")
     beyond = describe_beyond(_beyond(recorded, now), now.times, saved.names)
-    if beyond:  # as one, for those of two parts differ in numbers only, and one would not be shown
+    if beyond:  # as one: two that differ only in numbers would count as one kind
         doubts.append(". ".join(beyond))
     if idle := _idle(script, film, saved, known):
-        doubts.append(f"nothing is to be seen of {', '.join(idle)}")
+        doubts.append(f"no visible effect: {', '.join(idle)}")
     return film, doubts
 
 
 def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
-    """The id of the camera of a run in which most differs from the recording.
+    """The id of the camera in which the film differs most from the recording.
 
     Args:
-        film: what is filmed.
+        film: the edited film.
         saved: the run.
         script: the edits.
     """
@@ -94,7 +96,7 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
     moments = _edited_moments(film, plain)
     if not len(moments):
         return saved.camera(None)
-    some = np.linspace(0, len(moments) - 1, min(_LOOKS, len(moments)) + 2).round().astype(int)[1:-1]
+    some = np.linspace(0, len(moments) - 1, min(_COMPARED, len(moments)) + 2).round().astype(int)[1:-1]
     sequence = saved.recording.judged
     scale = _THUMBNAIL / max(sequence.width, sequence.height)
     size = [max(1, round(scale * side)) for side in (sequence.width, sequence.height)]
@@ -113,24 +115,20 @@ def telling_camera(film: Film, saved: PartsRun, script: Script) -> int:
 
 
 def new_folder(parent: Path, name: str) -> Path:
-    """A new folder of that name, with a number behind it if there is one.
+    """A new folder of that name, with a number appended if it is taken.
 
     Raises:
-        ValueError: that is no name for a folder.
+        ValueError: the name is not valid for a folder.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(
-            f"film name: expected letters, digits, spaces and any of . _ - behind the first, found {name!r}"
+            f"film name: expected letters, digits, spaces and any of . _ - after the first, found {name!r}"
         )
-    number, folder = 1, parent / name
-    while True:
-        try:
+    for folder in chain([parent / name], (parent / f"{name}_{number}" for number in count(2))):
+        with suppress(FileExistsError):
             folder.mkdir(parents=True)
-        except FileExistsError:
-            number += 1
-            folder = parent / f"{name}_{number}"
-        else:
             return folder
+    raise AssertionError
 
 
 def write_film(
@@ -144,23 +142,25 @@ def write_film(
     watch: Watch,
     ply: bool = False,
 ) -> dict[str, Any]:
-    """Film it: the script, a video and what is known of it take the place of an earlier film in the folder.
+    """Write a film: its script, video and metrics replace an earlier film in the folder.
 
     Args:
-        folder: for it.
+        folder: the folder of the film.
         script: the edits.
-        film: what is filmed.
+        film: the edited film.
         saved: the run.
-        watch: shows how far it is.
-        camera: the id of that which films.
-        notes: of the film.
-        ply: write the Gaussians of each frame too.
+        camera: id of the camera that films.
+        notes: notes on the film.
+        watch: shows the progress.
+        ply: whether to write the Gaussians of each frame too.
 
     Returns:
-        What is known of it, as in its metrics.json. It is not `complete` if it was stopped; what there is of
-        it can be watched.
+        The contents of its metrics.json. A film that was stopped is not `complete`, but can be watched so
+        far.
     """
-    _clear(folder)
+    for name in (SCRIPT, VIDEO, _METRICS):
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / _PLY, ignore_errors=True)
     with atomic_write(folder / SCRIPT) as temporary:
         temporary.write_text(to_yaml(script), encoding="utf-8")
     sequence = saved.recording.judged
@@ -199,9 +199,14 @@ def write_film(
 def frames_of(
     film: Film, blend: Blend, order: Int[np.ndarray, "n"] | None = None
 ) -> Callable[[int], Gaussians]:
-    """From the number of a frame to the Gaussians of a film in it, in another order if given.
+    """A function from the index of a frame to the Gaussians of a film in it.
 
-    One moment is taken on the host: then the length of a film is nothing that is compiled.
+    The moment is selected on the host, so that the length of a film is not compiled in.
+
+    Args:
+        film: the film.
+        blend: how rotations are blended.
+        order: rows of the Gaussians in the result (default: all, in their order).
     """
     scenes = tuple(layer.scene for layer in film)
     trajectories = jax.tree.map(np.asarray, tuple(layer.trajectory for layer in film))
@@ -224,11 +229,11 @@ def _placed(film: Film, order: Int[Array, "n"] | None, blend: Blend) -> Gaussian
 
 
 def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
-    """A film as a camera sees it, frame by frame.
+    """The frames of a film from one camera.
 
     Args:
-        film: what is filmed.
-        camera: that which films.
+        film: the film.
+        camera: the camera that films.
         saved: the run.
     """
     at = frames_of(film, saved.blend)
@@ -242,7 +247,7 @@ def shots(film: Film, camera: Camera, saved: PartsRun) -> Iterator[Shot]:
 
 
 def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
-    """`beyond_captured`, of a film of any length by a program that is there already."""
+    """`beyond_captured`, padded so that films of similar length share one program."""
     length = len(now.times)
     rows = np.minimum(np.arange(length + -length % ROUND), length - 1)
     longer = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), now)
@@ -250,15 +255,15 @@ def _beyond(recorded: Layer, now: Trajectory) -> Beyond:
 
 
 def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list[str]:
-    """The edits, as messages call them, without which the film would be the same, and so would be what those
-    before them make: of two that do the same, the second."""
+    """Labels of the edits that change neither the film nor what the edits before them make: of two equal
+    ones, the second."""
     length = _lasting(script, film, saved)
 
     @cache
     def made(edits: tuple[Edit, ...]) -> Film | None:
         try:
             return apply(replace(script, edits=edits, length=length), saved.layer, saved.names, known)
-        except ValueError:  # one needs another
+        except ValueError:  # an edit depends on another
             return None
 
     def same(*edits: tuple[Edit, ...]) -> bool:
@@ -274,14 +279,14 @@ def _idle(script: Script, film: Film, saved: PartsRun, known: LoadScene) -> list
 
 
 def _lasting(script: Script, film: Film, saved: PartsRun) -> float:
-    """The length, seconds, with which fewer edits make a film as long as this one."""
+    """The length, seconds, that makes a film with fewer edits as long as this one."""
     recorded = saved.layer.trajectory.times
     step = 1 / script.fps if script.fps else float(np.median(np.diff(recorded)))
     return float(np.clip(float(film[0].trajectory.times[-1]) + step / 2, *LENGTHS))
 
 
 def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
-    """At which moments a film differs from that without edits; all where something was added."""
+    """The moments at which a film differs from that without edits; all if something was added."""
     both = film[0].trajectory, plain[0].trajectory
     count = min(len(one.times) for one in both)
     if len(film) > 1:
@@ -289,11 +294,3 @@ def _edited_moments(film: Film, plain: Film) -> Int[np.ndarray, "m"]:
     pairs = zip(*map(jax.tree.leaves, both), strict=True)
     differ = [(np.asarray(a)[:count] != np.asarray(b)[:count]).reshape(count, -1) for a, b in pairs]
     return np.flatnonzero(np.concatenate(differ, axis=1).any(axis=1))
-
-
-def _clear(folder: Path) -> None:
-    """Removes what an earlier film left there."""
-    for name in (SCRIPT, VIDEO, _METRICS):
-        (folder / name).unlink(missing_ok=True)
-    if (folder / _PLY).is_dir():
-        shutil.rmtree(folder / _PLY)

@@ -1,4 +1,4 @@
-"""The steps of `gsjax parts`: parts are followed through all frames, and then the scene is refined."""
+"""The steps of `gsjax parts`: parts are tracked through all frames, and then the scene is refined."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from gsjax.optim.method import Run
 
 @dataclass
 class Loop:
-    """What the loops over steps need.
+    """The state of the loops over steps.
 
     Attributes:
-        method, problem: which steps, of what.
-        run: how far it is.
-        progress: how it has gone so far.
-        seconds: by stage; added to.
+        method, problem: the method and its problem.
+        run: the newest run.
+        progress: its progress.
+        seconds: time by stage; extended.
         folder: of the run.
-        notes: receive what is odd.
-        console: shows how far it is.
+        notes: collects warnings.
+        console: shows the progress.
     """
 
     method: Parts
@@ -41,12 +41,12 @@ class Loop:
     console: Console
 
     def follow(self) -> None:
-        """Find the poses of all frames; a row of the progress for each."""
+        """Find the poses of all frames, with a row of the progress for each."""
         steps, frames = self.method.config.stream.iterations, self.problem.sequence.num_frames
         total, progress = self.method.steps_of_frames(self.problem), self.progress
 
         def row(now: Tick, infos: list[Mapping[str, Any]]) -> dict[str, Any]:
-            """What the row of a frame has, after its last step."""
+            """The row of a frame, after its last step."""
             kept: Discovery = now.run.kept
             return {
                 "frame": kept.frame,
@@ -65,25 +65,25 @@ class Loop:
         self.seconds |= {"updates": sum(update_seconds(progress)), "compile": progress.compile_seconds}
 
     def finish(self) -> None:
-        """Leave out parts that no picture needs."""
+        """Remove parts that no picture needs."""
         if isinstance(self.run.params, RefineParams):
             return
         begun = perf_counter()
-        with stage(self.console, "leaving out parts that no picture needs"):
+        with stage(self.console, "removing parts that no picture needs"):
             self.run = self.method.brought_up_to_date(self.problem, self.run)
         self.seconds["finish"] = perf_counter() - begun
         if not np.asarray(self.run.kept.weights)[:, 1:].any():
-            self.notes.warn("no part is left that any picture needs; the outcome is the canonical scene")
+            self.notes.warn("no picture needs any part; the result is the canonical scene")
 
     def refine(self) -> None:
-        """Fit the scene and all poses to all frames, as far as it comes where it is stopped. An error of the
-        system ends that early, and the run all the same is complete."""
+        """Fit the scene and all poses to all frames, until it is stopped. An OSError ends it early, and the
+        run is complete all the same."""
         steps, begun = self.method.config.refine.iterations, perf_counter()
         first, total = self.method.steps_of_frames(self.problem), self.method.total(self.problem)
         skipped = self.progress.skipped
 
         def in_words(row: Mapping[str, Any]) -> str:
-            losses = row.get("losses") or [row.get("loss")]  # at first the newest row is a frame's
+            losses = row.get("losses") or [row.get("loss")]  # the newest row may still be a frame's
             return "no finite loss" if losses[-1] is None else f"loss {losses[-1]:.4f}"
 
         if steps:
@@ -92,17 +92,15 @@ class Loop:
         done, stopped = self.run.step - first, self.progress.stopped
         if stopped is not None:
             self.notes.warn(
-                f"the scene was refined by {done} of {steps} steps, and then stopped by {reason(stopped)}"
+                f"the scene was refined for {done} of {steps} steps, then stopped by {reason(stopped)}"
             )
             if isinstance(stopped, OSError):
                 self.progress.stopped = None
         if lost := self.progress.skipped - skipped:
-            self.notes.warn(
-                f"{lost} of {done} steps that refine the scene changed nothing: numbers were not finite"
-            )
+            self.notes.warn(f"{lost} of {done} steps of the refinement were not finite and changed nothing")
 
     def _watch(self, schedule: Schedule) -> None:
-        """Go on to the last step of a schedule."""
+        """Run to the last step of a schedule."""
         ticks = drive(
             self.method,
             self.problem,
@@ -117,29 +115,29 @@ class Loop:
 
 
 def resumed(folder: RunFolder, run: Run, progress: Progress) -> tuple[Run, Progress]:
-    """The newest run that was saved, and how it had gone; those given where none was.
+    """The newest saved run and its progress; the given ones if none was saved.
 
     Args:
         folder: of the run.
-        run, progress: before the first step.
+        run, progress: those before the first step.
 
     Raises:
-        CheckpointError: there are only damaged ones, or one of an earlier version of gsjax.
-        ValueError: it is made from another canonical scene.
+        CheckpointError: all are damaged, or of an earlier version of gsjax.
+        ValueError: the run has another canonical scene.
     """
-    earlier = folder.resume / "parts.npz"  # versions up to 0.1 wrote one
+    earlier = folder.resume / "parts.npz"  # of versions up to 0.1
     if earlier.is_file():
         load_checkpoint(earlier)
     return load_run(folder.resume, run, progress)
 
 
 def update_seconds(progress: Progress) -> list[float]:
-    """Seconds of each frame that was followed, compiling apart."""
+    """Seconds of each tracked frame, without compiling."""
     return [row["update_s"] for row in progress.rows if "update_s" in row]
 
 
 def _losses(infos: list[Mapping[str, Any]]) -> list[float] | None:
-    """The losses of a frame's picture at its first and at its last steps; None where none was finite."""
+    """The losses of a frame at its first and at its last steps; None if none was finite."""
     losses = np.array([float(info["now"]) for info in infos])
     few = max(1, len(losses) // 8)
     return [float(losses[:few].mean()), float(losses[-few:].mean())] if len(losses) else None

@@ -35,18 +35,18 @@ def finished(
     notes: Notes,
     console: Console,
 ) -> dict[str, Any]:
-    """Writes parts.npz, scene.ply and videos, and returns what metrics.json holds but for notes.
+    """Write parts.npz, scene.ply and videos, and return the contents of metrics.json but for notes.
 
     Args:
         folder: of the run.
-        recording: its tracked cameras, and those that are only judged.
+        recording: its tracked and held-out cameras.
         start: the canonical scene.
-        run: of the method, after its last step.
-        found: what it has come to.
-        progress: how that went.
-        seconds: by stage, so far.
-        notes: receive what is odd.
-        console: shows how far it is.
+        run: the run after its last step.
+        found: the result.
+        progress: the progress of the run.
+        seconds: time by stage, so far.
+        notes: collects warnings.
+        console: shows the progress.
     """
     frames, kept = np.flatnonzero(found.done), run.kept
     stopped, scene, trajectory = progress.stopped, found.scene, found.trajectory
@@ -58,17 +58,10 @@ def finished(
     write_ply(folder.scene, scene.gaussians, labels=np.asarray(scene.labels))
     joints, scores = found.joints(), Scores(None, None)
     if complete:
-        colors = np.arange(scene.num_parts)
+        film = Film(folder, recording, recording.tracked.num_frames, np.arange(scene.num_parts))
+        views = part_views(scene, trajectory, recording, found.blend)
         try:
-            with (
-                Film(folder, recording, recording.tracked.num_frames, colors) as film,
-                console.status("") as status,
-            ):
-                for frame in part_views(scene, trajectory, recording, found.blend):
-                    status.update(f"rendering and scoring frame {frame[0].t + 1} of {len(frames)}")
-                    for view in frame:
-                        scores.add(view)
-                        film.add(view)
+            film.score(views, scores, len(frames), console)
         except (KeyboardInterrupt, OSError) as error:
             notes.warn(f"scoring was stopped after {scores.num_frames} frames by {reason(error)}")
             progress.stopped = error if isinstance(error, KeyboardInterrupt) else None
@@ -116,8 +109,8 @@ def finished(
 
 
 def write_parts(path: Path, scene: PartScene, trajectory: Trajectory, anchor: int) -> None:
-    """Writes parts.npz. A point x with weights w is at time t at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
-    0 is the background, which stands still. All in metres, seconds and the world's axes.
+    """Write parts.npz. At time t, a point x with weights w is at sum_p w_p (R_p (x - c_p) + c_p + t_p); part
+    0 is the background, which does not move. All in metres, seconds and the world's axes.
 
     anchor (frame index), means0 [N,3], weights [N,P], labels [N], centres [P,3], R [T,P,3,3], t [T,P,3],
     times [T].

@@ -21,7 +21,7 @@ from gsjax.engine.options import RESUME_MAY_CHANGE, OfRecording, SamWeights, See
 from gsjax.engine.parts.loop import Loop, resumed
 from gsjax.engine.parts.outputs import finished
 from gsjax.engine.parts.results import summarize
-from gsjax.engine.parts.start import FIT
+from gsjax.engine.parts.start import FIT, detect_motion
 from gsjax.engine.progress import Progress
 from gsjax.engine.recording import Recording, chosen_recording, located, parse_frames
 from gsjax.engine.records import digest
@@ -33,16 +33,14 @@ from gsjax.methods.parts import (
     PartsConfig,
     Start,
     begin,
-    choose_anchor,
     masks_of_labels,
-    moved_pixels,
 )
 from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians
 
-_EVERYTHING = 0.6  # share of pixels that change
+_EVERYTHING = 0.6  # fraction of pixels that change above which everything seems to move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +73,7 @@ def run(options: Options) -> int:
         expect_dataset(options.dataset)
         recording = chosen_recording(options)
         _check(options, recording)
-        segmenter = _segmenter(options)
+        segmenter: Segmenter = PieceSegmenter() if options.sam is None else load_sam(options.sam)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
         if options.resume:
@@ -84,16 +82,8 @@ def run(options: Options) -> int:
         gaussians = None if scene is None else _read_scene(scene)
         seconds: dict[str, float] = {}
         tracked = recording.tracked
-        with stage(console, "looking for what moves"):
-            anchor = choose_anchor(tracked.image, tracked.num_frames, tracked.num_cameras, options.anchor)
-            discover = options.parts.discover
-            moved = moved_pixels(
-                tracked.image,
-                anchor,
-                tracked.num_cameras,
-                frames=discover.frames,
-                threshold=discover.threshold,
-            )
+        with stage(console, "detecting motion"):
+            anchor, moved = detect_motion(tracked, options.parts, options.anchor)
         masks = _masks(tracked, anchor, moved, options)
         folder.write_config(settings)  # from here on an earlier run is gone
         notes.add(
@@ -106,10 +96,10 @@ def run(options: Options) -> int:
                 return 130
             gaussians = _read_scene(scene)
         seconds["canonical"], at = perf_counter() - at, perf_counter()
-        with stage(console, "finding what may move, in all views"):
+        with stage(console, "discovering parts in all views"):
             key = jax.random.key(options.parts.seed)
             start = begin(tracked, gaussians, anchor, moved, options.parts, segmenter, key, masks)
-        _warn_if_odd(start, moved.mean(), options, notes)
+        _warn_if_doubtful(start, moved.mean(), options, notes)
         method = Parts(options.parts)
         problem, first = method.start(tracked, start)
         seconds["discovery"] = perf_counter() - at
@@ -158,14 +148,10 @@ def _check(options: Options, recording: Recording) -> None:
         raise ValueError("--scene: expected --anchor too, the frame that it shows, found none")
 
 
-def _segmenter(options: Options) -> Segmenter:
-    return PieceSegmenter() if options.sam is None else load_sam(options.sam)
-
-
 def _masks(
     sequence: Sequence, anchor: Anchor, moved: Bool[np.ndarray, "C H W"], options: Options
 ) -> Int[np.ndarray, "C H W"] | None:
-    """What moves by the recording's own masks; None where a segmenter finds it."""
+    """The moving pieces by the recording's own masks; None if a segmenter finds them."""
     if options.masks == "segment":
         return None
     labels = [sequence.mask(anchor.frame, c) for c in range(sequence.num_cameras)]
@@ -188,7 +174,7 @@ def _masks(
 def _fitted(
     options: Options, folder: RunFolder, anchor: Anchor, recording: Recording, console: Console
 ) -> Path | None:
-    """The PLY file of the scene at the anchor frame; None where fitting was stopped by Ctrl-C."""
+    """The PLY file of the scene at the anchor frame; None if the fit was stopped by Ctrl-C."""
     path = folder.path / "canonical"
     if not RunFolder(path, overwrite=True).finished:
         console.print("[bold]canonical scene[/]  fitted to the anchor frame", soft_wrap=True)
@@ -225,20 +211,19 @@ def _fit_options(options: Options, path: Path, anchor: Anchor, recording: Record
     )
 
 
-def _warn_if_odd(start: Start, moved: float, options: Options, notes: Notes) -> None:
-    """Warn where parts are doubtful; `moved` is the share of pixels that change."""
+def _warn_if_doubtful(start: Start, moved: float, options: Options, notes: Notes) -> None:
+    """Warn if the parts are doubtful; `moved` is the fraction of pixels that change."""
     pieces = int(start.masks.max())
     if moved > _EVERYTHING:
         notes.warn(
-            f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or cameras do; "
-            "what stands still is then badly known"
+            f"{moved:.0%} of the anchor's pixels change in other frames: everything moves, or the cameras "
+            "do; the background is then poorly determined"
         )
     if pieces >= options.parts.discover.most_parts:
         notes.warn(
-            f"there are more pieces that changed than --parts.discover.most-parts {pieces}; the smallest "
-            "were left out"
+            f"more pieces changed than --parts.discover.most-parts {pieces}; the smallest were left out"
         )
     seen = [(start.masks == piece).any((1, 2)).sum() for piece in range(1, pieces + 1)]
     alone = sum(count == 1 for count in seen)
     if alone:
-        notes.add(f"{alone} of {pieces} pieces were seen to change by one camera only.")
+        notes.add(f"{alone} of {pieces} pieces changed in one camera only.")

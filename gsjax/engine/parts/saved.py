@@ -1,4 +1,4 @@
-"""A run of `gsjax parts` read back: the scene, where its parts went, and the recording that it came from."""
+"""A run of `gsjax parts` read back: the scene, the motion of its parts, and its recording."""
 
 import json
 from collections.abc import Mapping
@@ -33,15 +33,15 @@ _AGAIN = "run gsjax parts again with this version of gsjax, or name another fold
 
 @dataclass(frozen=True, eq=False)
 class PartsRun:
-    """What `gsjax parts` left.
+    """A run of `gsjax parts`.
 
     Attributes:
         path: the folder.
-        layer: the scene, and its parts at the frames that were followed.
-        names: of the parts, with their numbers: "part 1", and what it truly is where that is known.
-        complete: whether all frames were followed.
-        recording: the same frames and cameras as then.
-        blend: how rotations were blended then.
+        layer: the scene, and its parts at the tracked frames.
+        names: numbers of the parts by name: "part 1", and the name of the true part if that is known.
+        complete: whether all frames were tracked.
+        recording: the frames and cameras of the run.
+        blend: how rotations are blended.
     """
 
     path: Path
@@ -52,7 +52,7 @@ class PartsRun:
     blend: Blend
 
     def camera(self, camera: int | None) -> int:
-        """The id of a camera of the run; default: the first held out one, else the first.
+        """The id of a camera of the run; default: the first held-out one, else the first.
 
         Raises:
             ValueError: the run had no such camera.
@@ -65,7 +65,7 @@ def open_parts_run(path: Path) -> PartsRun:
 
     Raises:
         FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
-        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+        ValueError: a file is not as the run wrote it, or its recording cannot be opened.
     """
     layer, names, complete = _read(path)
     recording, blend = reopen(path / "config.yml", _AGAIN, _blend)
@@ -73,7 +73,7 @@ def open_parts_run(path: Path) -> PartsRun:
 
 
 def blend_of(path: Path) -> Blend:
-    """How a run blended rotations, whose recording need not be there; as usual where it does not say."""
+    """How a run blends rotations, without opening its recording; the default if it does not say."""
     try:
         return _blend(yaml.safe_load((path / "config.yml").read_text(encoding="utf-8")))
     except (OSError, yaml.YAMLError, KeyError, TypeError):
@@ -85,7 +85,7 @@ def _blend(settings: Mapping[str, Any]) -> Blend:
 
 
 def read_parts(path: str | Path) -> tuple[Layer, Names]:
-    """The scene of a run with its parts, and their names. Its recording need not be there.
+    """The scene of a run with its parts, and their names, without opening its recording.
 
     Raises:
         FileNotFoundError, ValueError: as `open_parts_run`.
@@ -111,7 +111,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
     anchor, frames = int(arrays["anchor"]), len(arrays["times"])
     names, followed = _of_metrics(path / "metrics.json", frames)
     gaussians = read_scene(path, num, "parts.npz", _AGAIN)
-    # The others stand there as at the anchor, which they were not.
+    # The other frames hold the poses of the anchor.
     done = np.sort([anchor, *order_of_frames(frames, anchor)[: followed - 1]])
     R, t, times = (jnp.asarray(arrays[name][done], float) for name in ("R", "t", "times"))
     weights, centers = (jnp.asarray(arrays[name], float) for name in ("weights", "centres"))
@@ -122,7 +122,7 @@ def _read(path: Path) -> tuple[Layer, dict[str, int], bool]:
 
 
 def _kind(file: Path) -> str | None:
-    """The command that made a run; None where its scores do not say."""
+    """The command that made a run; None if its scores do not say."""
     try:
         return json.loads(file.read_text(encoding="utf-8")).get("kind")
     except (OSError, ValueError, AttributeError):
@@ -130,7 +130,7 @@ def _kind(file: Path) -> str | None:
 
 
 def _arrays(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of parts.npz, which fit each other."""
+    """The arrays of parts.npz, checked."""
     arrays = read_arrays(file, tuple(_ARRAYS), _AGAIN)
     frames = check_arrays(file, arrays, _ARRAYS, _AGAIN)["T"]
     anchor = arrays["anchor"]
@@ -141,7 +141,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
 
 
 def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
-    """Parts by name, and how many of the frames were followed."""
+    """Parts by name, and the number of tracked frames."""
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
         rows, followed = metrics["parts"], metrics["frames"]["followed"]
@@ -153,8 +153,8 @@ def _of_metrics(file: Path, frames: int) -> tuple[dict[str, int], int]:
             expected = "part, name and true_name to be a number, a text and a text or null"
             raise ValueError(f"{file}: expected {expected}, found {part!r}, {name!r} and {true!r}; {_AGAIN}")
     if type(followed) is not int or not 1 <= followed <= frames:
-        expected = f"1 to {frames} frames to be followed, as parts.npz has {frames}"
+        expected = f"1 to {frames} tracked frames, as parts.npz has {frames}"
         raise ValueError(f"{file}: expected {expected}, found {followed!r}; {_AGAIN}")
-    # The true names last: of two names, messages say the last.
+    # True names come last: of two names, messages use the last.
     names = {name: part for part, name, _ in called}
     return names | {true.lower().replace(" ", "_"): part for part, _, true in called if true}, followed

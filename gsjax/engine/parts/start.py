@@ -1,6 +1,27 @@
-"""The canonical scene, from which a discovery of parts begins."""
+"""The start of a discovery of parts: the anchor frame, motion, and the fit of the canonical scene."""
 
+import numpy as np
+from jaxtyping import Bool
+
+from gsjax.data.sequence import Sequence
 from gsjax.methods.fit import FitConfig, StartConfig
+from gsjax.methods.parts import Anchor, PartsConfig, choose_anchor, moved_pixels
 
 FIT = FitConfig(steps=3_000, cap=15_000, sh_degree=0, depth_weight=0.5, start=StartConfig(count=10_000))
-"""The default settings of its fit."""
+"""Default settings of the fit of the canonical scene."""
+
+
+def detect_motion(
+    tracked: Sequence, config: PartsConfig, anchor: int | None
+) -> tuple[Anchor, Bool[np.ndarray, "C H W"]]:
+    """The anchor frame, and the pixels of its pictures that change in other frames.
+
+    Args:
+        tracked: the tracked cameras.
+        config: settings of the discovery.
+        anchor: index of the frame (default: the one that differs most from the others).
+    """
+    cameras, discover = tracked.num_cameras, config.discover
+    chosen = choose_anchor(tracked.image, tracked.num_frames, cameras, anchor)
+    how = {"frames": discover.frames, "threshold": discover.threshold}
+    return chosen, moved_pixels(tracked.image, chosen, cameras, **how)

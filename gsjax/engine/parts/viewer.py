@@ -1,4 +1,4 @@
-"""A run of `gsjax parts` in the viewer: as a film, and how to edit it there, as `gsjax edit` does."""
+"""A run of `gsjax parts` in the viewer: as a film that can be edited, as with `gsjax edit`."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ class Filmed:
     """What all films of a run have in common.
 
     Attributes:
-        title: of the run.
-        names: of its parts.
+        title: title of the run.
+        names: names of its parts.
         blend: how rotations are blended.
-        times: of the recording, seconds from its start.
-        shots: its photographs, at these times; None where they are not to be had.
+        times: times of the recording, seconds from its start.
+        shots: its photographs at these times; None if they are not available.
     """
 
     title: str
@@ -44,8 +44,7 @@ class Filmed:
     shots: Shots | None
 
     def viewable(self, film: Film, editing: Editing | None = None) -> Viewable:
-        """A film to look at. What differs between its frames stands first; each frame is made when it is
-        shown."""
+        """A film to view. Gaussians that change come first; each frame is made when it is shown."""
         times = np.asarray(film[0].trajectory.times)
         moves = np.concatenate([_moves(layer) for layer in film])
         order = np.argsort(~moves, kind="stable")
@@ -65,7 +64,7 @@ class Filmed:
 
 
 def editing_of(saved: PartsRun, filmed: Filmed) -> Editing:
-    """How a run can be edited in the viewer."""
+    """The edits of a run in the viewer."""
     cameras = camera_names(saved.recording)
     first = saved.camera(None)
     called = {part: name for name, part in {"background": BACKGROUND, **saved.names}.items()}
@@ -105,19 +104,19 @@ def script_of(lines: Sequence[str]) -> Script:
     """The edits that lines describe.
 
     Raises:
-        ValueError: one is not as it should be; the message names the edit by its number.
+        ValueError: one is invalid; the message names the edit by its number.
     """
     return Script(edits=tuple(parse_op(line, number) for number, line in enumerate(lines, 1)))
 
 
 def camera_names(recording: Recording) -> dict[str, int]:
-    """What the cameras of a recording are called, with their ids."""
+    """Ids of the cameras of a recording, by name."""
     held_out = recording.held_out
     return {f"camera {c}" + (" (held out)" if c in held_out else ""): c for c in recording.judged.camera_ids}
 
 
 def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
-    """Which Gaussians of a layer are not the same in all of its moments."""
+    """The Gaussians of a layer that are not the same at all moments."""
     trajectory, parts = layer.trajectory, layer.scene.num_parts
     changes = np.zeros(parts, bool)
     for leaf in map(np.asarray, jax.tree.leaves((trajectory.poses, trajectory.opacities, trajectory.scales))):
@@ -126,12 +125,12 @@ def _moves(layer: Layer) -> Bool[np.ndarray, "n"]:
 
 
 def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, str]]:
-    """Labels of all Gaussians of a film, and their names; parts of other runs come behind the own ones."""
-    known: dict[int, Any] = {part: name for name, part in names.items()}  # the true name, which comes last
+    """Labels of all Gaussians of a film, and their names; parts of other runs follow those of the run."""
+    known: dict[int, Any] = {part: name for name, part in names.items()}  # true names come last
     labels, behind = [], film[0].scene.num_parts
     for layer in film:
         own, first = layer.scene.num_parts, 0
-        if not np.array_equal(layer.scene.centers, film[0].scene.centers):  # no copy of a part of the run
+        if not np.array_equal(layer.scene.centers, film[0].scene.centers):  # a layer of another run
             first, behind = behind, behind + own
             known |= {first + part: f"part {part} of another run" for part in range(own)}
         labels.append(first + np.asarray(layer.scene.labels))
@@ -139,7 +138,7 @@ def _labels(film: Film, names: Names) -> tuple[Int[np.ndarray, "n"], dict[int, s
 
 
 def _at_times(shots: Shots, recorded: np.ndarray, times: np.ndarray) -> Shots:
-    """The photographs that were taken at about these times of the recording."""
+    """The photographs nearest to these times of the recording."""
     rows = np.interp(times, recorded, np.arange(len(recorded))).round().astype(int)
     load = shots.load_image
     return Shots(

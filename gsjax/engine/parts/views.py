@@ -15,15 +15,15 @@ from gsjax.scene.render import Rendered, render
 
 
 def part_views(
-    scene: PartScene, trajectory: Trajectory, recording: Recording, blend: Blend, every: int = 1
+    scene: PartScene, trajectory: Trajectory, recording: Recording, blend: Blend
 ) -> Iterator[list[View]]:
-    """The views of all cameras, a list for every `every`-th frame; groups are the parts."""
+    """The views of all cameras, a list per frame; groups are the parts."""
 
     def at(t: int) -> tuple[PartScene, Moment]:
         return scene, moment(trajectory, t)
 
     placed = partial(gaussians_at, blend=blend)
-    return views_of(recording, range(0, len(trajectory.times), every), at, _renders_parts(blend), placed)
+    return views_of(recording, range(len(trajectory.times)), at, _renders_parts(blend), placed)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""A recording followed: frames in, poses out, and everything timed."""
+"""The loop over the frames of a recording: frames in, poses out, and everything timed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,33 +23,32 @@ from gsjax.methods.track.budget import Chosen
 from gsjax.scene.frame import Frame
 
 LOADED_AHEAD = 2
-"""Frames that are read while an update runs, where there is a second core for that."""
-
-_SHOWN_EVERY_S = 0.1
-"""The progress bar is drawn between updates, for a thread of its own would make some of them late."""
+"""Frames read ahead while an update runs, if there is a second core for that."""
+_RATE_OVER = 10  # updates
+_SHOWN_EVERY_S = 0.1  # the progress bar is drawn between updates: a thread of its own would make some late
 
 
 @dataclass
 class Tracking:
-    """What tracking gave so far: the first frame, and one more entry for each update.
+    """What has been tracked so far: the first frame, and one more entry for each update.
 
     Attributes:
-        scene: at the first frame.
-        tick: the newest, with what has joined the objects; None before the first update.
-        joined: how many Gaussians had joined by each frame.
-        poses: of the moving Gaussians in each frame, and after the first of those that join; on the host.
+        scene: the scene at the first frame.
+        poses: poses of the moving Gaussians in each frame, after the first with those that join; on the host.
+        tick: the newest tick, with what has joined the objects; None before the first update.
+        joined: number of Gaussians that had joined by each frame.
         update_s: seconds of each update; 0 for the first frame, which is initialisation.
-        compile_s: seconds spent compiling, since it began or was resumed.
-        planning_s: seconds before the first update that went into its plan, and into compiling what plans.
+        compile_s: seconds spent compiling, since the run began or was resumed.
+        planning_s: seconds before the first update spent on its plan, and on compiling what plans.
         loading_s: seconds that the loop waited for images.
         loop_s: seconds of the whole loop.
-        plans: how many plans there were; more than one means that it had to plan again.
-        visible: [K] of each update, which objects some camera saw.
-        lost: [K] of each update, which objects were not where they were believed to be.
-        turn_known: [K] of each update, whether the turn of each object since the first frame is known.
-        skipped: updates that changed nothing, because a number in them was not finite.
-        everywhere: of each update, how many groups it looked for everywhere.
-        resumed: how many frames an earlier run had tracked; 0 without one.
+        plans: number of plans; more than one means that it had to plan again.
+        visible: [K] per update: which objects some camera saw.
+        lost: [K] per update: which objects were not where they were believed to be.
+        turn_known: [K] per update: whether the rotation of each object since the first frame is known.
+        skipped: number of updates that changed nothing, because a number in them was not finite.
+        everywhere: number of groups that each update searched for everywhere.
+        resumed: number of frames that an earlier run had tracked; 0 without one.
         stopped: what ended the loop early, or None.
     """
 
@@ -101,9 +100,19 @@ class Tracking:
 
     @property
     def hz(self) -> float | None:
-        """Updates a second, loading and compiling apart; None before the first."""
+        """Updates per second, without loading and compiling; None before the first."""
         total = sum(self.update_s)
         return (self.num_frames - 1) / total if total else None
+
+    def seconds(self) -> dict[str, float]:
+        """How the time of the loop was spent, in seconds."""
+        parts = {
+            "planning": self.planning_s,
+            "compile": self.compile_s,
+            "updates": sum(self.update_s[max(self.resumed, 1) :]),
+            "loading": self.loading_s,
+        }
+        return parts | {"loop_rest": self.loop_s - sum(parts.values()), "loop_wall": self.loop_s}
 
     def means(self) -> Float[np.ndarray, "T N 3"]:
         """The centres of all Gaussians over time, metres."""
@@ -112,11 +121,11 @@ class Tracking:
         return np.stack([np.concatenate([pose.means[:count], still]) for pose in self.poses])
 
     def quats(self) -> Float[np.ndarray, "T M 4"]:
-        """The orientations of the moving Gaussians, which stand first, over time."""
+        """The orientations of the moving Gaussians, which come first, over time."""
         return np.stack([pose.quats[: self.scene.num_moving] for pose in self.poses])
 
     def at(self, t: int) -> tuple[TrackedScene, Pose]:
-        """The scene and its pose in frame t, in the same shapes for all t; what joined later is hidden."""
+        """The scene and its pose in frame t, in the same shapes for all t, without what joined later."""
         final, pose = self.final, self.poses[t]
         if final is None:
             return self.scene, pose
@@ -148,16 +157,16 @@ def follow(
     budget_ms: float | None = None,
     saved: Callable[..., None] = lambda tracking, *, last: None,
 ) -> Tracking:
-    """Track all frames that are left. Ctrl-C or an error ends the loop; what was tracked until then stays.
+    """Track the remaining frames. Ctrl-C or an error ends the loop; what was tracked until then is kept.
 
     Args:
-        tracking: what there is so far, from `begin` or an earlier run; it is added to, and returned.
-        first: what the tracked cameras saw at first.
+        tracking: from `begin` or an earlier run; it is extended, and returned.
+        first: the first frame.
         tracked: the tracked cameras; only images and depth are loaded.
-        config: the tracker's.
+        config: the settings of the tracker.
         console: for the progress bar.
-        budget_ms: what an update may take, or None.
-        saved: called after each update, and once more, with `last` on, where the loop ends.
+        budget_ms: time that an update may take, or None.
+        saved: called after each update, and once more, with `last` on, at the end of the loop.
     """
     shared = usable_cores() == 1 and jax.default_backend() == "cpu"  # with a thread that reads meanwhile
     ahead = 0 if shared else LOADED_AHEAD
@@ -185,7 +194,8 @@ def follow(
                 shielded(tracking.add, now)
                 plans.add(now.run.plans[PLAN])
                 saved(tracking, last=False)
-                progress.update(task, advance=1, rate=_rate(tracking))
+                recent = tracking.update_s[1:][-_RATE_OVER:]
+                progress.update(task, advance=1, rate=f"{len(recent) / sum(recent):.2f} Hz")
                 if perf_counter() - drawn > _SHOWN_EVERY_S:
                     progress.refresh()
                     drawn = perf_counter()
@@ -197,9 +207,3 @@ def follow(
     tracking.loop_s = perf_counter() - begun
     tracking.loading_s, tracking.plans = frames.waited, len(plans)
     return tracking
-
-
-def _rate(tracking: Tracking) -> str:
-    """The rate of the last ten updates."""
-    recent = tracking.update_s[1:][-10:]
-    return f"{len(recent) / sum(recent):.2f} Hz"

@@ -1,7 +1,8 @@
-"""What a run writes: trajectory, scene, renders, videos, plots."""
+"""Files of a tracked recording: trajectory, scene and plots."""
 
 import numpy as np
 from jaxtyping import Bool
+from matplotlib.figure import Figure
 
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.recording import FirstMask, Recording
@@ -10,13 +11,13 @@ from gsjax.engine.summary import Media
 from gsjax.engine.track.loop import Tracking
 from gsjax.io.pictures import write_png
 from gsjax.io.ply import write_ply
-from gsjax.metrics.tracking import ObjectScore
+from gsjax.metrics.tracking import ObjectScore, relative_motion
 from gsjax.viz import plots
 from gsjax.viz.colors import overlay_labels
 
 
 def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> None:
-    """Writes trajectory.npz and scene.ply; done before anything is scored, so that scoring may be stopped.
+    """Write trajectory.npz and scene.ply; this comes before scoring, which may be stopped.
 
     Args:
         folder: of the run.
@@ -41,7 +42,7 @@ def write_tracking(folder: RunFolder, tracking: Tracking, times: np.ndarray) -> 
 
 
 def _of_objects(flags: list[np.ndarray], label_of: np.ndarray) -> Bool[np.ndarray, "T K"]:
-    """Whether an update set the flag of any part of each object; none is set in the first frame."""
+    """Whether an update set the flag of any part of each object; never in the first frame."""
     rows = np.zeros((1 + len(flags), label_of.max()), bool)
     for t, row in enumerate(flags, 1):
         np.logical_or.at(rows[t], label_of[1:] - 1, row)
@@ -65,83 +66,68 @@ def write_plots(
     scores: Scores,
     motion: dict[int, ObjectScore],
     names: dict[int, str],
-    colors: np.ndarray,
+    group_labels: np.ndarray,
 ) -> list[Media]:
     """Write the plots.
 
     Args:
         folder: of the run.
-        tracking, recording: what was tracked, and what judges.
-        scores: of views.
-        motion: of objects, by mask value.
-        names: of objects, by mask value.
-        colors: [K+1], the label that gives each group its colour.
+        tracking, recording: what was tracked, with the truth.
+        scores: those of views.
+        motion: scores of objects, by label.
+        names: names of objects, by label.
+        group_labels: the label of each group, [K+1], which gives it its colour.
     """
     written = []
 
-    def keep(name: str, figure, caption: str) -> None:
+    def keep(name: str, figure: Figure, caption: str) -> None:
         written.append(Media(plots.save(figure, folder.plot(name)), caption))
 
-    known = {names[label]: label for label in motion if label in names and motion[label].num_scored}
-    if tracking.num_frames > 1:
-        if known:
-            errors = {name: motion[label].centroid_errors_mm for name, label in known.items()}
-            figure = plots.error_over_frames(errors, known, limit_mm=5.0)
-            keep("centroid_error", figure, "How far each object's centroid is from the truth")
-        keep(
-            "update_time",
-            plots.update_time(np.array([np.nan, *tracking.update_s[1:]])),
-            "Time of each update; compiling apart",
-        )
+    labels, moved = {name: label for label, name in names.items()}, tracking.num_frames > 1
+    scored = {names[k]: s.centroid_errors_mm for k, s in motion.items() if k in names and s.num_scored}
+    if moved and scored:
+        figure = plots.error_over_frames(scored, labels, limit_mm=5.0)
+        keep("centroid_error", figure, "Distance of each object's centroid from the truth")
+    if moved:
+        times = plots.update_time(np.array([np.nan, *tracking.update_s[1:]]))
+        keep("update_time", times, "Time of each update, without compiling")
     if scores.num_frames > 1:
-        lines = {
-            kind: {
+        held_out, tracked = (
+            {
                 f"camera {camera}": np.asarray(found.values["psnr"])
                 for camera, found in scores.cameras.items()
                 if found.held_out == kind
             }
-            for kind in (False, True)
-        }
-        keep(
-            "psnr",
-            plots.psnr_over_frames(lines[False], lines[True]),
-            "Rendered pictures against the camera's",
+            for kind in (True, False)
         )
-    if tracking.num_frames > 1:
-        paths = _centroids(tracking, names, colors)
-        caption = "Centroids from above; ring: start, dot: end; thin lines: the truth"
-        figure = plots.trajectories(
-            paths,
-            {name: label for label, name in names.items()},
-            _true_paths(recording, tracking, paths, names),
-        )
-        keep("paths", figure, caption)
+        keep("psnr", plots.psnr_over_frames(tracked, held_out), "PSNR of rendered pictures")
+    if moved:
+        paths = _centroids(tracking, names, group_labels)
+        figure = plots.trajectories(paths, labels, _true_paths(recording, tracking, paths, names))
+        keep("paths", figure, "Centroids from above; ring: start, dot: end; thin lines: the truth")
     return written
 
 
-def _centroids(tracking: Tracking, names: dict[int, str], colors: np.ndarray) -> dict[str, np.ndarray]:
-    """Where the centroid of each object's Gaussians went, [T,3]."""
-    groups, means = np.asarray(tracking.scene.labels), tracking.means()
-    paths = {}
-    for label, name in names.items():
-        members = np.isin(groups, np.flatnonzero(colors == label))
-        if members.any():
-            paths[name] = means[:, members].mean(axis=1)
-    return paths
+def _centroids(tracking: Tracking, names: dict[int, str], group_labels: np.ndarray) -> dict[str, np.ndarray]:
+    """The path of the centroid of each object's Gaussians, [T,3]."""
+    labels, means = group_labels[np.asarray(tracking.scene.labels)], tracking.means()
+    return {
+        name: means[:, labels == label].mean(axis=1)
+        for label, name in names.items()
+        if (labels == label).any()
+    }
 
 
 def _true_paths(
     recording: Recording, tracking: Tracking, paths: dict[str, np.ndarray], names: dict[int, str]
 ) -> dict[str, np.ndarray]:
-    """Where the truth would have carried the same centroids."""
-    truth = recording.tracked.truth
+    """The paths of the same centroids under the true motion."""
+    truth, true = recording.tracked.truth, {}
     if truth is None:
-        return {}
-    true = {}
+        return true
     for i, label in enumerate(truth.label_ids):
         name = names.get(int(label))
         if name in paths:
-            poses = truth.poses[: tracking.num_frames, i]
-            motion = poses @ np.linalg.inv(poses[0])
+            motion = relative_motion(truth.poses[: tracking.num_frames, i])
             true[name] = motion[:, :3, :3] @ paths[name][0] + motion[:, :3, 3]
     return true

@@ -1,4 +1,4 @@
-"""What an unfinished run leaves behind from time to time, so that another can go on from it."""
+"""Saving and loading what an unfinished run of `gsjax track` resumes from."""
 
 from pathlib import Path
 
@@ -16,29 +16,30 @@ _PER_UPDATE = ("visible", "lost", "turn_known")
 
 
 class Saver:
-    """Writes the state of a run into its folder `resume/`, and what poses have come since the last time.
+    """Writes the state of a run into its folder `resume/`, and the poses that are new since the last time.
 
     Args:
         folder: RUN/resume.
-        saved: how many frames stand there already.
+        saved: number of frames stored there already.
     """
 
     def __init__(self, folder: Path, saved: int = 0):
         self._folder, self._saved, self._save = folder, saved, saving.Saver("tracking")
 
     def __call__(self, tracking: Tracking, *, last: bool) -> None:
-        """Save if the last time is long enough ago, or this is the last; warn where the disk is full."""
+        """Save if the last time is long enough ago, or this is the last; warn if it cannot be written."""
         self._save(lambda: self._write(tracking), last=last)
 
     def _write(self, tracking: Tracking) -> None:
         assert tracking.tick is not None
         for path in _parts(self._folder):
-            if _frames_of(path) > self._saved:  # written before a state that failed, or by an earlier run
+            if _frames_of(path) > self._saved:  # by a save that failed, or an earlier run
                 path.unlink()
         news = tracking.poses[max(self._saved, 1) :]  # the first one is the scene's own
         if news:
             poses = jax.tree.map(lambda *rows: np.stack(rows), *news)
-            write_npz(_part(self._folder, tracking.num_frames), {"means": poses.means, "quats": poses.quats})
+            part = self._folder / f"poses_{tracking.num_frames:06d}.npz"  # up to this many frames
+            write_npz(part, {"means": poses.means, "quats": poses.quats})
         metadata = {
             "frames": tracking.num_frames,
             "joined": tracking.joined,
@@ -53,11 +54,7 @@ class Saver:
 
 
 def load(folder: Path, config: TrackConfig) -> Tracking:
-    """What a run had come to, to go on from.
-
-    Args:
-        folder: RUN/resume.
-        config: the tracker's.
+    """The tracking saved in a folder RUN/resume by a run with this config.
 
     Raises:
         ValueError: nothing was saved there, or it is damaged, or of another version of gsjax.
@@ -76,13 +73,8 @@ def load(folder: Path, config: TrackConfig) -> Tracking:
     return Tracking(scene, poses, tick, resumed=frames, **found, **rows)
 
 
-def _part(folder: Path, frames: int) -> Path:
-    """Where the poses up to this many frames stand, since the part before."""
-    return folder / f"poses_{frames:06d}.npz"
-
-
 def _parts(folder: Path) -> list[Path]:
-    """All of them, in order."""
+    """The files of poses, in order."""
     return sorted(folder.glob("poses_*.npz"))
 
 
@@ -91,13 +83,7 @@ def _frames_of(part: Path) -> int:
 
 
 def _saved_poses(folder: Path, frames: int, like: Pose) -> list[Pose]:
-    """The poses after the first one. Parts that were written after the state are from an earlier run.
-
-    Args:
-        folder: RUN/resume.
-        frames: that were tracked.
-        like: a pose on the host.
-    """
+    """The poses after the first one. Files written after the state are from an earlier run."""
     poses = []
     for path in _parts(folder):
         if _frames_of(path) <= frames:

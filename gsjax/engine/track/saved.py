@@ -1,4 +1,4 @@
-"""A run folder read back: the scene, where it went, and the recording that it came from."""
+"""A run of `gsjax track` read back: the scene, its motion, and the recording that it was tracked in."""
 
 import json
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class SavedRun:
     Attributes:
         path: the folder.
         tracking: the scene and its poses; parts of one object are one group here.
-        recording: the same frames and cameras as then.
+        recording: the same frames and cameras as when it was tracked.
         mask_camera: id of the camera whose first mask named the objects; the first tracked one if none did.
-        names: of each object, by its group, 1 to K.
+        names: name of each object, by its group, 1 to K.
     """
 
     path: Path
@@ -35,7 +35,7 @@ class SavedRun:
     names: dict[int, str]
 
     def seen_by(self, camera: int | None) -> Recording:
-        """The recording with one camera only; the first held out one, else the first tracked, by default.
+        """The recording with one camera only; default: the first held-out one, else the first tracked.
 
         Raises:
             ValueError: the run had no such camera.
@@ -50,7 +50,7 @@ def open_run(path: Path) -> SavedRun:
 
     Raises:
         FileNotFoundError: there is no such folder, it is no run's, or a file of it is missing.
-        ValueError: a file holds something else than a run writes, or its recording cannot be opened.
+        ValueError: a file is not as the run wrote it, or its recording cannot be opened.
     """
     expect_run(path, made_by="`gsjax track`")
     missing = [n for n in ("trajectory.npz", "scene.ply", "metrics.json") if not (path / n).is_file()]
@@ -62,16 +62,15 @@ def open_run(path: Path) -> SavedRun:
         found = f"{recording.tracked.num_frames} frames where the run has {tracking.num_frames}"
         raise ValueError(f"{path}: expected its recording as it was, found {found}; restore it, or {_AGAIN}")
     camera, names = _read_metrics(path / "metrics.json", tracking.scene)
-    if camera is None:
-        camera = recording.tracked.camera_ids[0]
-    return SavedRun(path, tracking, recording, camera, names)
+    first = recording.tracked.camera_ids[0]
+    return SavedRun(path, tracking, recording, first if camera is None else camera, names)
 
 
 def read_tracking(path: Path) -> Tracking:
     """The scene of scene.ply with the poses of trajectory.npz.
 
     Raises:
-        ValueError: they do not fit each other, or one of them is something else.
+        ValueError: they do not match, or one of them cannot be read.
     """
     wanted = ("means", "quats", "normals", "labels", "label_ids", "lost", "turn_known")
     arrays = read_arrays(path / "trajectory.npz", wanted, _AGAIN)
@@ -94,8 +93,8 @@ def read_tracking(path: Path) -> Tracking:
 
 
 def _read_metrics(file: Path, scene: TrackedScene) -> tuple[int | None, dict[int, str]]:
-    """The camera whose mask named the objects, and the names that the recording has for its labels; those
-    of the segmenter have none."""
+    """The camera whose mask named the objects, and the name of each group; labels of the segmenter have no
+    name in the recording."""
     try:
         metrics = json.loads(file.read_text(encoding="utf-8"))
         camera, source = metrics["mask"]["camera"], metrics["mask"]["source"]

@@ -1,4 +1,4 @@
-"""Scores of a run, added up view by view so that memory stays flat, and the metrics that come of them."""
+"""Scores of a tracked recording, for its metrics.json."""
 
 from typing import Any
 
@@ -6,22 +6,21 @@ import numpy as np
 from jaxtyping import Bool
 
 from gsjax.engine.recording import FirstMask, Recording, label_names
-from gsjax.engine.scores import Scores, camera_metrics, motion_metrics
+from gsjax.engine.scores import Scores, camera_metrics, motion_metrics, true_labels_at
 from gsjax.engine.track.loop import Tracking
 from gsjax.methods.track.budget import Chosen
-from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
+from gsjax.metrics.tracking import ObjectScore, score_tracks
 
 
 def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> np.ndarray | None:
     """The mask value in the data's files that each group stands for, [K+1]; None if there are no files.
 
-    Groups of the segmenter stand for the value that most of their pixels have in the file's first mask.
+    A group of the segmenter stands for the value that most of its pixels have in the file's first mask.
     """
     values = np.asarray(tracking.scene.label_ids)
     if mask.source != "segment":
         return values
-    c = recording.tracked.camera_ids.index(mask.camera)
-    files = recording.tracked.mask(0, c)
+    files = recording.tracked.mask(0, recording.tracked.camera_ids.index(mask.camera))
     if files is None or mask.labels is None:
         return None
     matched = [0]
@@ -31,26 +30,23 @@ def group_values(tracking: Tracking, mask: FirstMask, recording: Recording) -> n
     return np.asarray(matched)
 
 
+def labels_of_groups(tracking: Tracking, values: np.ndarray | None) -> np.ndarray:
+    """The label of each group of a tracking, [K+1]: its value from `group_values`, or if that is None the
+    segmenter's own."""
+    return np.asarray(tracking.scene.label_ids) if values is None else values
+
+
 def score_motion(tracking: Tracking, recording: Recording) -> dict[int, ObjectScore]:
-    """How each object of the truth was followed, by its mask value; empty without truth, depth or masks."""
+    """How well the motion of each object of the truth was followed, by its mask value; empty without truth,
+    depth or masks."""
     sequence = recording.tracked
     truth = sequence.truth
     if truth is None or not (sequence.has_masks and sequence.has_depth) or tracking.num_frames < 2:
-        return {}  # the first frame is what errors are counted from
-    seen = [(sequence.mask(0, c), sequence.depth(0, c), c) for c in range(sequence.num_cameras)]
-    seen = [(mask, depth, c) for mask, depth, c in seen if mask is not None and depth is not None]
-    if not seen:
+        return {}  # errors are relative to the first frame
+    means, poses = tracking.means(), truth.poses[: tracking.num_frames]
+    labels = true_labels_at(sequence, 0, means[0])
+    if labels is None:
         return {}
-    masks, depths, cameras = zip(*seen, strict=True)
-    means = tracking.means()
-    labels = true_labels(
-        means[0],
-        masks,
-        depths,
-        [sequence.viewmats[0, c] for c in cameras],
-        [sequence.Ks[0, c] for c in cameras],
-    )
-    poses = truth.poses[: tracking.num_frames]
     return score_tracks(means, labels, {int(k): poses[:, i] for i, k in enumerate(truth.label_ids)})
 
 
@@ -67,25 +63,38 @@ def metrics(
 
     Args:
         tracking: the scene and its poses.
-        recording: what judges.
-        mask: the first one.
-        scores: of views.
-        motion: of objects, by mask value.
+        recording: the recording, with its truth.
+        mask: the first mask.
+        scores: those of views.
+        motion: those of objects, by mask value.
         values: the mask value of each group, [K+1], or None.
     """
-    names = object_names(tracking, recording, mask, values)
-    motion = {label: score for label, score in motion.items() if _members(tracking, values, label).any()}
-    objects = {
-        name: {
+    names = object_names(tracking, recording, values)
+    ids, label_ids = labels_of_groups(tracking, values), np.asarray(tracking.scene.label_ids)
+    groups, means = np.asarray(tracking.scene.labels), tracking.means()
+    objects = {}
+    for label, name in names.items():
+        members = np.isin(groups, np.flatnonzero(ids == label))
+        is_tracked, pixels = members.any(), None
+        if mask.labels is not None:
+            own = [label] if mask.source == "files" or values is None else label_ids[ids == label]
+            pixels = int(np.isin(mask.labels, own).sum())
+        centroids = means[:, members].mean(axis=1) if is_tracked else None
+        objects[name] = {
             "label": label,
-            "gaussians": _count_gaussians(tracking, values, label),
-            "mask_pixels": _pixels(mask, tracking, values, label),
-            "travelled_mm": _travelled_mm(tracking, values, label),
-            "frames_lost": _frames_lost(tracking, values, label),
+            "gaussians": int(members.sum()),
+            "mask_pixels": pixels,
+            "travelled_mm": None
+            if centroids is None
+            else 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max()),
+            "frames_lost": int(lost_over_frames(tracking, values, label).sum()) if is_tracked else None,
             "turn_unknown_from": turn_unknown_from(tracking, values, label),
-            **motion_metrics(motion.get(label)),
+            **motion_metrics(motion.get(label) if is_tracked else None),
         }
+    followed = {
+        name: motion[label].centroid_errors_mm
         for label, name in names.items()
+        if label in motion and objects[name]["gaussians"]
     }
     return {
         "objects": objects,
@@ -94,15 +103,13 @@ def metrics(
         **camera_metrics(scores),
         "over_frames": {
             "psnr": {str(camera): found.values["psnr"] for camera, found in scores.cameras.items()},
-            "centroid_error_mm": {
-                names[label]: score.centroid_errors_mm for label, score in motion.items() if label in names
-            },
+            "centroid_error_mm": followed,
         },
     }
 
 
 def budget_metrics(chosen: Chosen) -> dict[str, Any]:
-    """What was chosen for a budget, and why, for metrics.json."""
+    """The settings chosen for a budget, and the measured costs, for metrics.json."""
     tried = {
         name: {"base_ms": 1e3 * costs.base, "each_search_ms": 1e3 * costs.search}
         for name, costs in chosen.tried.items()
@@ -110,17 +117,17 @@ def budget_metrics(chosen: Chosen) -> dict[str, Any]:
     return {"chosen": chosen.name, "fits": chosen.fits, "measured": tried}
 
 
-def object_names(
-    tracking: Tracking, recording: Recording, mask: FirstMask, values: np.ndarray | None
-) -> dict[int, str]:
-    """The name of each object that is tracked or in the truth, by mask value, background left out."""
-    known = label_names(recording, "files")
-    ids = tracking.scene.label_ids if values is None else values.tolist()
-    labels = sorted({*ids, *(known if values is not None else {})} - {0})
-    return {
-        label: known.get(label, f"object {label}") if values is not None else f"object {label}"
-        for label in labels
-    }
+def object_names(tracking: Tracking, recording: Recording, values: np.ndarray | None) -> dict[int, str]:
+    """The name of each object that is tracked or in the truth, by label, background left out.
+
+    Args:
+        tracking: the scene.
+        recording: the recording, with the names of its mask values.
+        values: the mask value of each group, [K+1], or None.
+    """
+    known = {} if values is None else label_names(recording, "files")
+    labels = sorted({*labels_of_groups(tracking, values).tolist(), *known} - {0})
+    return {label: known.get(label, f"object {label}") for label in labels}
 
 
 def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, float]:
@@ -128,34 +135,10 @@ def _iou(scores: Scores, names: dict[int, str], held_out: bool) -> dict[str, flo
     return {name: overlap.iou(label) for label, name in names.items() if label in overlap.labels}
 
 
-def _members(tracking: Tracking, values: np.ndarray | None, label: int) -> np.ndarray:
-    """Which Gaussians the tracker takes for the object."""
-    ids = np.asarray(tracking.scene.label_ids) if values is None else values
-    return np.isin(np.asarray(tracking.scene.labels), np.flatnonzero(ids == label))
-
-
-def _count_gaussians(tracking: Tracking, values: np.ndarray | None, label: int) -> int:
-    return int(_members(tracking, values, label).sum())
-
-
-def _travelled_mm(tracking: Tracking, values: np.ndarray | None, label: int) -> float | None:
-    """How far the tracker moved the object's centroid from where it was first, at most."""
-    members = _members(tracking, values, label)
-    if not members.any():
-        return None
-    centroids = tracking.means()[:, members].mean(axis=1)
-    return 1e3 * float(np.linalg.norm(centroids - centroids[0], axis=-1).max())
-
-
-def _frames_lost(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
-    lost = lost_over_frames(tracking, values, label)
-    return int(lost.sum()) if _members(tracking, values, label).any() else None
-
-
 def lost_over_frames(
     tracking: Tracking, values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates"]:
-    """In which updates the tracker held the object, or a part of it, for lost.
+    """In which updates the tracker took the object, or a part of it, for lost.
 
     Args:
         tracking: the scene and the tracker's flags.
@@ -166,7 +149,7 @@ def lost_over_frames(
 
 
 def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> Bool[np.ndarray, "updates"]:
-    """After which updates the tracker did not know how the object, or a part of it, is turned.
+    """After which updates the tracker did not know the rotation of the object, or of a part of it.
 
     Args:
         tracking, values, label: as for `lost_over_frames`.
@@ -175,8 +158,8 @@ def turn_unknown(tracking: Tracking, values: np.ndarray | None, label: int) -> B
 
 
 def turn_unknown_from(tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
-    """The frame from which on, to the end, the tracker did not know how the object is turned, lost or not;
-    None if it knew at the end.
+    """The frame from which on, to the end, the tracker did not know the object's rotation, lost or not; None
+    if it knew it at the end.
 
     Args:
         tracking, values, label: as for `lost_over_frames`.
@@ -190,13 +173,5 @@ def _of_object(
     tracking: Tracking, flags: list[np.ndarray], values: np.ndarray | None, label: int
 ) -> Bool[np.ndarray, "updates parts"]:
     """The flags of one object's groups."""
-    ids = np.asarray(tracking.scene.label_ids) if values is None else values
+    ids = labels_of_groups(tracking, values)
     return np.asarray(flags, bool).reshape(len(flags), len(ids) - 1)[:, ids[1:] == label]
-
-
-def _pixels(mask: FirstMask, tracking: Tracking, values: np.ndarray | None, label: int) -> int | None:
-    if mask.labels is None:
-        return None
-    ids = np.asarray(tracking.scene.label_ids)
-    own = ids[values == label] if values is not None else [label]
-    return int(np.isin(mask.labels, [label] if mask.source == "files" else own).sum())

@@ -19,7 +19,6 @@ from gsjax.viz.viewer.viewable import Answer, Asking, Showing, Viewable, redone
 _TYPED_S = 0.7  # since the last key press
 _SETTLE_S, _PATIENCE_S = 0.05, 0.3  # delays while the threshold slides
 _SHADE = 0.35  # brightness of Gaussians below the threshold
-_RED, _GREEN = "#ff6b6b", "#51cf66"
 _HEAT, _ONLY, _WITHOUT, _SCENE = get_args(Showing)
 _PICK_FIRST = "pick something first: click on it in the view"
 _ASK_FIRST = "enter a query first"
@@ -58,7 +57,7 @@ class AskFolder:
             like = gui.add_button(
                 "Find similar to the pick", color="gray", hint="Click on something in the view first"
             )
-            self._status = gui.add_html(markup.as_lines([asking.hint]))
+            self._status = gui.add_html(markup.as_lines(asking.hint))
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5)
             self._showing = gui.add_dropdown("Shows", get_args(Showing))
             self._count = gui.add_html("")
@@ -93,18 +92,18 @@ class AskFolder:
         """Ask and show the heat of the answer, unless a newer query arrived meanwhile; runs in its own thread
         or in one of viser's."""
         if ask is None:
-            self._status.content = markup.as_lines([otherwise], _RED)
+            self._status.content = markup.as_lines(otherwise, color=markup.RED)
             return
         with self._lock:
             self._num_queries += 1
             number = self._num_queries
-            self._status.content = markup.as_lines(["asking ..."])
+            self._status.content = markup.as_lines("asking ...")
         try:
             found = ask()
         except Exception as error:  # would otherwise go unnoticed
             with self._lock:
                 if number == self._num_queries:
-                    self._status.content = markup.as_lines([f"{error}"], _RED)
+                    self._status.content = markup.as_lines(f"{error}", color=markup.RED)
             return
         with self._lock:
             if number == self._num_queries:
@@ -112,15 +111,12 @@ class AskFolder:
 
     def _accept(self, found: Answer) -> None:
         """Replace the previous answer."""
-        low, high = (
-            float(np.floor(100 * found.scores.min()) / 100),
-            float(np.ceil(100 * found.scores.max()) / 100),
-        )
-        self._threshold.min, self._threshold.max = low, max(high, low + 0.01)
-        self._found = found
-        self._threshold.value = float(np.clip(found.threshold, low, max(high, low + 0.01)))
+        low = float(np.floor(100 * found.scores.min()) / 100)
+        high = max(float(np.ceil(100 * found.scores.max()) / 100), low + 0.01)
+        self._threshold.min, self._threshold.max, self._found = low, high, found
+        self._threshold.value = float(np.clip(found.threshold, low, high))
         self._status.content = markup.as_lines(
-            [f"{found.what}, in {1e3 * found.seconds:.0f} ms ({found.rule})"], _GREEN
+            f"{found.what}, in {1e3 * found.seconds:.0f} ms ({found.rule})", color=markup.GREEN
         )
         if self._showing.value == _SCENE:
             self._showing.value = _HEAT
@@ -138,7 +134,7 @@ class AskFolder:
             return
         try:
             selected = self._selected(found)
-            self._count.content = markup.as_lines([f"{selected.sum():,} of {len(selected):,} Gaussians"])
+            self._count.content = markup.as_lines(f"{selected.sum():,} of {len(selected):,} Gaussians")
             if showing == _SCENE:
                 self._rows = None
                 self._show(None)
@@ -149,17 +145,17 @@ class AskFolder:
             else:
                 kept = selected if showing == _ONLY else ~selected
                 if not kept.any():
-                    self._count.content = markup.as_lines(["nothing is left to show"], _RED)
+                    self._count.content = markup.as_lines("nothing is left to show", color=markup.RED)
                     return
                 self._rows = np.flatnonzero(kept)
                 self._show(redone(self._scene, lambda gaussians: gaussians, kept))
         except Exception as error:  # runs in its own thread, where an exception would go unnoticed
-            self._count.content = markup.as_lines([f"{error}"], _RED)
+            self._count.content = markup.as_lines(f"{error}", color=markup.RED)
 
     def _save_part(self, which: str) -> None:
         """Save a part of the scene; runs in one of viser's threads."""
         if self._found is None:
-            self._save_status.content = markup.as_lines([_ASK_FIRST], _RED)
+            self._save_status.content = markup.as_lines(_ASK_FIRST, color=markup.RED)
             return
         try:
             selected = self._selected(self._found)
@@ -167,9 +163,9 @@ class AskFolder:
             if not selected.any():
                 raise ValueError("nothing is left to save")
             path = self._asking.save(selected, f"{self._found.what} {which}", self._frame())
-            self._save_status.content = markup.as_lines([f"saved as {path}"], _GREEN)
+            self._save_status.content = markup.as_lines(f"saved as {path}", color=markup.GREEN)
         except Exception as error:  # would otherwise go unnoticed
-            self._save_status.content = markup.as_lines([f"{error}"], _RED)
+            self._save_status.content = markup.as_lines(f"{error}", color=markup.RED)
 
 
 def heat_of(gaussians: Gaussians, found: Answer, selected: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jaxtyping import Float, UInt8
 from gsjax.geometry.cameras import Camera
 from gsjax.geometry.spherical_harmonics import rgb_to_sh0
 from gsjax.scene.gaussians import Gaussians
-from gsjax.scene.render import plan_render, render
+from gsjax.scene.render import plan_render, render, with_room
 from gsjax.viz.colors import colorize_depth, to_uint8
 
 Shown = Literal["colour", "depth", "alpha", "label", "features"]
@@ -73,16 +74,10 @@ class Drawer:
             slots = min((known for known in plans if known >= count), default=grown)
             gaussians, plan = _padded(gaussians, slots), plans.get(slots)
             if plan is None:
-                options = {"headroom": _HEADROOM, "rasterize_mode": self._mode}
-                plan = plan_render(gaussians, camera, **options)
-            while True:
-                *images, overflow, needed = jax.device_get(
-                    self._program(gaussians, camera, self._background, plan)
-                )
-                if not overflow:
-                    plans[slots] = plan
-                    return Drawn(*images)
-                plan = plan.grown(int(needed), _HEADROOM)
+                plan = plan_render(gaussians, camera, headroom=_HEADROOM, rasterize_mode=self._mode)
+            draw = partial(self._program, gaussians, camera, self._background)
+            drawn, plans[slots] = with_room(draw, plan, _HEADROOM)
+            return jax.device_get(drawn)
 
 
 def _padded(gaussians: Gaussians, slots: int) -> Gaussians:
@@ -95,11 +90,11 @@ def _padded(gaussians: Gaussians, slots: int) -> Gaussians:
     return jax.tree.map(jnp.asarray, more)
 
 
-def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any) -> tuple[jax.Array, ...]:
+def _draw(gaussians: Gaussians, camera: Camera, background: jax.Array, plan: Any) -> tuple[Drawn, Any]:
     drawn = render(gaussians, camera, plan, backgrounds=background)
     alphas = drawn.alphas[0]
     depths = jnp.where(alphas > _OPAQUE, drawn.depths[0], 0.0)
-    return drawn.colors[0], depths, alphas, drawn.meta.overflow.any(), drawn.meta.needed.max()
+    return Drawn(drawn.colors[0], depths, alphas), drawn.meta._replace(features=None)
 
 
 def recolored(gaussians: Gaussians, colors: Float[np.ndarray, "n 3"]) -> Gaussians:

@@ -10,7 +10,6 @@ from gsjax.viz.viewer.debounce import Debouncer
 from gsjax.viz.viewer.viewable import Editing, Viewable
 
 _SETTLE_S = 0.5  # since the last key press
-_RED, _AMBER, _GREEN = "#ff6b6b", "#f5b041", "#51cf66"
 _HOW = "One edit per line, applied in order; a # before a line disables it"
 
 
@@ -84,35 +83,35 @@ class EditFolder:
         if lines == self._previewed:
             return
         self._previewed = lines
-        self._status.content = markup.as_lines(["editing ..."])
+        self._status.content = markup.as_lines("editing ...")
         try:
             found = self._editing.preview(lines) if lines else None
             self._show(None if found is None else found.scene)
         except Exception as error:  # runs in its own thread, where an exception would go unnoticed
-            self._status.content = markup.as_lines([f"{error}"], _RED)
+            self._status.content = markup.as_lines(f"{error}", color=markup.RED)
             return
         doubts = [] if found is None else found.doubts
         summary = [] if found is None else [markup.film_summary(found.scene)]
-        self._status.content = markup.as_lines(summary, _GREEN) + markup.as_lines(doubts, _AMBER)
+        self._status.content = markup.as_lines(*summary, color=markup.GREEN) + markup.as_lines(
+            *doubts, color=markup.AMBER
+        )
 
     def _save_film(self) -> None:
         """Save the film that the list describes; runs in one of viser's threads."""
         if not self._filming.acquire(blocking=False):
-            self._save_status.content = markup.as_lines(
-                ["one film at a time: wait until the current one is saved"]
-            )
+            self._save_status.content = markup.as_lines("one film at a time: wait until this one is saved")
             return
         try:
             self._save_button.disabled, self._progress.value, self._progress.visible = True, 0, True
-            self._save_status.content = markup.as_lines(["filming ..."])
+            self._save_status.content = markup.as_lines("filming ...")
             lines = self._lines()
             if not lines:
                 raise ValueError("expected edits in the list, found none; add one")
             name, camera = self._name.value.strip(), self._camera.value
             path = self._editing.save(lines, name, camera, self._report_progress)
-            self._save_status.content = markup.as_lines([f"saved as {path}"], _GREEN)
+            self._save_status.content = markup.as_lines(f"saved as {path}", color=markup.GREEN)
         except Exception as error:  # would otherwise go unnoticed
-            self._save_status.content = markup.as_lines([f"{error}"], _RED)
+            self._save_status.content = markup.as_lines(f"{error}", color=markup.RED)
         finally:
             self._save_button.disabled = self._progress.visible = False
             self._filming.release()

@@ -16,22 +16,21 @@ _MOST_NAMES = 24
 
 
 def heading(scene: Viewable, sent: int) -> str:
-    """A short description of the scene.
-
-    Args:
-        scene: the scene that is shown.
-        sent: number of Gaussians sent to the browser.
-    """
+    """A short description of a scene of which `sent` Gaussians are sent to the browser."""
     count = scene.gaussians.num
-    facts = [f"**{count:,}** Gaussians", f"SH degree {scene.gaussians.sh_degree}"]
-    if scene.num_frames > 1:
-        facts.append(f"{scene.num_frames} frames")
-    if scene.shots is not None:
-        facts.append(f"{len(scene.shots.names)} {'cameras' if scene.num_frames > 1 else 'photographs'}")
-    lines = [", ".join(facts) + "."]
+    lines = [", ".join([f"**{count:,}** Gaussians", *contents(scene)]) + "."]
     if sent < count:
         lines.append(f"The view shows the {sent:,} most opaque of them; the render shows all.")
     return " ".join(lines) + "\n\nDrag to rotate, right-drag to pan, scroll to zoom."
+
+
+def contents(scene: Viewable) -> list[str]:
+    """The contents of a scene besides its number of Gaussians."""
+    moves = scene.num_frames > 1
+    facts = [f"SH degree {scene.gaussians.sh_degree}", *([f"{scene.num_frames} frames"] if moves else [])]
+    if scene.shots is not None:
+        facts.append(f"{len(scene.shots.names)} {'cameras' if moves else 'photographs'}")
+    return facts
 
 
 def format_length(value: float, unit: str) -> str:
@@ -107,12 +106,16 @@ def legend(
 
 def _chip(label: int, scene: Viewable) -> str:
     color = "rgb({}, {}, {})".format(*(label_color(label) if label >= 0 else (38, 40, 44)))
-    name = scene.names.get(label, "background" if label == 0 else f"object {label}")
+    name = scene.name_of_label(label)
     dot = f'<span style="color: {color}; font-size: 1.3em; vertical-align: -0.08em">&#9679;</span>'
     return f'<span style="white-space: nowrap; margin-right: 0.5em">{dot} {html.escape(name)}</span>'
 
 
-def as_lines(sentences: Sequence[str], color: str = "inherit") -> str:
+RED, AMBER, GREEN = "#ff6b6b", "#f5b041", "#51cf66"
+"""Colours of errors, warnings and successes."""
+
+
+def as_lines(*sentences: str, color: str = "inherit") -> str:
     """Sentences as HTML, one per line."""
     return _small("".join(f'<div style="color: {color}">{html.escape(line)}</div>' for line in sentences))
 

@@ -126,8 +126,15 @@ class Page:
             self._edits = EditFolder(gui, scene.editing, self._show, shared.closing, shared.filming)
         self._questions = None
         if scene.asking is not None and self._edits is None:
-            touched = (self._show, self._picked_row, lambda: self._frame, self._in_colour)
-            self._questions = AskFolder(gui, scene, scene.asking, *touched)
+            self._questions = AskFolder(
+                gui,
+                scene,
+                scene.asking,
+                show=self._show,
+                picked=lambda: None if self._picked is None else self._picked.index,
+                frame=lambda: self._frame,
+                in_colour=lambda: setattr(self._coloring, "value", "colour"),
+            )
         with gui.add_folder("View (splats, drawn by the browser)"):
             self._coloring = gui.add_dropdown("Colour by", scene.colorings)
             self._legend = gui.add_html("", visible=False)
@@ -163,7 +170,7 @@ class Page:
             frustums = gui.add_checkbox("Show where they were taken", False)
             self._visited = gui.add_dropdown("Look from", ("...", *self._names))
             frustums.on_update(lambda _: nodes.show(frustums.value, self._frame))
-            self._visited.on_update(lambda _: self._visit_named(self._visited.value))
+            self._visited.on_update(lambda _: self._visit(self._visited.value))
 
     def _frusta(self, shots: Shots) -> ShotNodes:
         self._names = unique(shots.names)
@@ -211,12 +218,6 @@ class Page:
             self._mark(None)
             self._picked_info.content = markup.HOW_TO_PICK
 
-    def _picked_row(self) -> int | None:
-        return None if self._picked is None else self._picked.index
-
-    def _in_colour(self) -> None:
-        self._coloring.value = "colour"
-
     def _step(self) -> None:
         """Go to the next frame, or from the last to the first."""
         self._slider.value = (int(self._slider.value) + 1) % self._now.scene.num_frames
@@ -224,14 +225,13 @@ class Page:
     def _label_play(self, plays: bool) -> None:
         self._play.label = "Stop" if plays else "Play"
 
-    def _visit_named(self, name: str) -> None:
+    def _visit(self, name: str) -> None:
+        """Move the camera to where a photograph was taken; `_render` then shows the photograph too."""
         now = self._current()
-        if now.scene.shots is not None and name in self._names:
-            self._visit(now, now.scene.shots, self._names.index(name))
-
-    def _visit(self, now: Displayed, shots: Shots, shot: int) -> None:
-        """Move the camera to where a photograph was taken; `_render` then shows the photograph beside."""
-        self._shot = shot
+        shots = now.scene.shots
+        if shots is None or name not in self._names:
+            return
+        self._shot = shot = self._names.index(name)
         distance = distance_along(now.gaussians, shots.viewmats[shots.at(now.frame), shot])
         self._go(pose_of(shots, now.frame, shot, distance))
         self._renderer.request()

@@ -10,6 +10,7 @@ from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.scene.gaussians import Gaussians
 
 _FAINTEST, _FULL = 1 / 255, 0.99  # the rasterizer's alpha_min and alpha_max
+_NEAR, _LEAST = 0.01, 0.5  # nearer Gaussians are ignored; a ray with less total alpha hits nothing
 
 
 class Picked(NamedTuple):
@@ -34,9 +35,6 @@ def pick(
     gaussians: Gaussians,
     origin: Float[np.ndarray, "3"],
     direction: Float[np.ndarray, "3"],
-    *,
-    least: float = 0.5,
-    near: float = 0.01,
 ) -> Picked | None:
     """The Gaussian that contributes most of the colour along a ray; None if the ray passes through.
 
@@ -48,8 +46,6 @@ def pick(
         gaussians: N Gaussians.
         origin: origin of the ray, in the world.
         direction: direction of the ray, of any length but 0.
-        least: a ray whose total alpha is lower hits nothing.
-        near: Gaussians nearer than this are ignored.
 
     Raises:
         ValueError: `direction` has no length.
@@ -67,11 +63,11 @@ def pick(
     depths = -np.sum(start * along, axis=1) / np.sum(along * along, axis=1)
     squared = np.sum((start + depths[:, None] * along) ** 2, axis=1)
     alphas = np.minimum(np.asarray(gaussians.opacities, np.float64) * np.exp(-squared / 2), _FULL)
-    met = np.flatnonzero((depths > near) & (alphas >= _FAINTEST))
+    met = np.flatnonzero((depths > _NEAR) & (alphas >= _FAINTEST))
     met = met[np.argsort(depths[met], kind="stable")]
     through = np.concatenate([[1.0], np.cumprod(1 - alphas[met])])
     stopped = 1 - through[-1]
-    if stopped < least:
+    if stopped < _LEAST:
         return None
     shares = alphas[met] * through[:-1]
     best = int(shares.argmax())

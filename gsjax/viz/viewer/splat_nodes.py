@@ -73,13 +73,18 @@ class SplatNodes:
         if now.scene is not self._scene:
             self._begin(now.scene)
         for name, rows in self._rows.items():
-            if len(rows) == 0:
-                self._remove(name)
-            elif not self._has(name, now.frame, look):
-                part = splats(rows_of(now.gaussians, rows), self._scale)
+            if len(rows) == 0 and name in self._nodes:
+                self._nodes.pop(name).remove()
+            elif len(rows) and not self._has(name, now.frame, look):
+                centers, covariances, opacities = splats(rows_of(now.gaussians, rows), self._scale)
                 means = np.asarray(now.gaussians.means)
                 colors = now.palette(look.coloring, means, rows, look.viewmat, look.depths)
-                self._send(name, part.centers, part.covariances, colors, part.opacities)
+                arrays = (centers, covariances, colors, opacities)
+                if name in self._nodes:
+                    self._nodes[name].set_gaussians(*arrays)
+                else:
+                    add = self._api.add_gaussian_splats
+                    self._nodes[name] = add(f"/splats/{name}", *arrays, scale=self._scale)
                 self._sent[name] = (now.frame, look)
 
     def _begin(self, scene: Viewable) -> None:
@@ -91,27 +96,8 @@ class SplatNodes:
         }
         self._sent: dict[str, tuple[int, Appearance]] = {}
 
-    def _remove(self, name: str) -> None:
-        if name in self._nodes:
-            self._nodes.pop(name).remove()
-
     def _has(self, name: str, frame: int, look: Appearance) -> bool:
         if name not in self._sent:
             return False
         then, colored = self._sent[name]
         return look.same_as(colored) and (name == "still" or then == frame)
-
-    def _send(
-        self,
-        name: str,
-        centers: Float[np.ndarray, "n 3"],
-        covariances: Float[np.ndarray, "n 3 3"],
-        colors: Float[np.ndarray, "n 3"],
-        opacities: Float[np.ndarray, "n 1"],
-    ) -> None:
-        if name in self._nodes:
-            self._nodes[name].set_gaussians(centers, covariances, colors, opacities)
-        else:
-            self._nodes[name] = self._api.add_gaussian_splats(
-                f"/splats/{name}", centers, covariances, colors, opacities, scale=self._scale
-            )

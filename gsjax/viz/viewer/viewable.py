@@ -235,7 +235,10 @@ class Viewable:
         """Name of the object that a Gaussian belongs to; None without labels."""
         if self.labels is None:
             return None
-        label = int(self.labels[index])
+        return self.name_of_label(int(self.labels[index]))
+
+    def name_of_label(self, label: int) -> str:
+        """Name of a label."""
         return self.names.get(label, "background" if label == 0 else f"object {label}")
 
 

@@ -59,7 +59,7 @@ def test_photographs_are_where_they_are_said_to_be(gsjax, field, pristine, scene
     code, said = gsjax("query", field, "can")
     assert code == 0, said
     assert "its photographs cannot be read, so nothing is drawn" in said
-    assert "--images says where they are now" in said
+    assert "--images gives their present path" in said
     assert not (field / "query" / "masks").exists()
     for options in (("can",), ("--point", "1,1")):
         code, said = gsjax("query", field, *options, "--camera", 0)
@@ -120,7 +120,7 @@ def test_a_folder_of_somebody_else_is_left_alone(gsjax, field, tmp_path):
     (mine / "query" / "precious.txt").write_text("mine")
     code, said = gsjax("query", mine, "can")
     assert code == 2
-    assert "query: expected what gsjax writes there or nothing" in said
+    assert "query: expected nothing, or only what gsjax writes there" in said
     assert "found precious.txt" in said
     assert (mine / "query" / "precious.txt").read_text() == "mine"
     (mine / "query" / "precious.txt").rename(mine / "precious.txt")

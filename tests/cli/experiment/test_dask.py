@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_what_is_done_on_a_cluster_too(toy, gsjax):
     os.killpg(going.pid, signal.SIGINT)  # as a terminal does it: to all of them
     _, err = going.communicate(timeout=60)
     assert going.returncode == 130, err
-    assert "stopped: by Ctrl-C after 1 of 3 cells; the same command goes on from there" in err
+    assert "stopped: by Ctrl-C after 1 of 3 cells; the same command continues from there" in err
     assert "Traceback" not in err
     assert len(cell_files()) == 1
 
@@ -240,11 +240,11 @@ def test_a_job_of_slurm_is_one_worker_with_all_its_cores(defaults):
         ),
         (
             ("--executor", "dask", "--scheduler", "tcp://nowhere:1", "--workers", "2"),
-            "--workers: expected none given, for tcp://nowhere:1 has its own, found 2",
+            "--workers: expected none, because tcp://nowhere:1 has its own, found 2",
         ),
         (
             ("--executor", "dask", "--scheduler", "slurm"),
-            "--workers: expected how many jobs to submit to SLURM, found none given",
+            "--workers: expected the number of jobs to submit to SLURM, found none",
         ),
         (
             ("--executor", "dask", "--scheduler", "slurm", "--workers", "2"),

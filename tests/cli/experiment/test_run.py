@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gsjax.cli import main
-from gsjax.cli.experiment import choose
+from gsjax.engine.experiments.run import choose
 from gsjax.engine.experiments.sweep import Cell, read_experiment
 from tests.cli.experiment.toys import calls, cell_files, markdown_table, results, stopping
 
@@ -61,7 +61,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(toy, gsjax):
     Path("stop").touch()
     code, _, err = gsjax("run", "toy")
     assert code == 130
-    assert "stopped: by Ctrl-C after 2 of 4 cells; the same command goes on from there" in err
+    assert "stopped: by Ctrl-C after 2 of 4 cells; the same command continues from there" in err
     assert len(cell_files()) == 2
     assert not (folder / "results.json").exists()
     Path("stop").unlink()

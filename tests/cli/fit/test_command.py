@@ -20,7 +20,7 @@ from gsjax.cli import main
 from gsjax.data.video import describe_video
 from gsjax.engine.drive import Tick
 from gsjax.engine.fit.ablation import ablate_time
-from gsjax.engine.fit.schedule import Budget, Looks
+from gsjax.engine.fit.schedule import Budget, Evaluation
 from gsjax.engine.progress import Progress
 from gsjax.io.ply import read_ply
 from gsjax.methods.fit import PRESETS, Fit
@@ -103,7 +103,7 @@ def test_a_run_from_photographs_to_a_report_and_one_that_was_stopped(gsjax_fit, 
     assert "was begun with fit.seed 0, now it is 5. Give the same" in " ".join(said.split())
     code, said = gsjax_fit(*QUICK, name="stopped")
     assert code == 2
-    assert "an unfinished run; go on with it by --resume" in " ".join(said.split())
+    assert "an unfinished run; continue it with --resume" in " ".join(said.split())
     code, said = gsjax_fit(*QUICK, "--resume", name="stopped")
     assert code == 0, said
     assert "Resumed after 14 steps" in json.dumps(
@@ -186,7 +186,7 @@ def test_minutes_of_which_compiling_took_most(gsjax_fit, tmp_path):
     ("module", "what", "lacks"),
     [
         (gsjax.engine.fit.judge, "write_panel", "scoring"),
-        (gsjax.engine.fit.run, "ablate", "looking at"),
+        (gsjax.engine.fit.run, "ablate", "ablating"),
         (gsjax.engine.fit.run, "write_orbit", "drawing a video"),
     ],
 )
@@ -243,7 +243,7 @@ def test_it_stops_when_held_out_views_are_seen_as_well_as_asked(gsjax_fit, tmp_p
 def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypatch):
     """On the way a few are looked at, which may be easy ones."""
     monkeypatch.setattr(
-        Looks, "__call__", lambda self, now: {"test_psnr": 99.0} if now.step % 8 == 0 else None
+        Evaluation, "__call__", lambda self, now: {"test_psnr": 99.0} if now.step % 8 == 0 else None
     )
     code, said = gsjax_fit(*QUICK, "--until-psnr", "90")
     assert code == 0, said
@@ -255,7 +255,7 @@ def test_it_stops_only_when_all_held_out_views_are(gsjax_fit, tmp_path, monkeypa
     [
         (("--scale", "0"), "--scale: expected above 0"),
         (("--scale", "0.1"), "--scale 0.1: a photograph of 48x36 would be 5x4; expected 8 pixels"),
-        (("--resume", "--overwrite"), "--resume and --overwrite: one goes on with a run"),
+        (("--resume", "--overwrite"), "--resume and --overwrite: one continues a run"),
         (("--test-every", "1"), "--test-every: expected 0"),
         (("--minutes", "-1"), "--minutes: expected more than 0"),
         (("--until-psnr", "20", "--test-every", "0"), "--until-psnr: nothing is held out"),

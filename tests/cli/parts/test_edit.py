@@ -222,7 +222,7 @@ def test_an_edit_that_is_seen_by_what_follows_it_is_not_idle(run):
         _, doubts = films.edited(parse_script(text), saved)
         assert not any("nothing is to be seen" in doubt for doubt in doubts), doubts
     _, doubts = films.edited(parse_script("edits: [{op: freeze, parts: 1}, {op: freeze, parts: 1}]"), saved)
-    assert doubts == ["nothing is to be seen of edit 2 (freeze)"]
+    assert doubts == ["no visible effect: edit 2 (freeze)"]
 
 
 @pytest.mark.parametrize("script", ["length: 0.01", "{fps: 15, length: 0.05}", "{fps: 1000, length: 0.01}"])
@@ -250,9 +250,9 @@ def test_edits_that_change_nothing_are_said_to(gsjax, run):
     edits = ["freeze:parts=drawer,from=9", "move:parts=drawer,by=[0,0,0.1]", "scale:parts=1,factor=1"]
     code, said = gsjax("edit", run, *(word for op in edits for word in ("--op", op)))
     assert code == 0, said
-    assert "warning: nothing is to be seen of edit 1 (freeze), edit 3 (scale)" in said
+    assert "warning: no visible effect: edit 1 (freeze), edit 3 (scale)" in said
     code, said = gsjax("edit", run, "--op", edits[0])
-    assert "nothing is to be seen of edit 1 (freeze)" in said
+    assert "no visible effect: edit 1 (freeze)" in said
     assert "seen by camera 2" in said
 
 

@@ -78,11 +78,11 @@ def test_a_file_with_flipped_bits(run):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"frames": {"followed": 0}}, "expected 1 to 4 frames to be followed, as parts.npz has 4, found 0"),
-        ({"frames": {"followed": 5}}, "to be followed, as parts.npz has 4, found 5"),
+        ({"frames": {"followed": 0}}, "expected 1 to 4 tracked frames, as parts.npz has 4, found 0"),
+        ({"frames": {"followed": 5}}, "tracked frames, as parts.npz has 4, found 5"),
         (
             {"frames": {"followed": 2.5}},
-            "to be followed, as parts.npz has 4, found 2.5",
+            "tracked frames, as parts.npz has 4, found 2.5",
         ),
         ({"parts": [{"part": 1, "name": "a", "true_name": 7}]}, "found 1, 'a' and 7"),
         ({"parts": [{"part": 1, "name": 3}]}, "found 1, 3 and None"),

@@ -111,7 +111,7 @@ def test_unfinished_run_is_resumed_or_replaced_only_when_told(finished):
     (finished.resume / "state.npz").touch()
     before = contents(finished)
     with pytest.raises(
-        FileExistsError, match=r"an unfinished run; go on with it by --resume, or .*--overwrite"
+        FileExistsError, match=r"an unfinished run; continue it with --resume, or .*--overwrite"
     ):
         RunFolder(finished.path)
     with pytest.raises(FileExistsError, match=r"an unfinished run; replace it with --overwrite"):
@@ -131,7 +131,7 @@ def test_a_fit_within_an_unfinished_run_can_be_gone_on_with(tmp_path, left):
     run.write_config(Config())
     (run.path / left).parent.mkdir(parents=True)
     (run.path / left).touch()
-    with pytest.raises(FileExistsError, match="an unfinished run; go on with it by --resume"):
+    with pytest.raises(FileExistsError, match="an unfinished run; continue it with --resume"):
         RunFolder(run.path)
     assert (run.path / left).exists()
 
@@ -227,7 +227,9 @@ def test_a_folder_with_something_else_is_not_replaced(tmp_path, there):
     for name in there:
         (folder / name).touch()
     for replace in (lambda: replaced_folder(folder, OURS).__enter__(), lambda: fresh_folder(folder, OURS)):
-        with pytest.raises(FileExistsError, match=r"answer: expected what gsjax writes there or nothing"):
+        with pytest.raises(
+            FileExistsError, match=r"answer: expected nothing, or only what gsjax writes there"
+        ):
             replace()
     assert listed(folder) == sorted(there)
 

@@ -39,7 +39,7 @@ def opened(monkeypatch):
         return result
 
     monkeypatch.setattr(Sequence, "mask", watched)
-    monkeypatch.setattr("gsjax.cli.track.follow", followed)
+    monkeypatch.setattr("gsjax.engine.track.run.follow", followed)
     return log
 
 
@@ -207,10 +207,10 @@ def test_a_run_says_what_was_lost_and_whose_turn_is_not_known(
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert [note for note in found["notes"] if note.startswith(("carton:", "can:", "ball:"))] == [
         "carton: lost in 1 frames, from 2 to 2.",
-        "carton: from frame 2 on it is not known how it is turned: it was lost then.",
+        "carton: its rotation is unknown from frame 2 on: it was lost then.",
         "can: lost in 1 frames, from 1 to 1.",
         "ball: lost in 1 frames, from 1 to 1.",
-        "ball: from frame 3 on it is not known how it is turned: other turns agree as well.",
+        "ball: its rotation is unknown from frame 3 on: other rotations agree as well.",
     ]
     objects = found["objects"]
     lost = {name: o["frames_lost"] for name, o in objects.items() if o["frames_lost"]}

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import gsjax.cli.live
 import gsjax.data.stream
 from gsjax.cli import main
+from gsjax.engine.track import live as engine
 from gsjax.methods.track import start_scene
 from tests.cli.conftest import still_tick
 
@@ -34,8 +34,8 @@ def unfitted(frame, mask, camera, config):
 @pytest.fixture
 def live(tmp_path, capfd, monkeypatch):
     """Runs `gsjax live` in this process; returns the exit code, what was said, and the run's folder."""
-    monkeypatch.setattr(gsjax.cli.live, "track", standing_still)
-    monkeypatch.setattr(gsjax.cli.live, "start_scene", unfitted)
+    monkeypatch.setattr(engine, "track", standing_still)
+    monkeypatch.setattr(engine, "start_scene", unfitted)
 
     def call(source, *options: str):
         code = main(["live", str(source), "--out", str(tmp_path / "run"), *options])
@@ -55,7 +55,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
     assert frames["used"] + frames["dropped"] == 12
     assert found["complete"]
     assert found["skipped"] == 1
-    assert "1 updates came to nothing finite" in said
+    assert "1 updates were not finite" in said
     assert found["latency_ms"]["median"] > 0
     assert found["memory_mb"]["max"] > 10
     assert "12 offered" in said
@@ -76,7 +76,7 @@ def test_a_recording_is_replayed_and_all_frames_are_accounted_for(pristine, live
 
 def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     """Its own middle shifts with what joins: by 2 cm here, while it turns by 90 degrees and moves by 1 m."""
-    log = gsjax.cli.live.Log((0, 5), {})
+    log = engine.Log((0, 5), {})
     still, turn = np.zeros((1, 6)), np.array([[1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]])
     start, joined, moved = (np.array([[x, 0.0, 0.0]]) for x in (0.1, 0.12, 1.12))
     places = [
@@ -97,7 +97,7 @@ def test_a_group_goes_where_it_is_carried_whatever_joins_it():
     [
         ("camera:x", (), "expected camera:NUMBER"),
         ("camera:97", (), "replay a folder"),
-        ("camera:0", ("--cameras", "1"), "--cameras: is of recordings"),
+        ("camera:0", ("--cameras", "1"), "--cameras: applies to recordings"),
         (None, ("--hz", "0"), "--hz: expected more than 0"),
         (None, ("--cameras", "9"), "has no camera 9"),
     ],
@@ -113,7 +113,7 @@ def test_a_stream_that_fails_leaves_what_was_followed(pristine, live, monkeypatc
         yield from gsjax.data.stream.replay(frames, hz, 0.2)
         raise OSError("the camera was unplugged")
 
-    monkeypatch.setattr(gsjax.cli.live, "replay", failing)
+    monkeypatch.setattr(engine, "replay", failing)
     code, said, folder = live(pristine, "--cameras", "0", "--hz", "20")
     assert code == 2
     assert "unplugged" in said

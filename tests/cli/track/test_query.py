@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from gsjax.cli import main
-from gsjax.cli.grasp import draw_grasp
 from gsjax.engine.distill.source import Source
+from gsjax.engine.track.grasp import draw_grasp
 from gsjax.io.video import read_video_frames
 from gsjax.methods.grasping import Grasp, Gripper
 from gsjax.perception.codebook import ClassCodebook
@@ -23,7 +23,7 @@ def tracked(pristine, tmp_path_factory):
     """A run of four frames of a table on which nothing is moved, held out camera 2."""
     out = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsjax.cli.track.start_scene", unfitted)
+        patch.setattr("gsjax.engine.track.run.start_scene", unfitted)
         patch.setattr("gsjax.engine.track.loop.track", standing_still)
         options = ("--cameras", "0", "1", "--mask-camera", "1", "--eval-cameras", "2")
         assert main(["track", str(pristine), "--out", str(out), *options]) == 0

@@ -10,11 +10,11 @@ from rich.console import Console
 
 from gsjax.cli import main
 from gsjax.cli.fit import Options as FitOptions
-from gsjax.cli.track import Options as TrackOptions
 from gsjax.engine.folder import RunFolder
 from gsjax.engine.messages import Notes
 from gsjax.engine.track.loop import Tracking
 from gsjax.engine.track.outputs import write_tracking
+from gsjax.engine.track.run import Options as TrackOptions
 from gsjax.io.ply import write_ply
 from gsjax.methods.fit import FitConfig
 from gsjax.methods.track import Pose, TrackedScene

@@ -269,4 +269,4 @@ def test_a_page_is_served_until_ctrl_c(ply):
         out, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in out + err
-    assert "stopped: nobody can look any more" in err
+    assert "stopped: the page is no longer served" in err

@@ -62,7 +62,7 @@ def test_a_field_alone_is_asked_of_the_scene_that_is_named(fitted, asked, tmp_pa
     assert "--scene names it" in said
     code, said = view(mine, "--port", 0, "--scene", tmp_path / "moved.ply")
     assert code == 130, said
-    assert "can be asked" in said
+    assert "can be queried" in said
     scene, folder = open_viewable(mine, notes, Whereabouts(tmp_path / "moved.ply"))
     assert folder == mine
     np.testing.assert_array_equal(scene.labels, np.arange(30) % 3)
@@ -124,7 +124,7 @@ def test_a_field_of_another_scene_is_not_asked(fitted, asked, tmp_path, notes):
     np.savez(asked / "field.npz", **{**told, "vectors": told["vectors"][:7]})
     scene, _ = open_viewable(fitted, notes)
     assert (scene.gaussians.num, scene.asking) == (20, None)
-    assert any("its field cannot be asked" in note for note in notes.all)
+    assert any("its field cannot be queried" in note for note in notes.all)
 
 
 def test_what_moves_says_where_its_field_is_asked(tracked, notes):

@@ -1,0 +1,183 @@
+"""What a recording or a set of photographs holds, as `gsjax info` prints it."""
+
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from gsjax.data import Photographs, Sequence, open_photographs, open_sequence, photographs_of
+from gsjax.data.errors import MissingFile
+from gsjax.data.open import is_photographs, is_recording
+from gsjax.engine.folder import expect_dataset
+from gsjax.engine.info_picture import by_camera, by_split, write_picture
+from gsjax.engine.messages import Notes
+from gsjax.engine.options import Common, OneDataset, Reading
+from gsjax.engine.summary import Column, Table
+from gsjax.engine.terminal import print_facts, print_table
+from gsjax.methods.fit import extent_of
+
+PICTURES = (".png", ".svg", ".pdf")
+MOST_LABELS, MOST_CAMERAS = 8, 6  # in the table of masks
+
+
+@dataclass(frozen=True)
+class Options(Common, Reading, OneDataset):
+    """Options of `gsjax info`."""
+
+    picture: Path | None = None
+    """Draw the cameras and the points, from above and from the side, into this file (.png, .svg or .pdf)."""
+
+
+def run(options: Options) -> int:
+    """Print what a dataset holds.
+
+    Raises:
+        DataError, ValueError: it cannot be read, or a picture cannot be written in that format.
+    """
+    if options.picture is not None and options.picture.suffix not in PICTURES:
+        raise ValueError(
+            f"--picture: expected a name that ends in {', '.join(PICTURES)}, found {options.picture.name!r}"
+        )
+    expect_dataset(options.dataset)
+    table = None
+    with Notes(Console(stderr=True, highlight=False)):
+        if is_photographs(options.dataset) and not is_recording(options.dataset):
+            photographs = open_photographs(options.dataset, options.read)
+            photographs.image(0)  # an error if it cannot be read
+            facts, groups = describe_photographs(photographs), by_split
+        else:
+            sequence = open_sequence(options.dataset, options.read)
+            for c in range(sequence.num_cameras):
+                sequence.image(0, c)  # an error if it cannot be read
+            masks = first_masks(sequence)
+            facts, table = describe_sequence(sequence, masks), mask_table(masks, sequence)
+            photographs, groups = photographs_of(sequence), lambda _: by_camera(sequence)
+        if options.picture is not None:
+            write_picture(options.picture, photographs, groups(photographs))
+    print_facts(facts, title=photographs.name)
+    if table is not None:
+        print_table(table)
+    if options.picture is not None:
+        print(f"\nwrote {options.picture}")
+    return 0
+
+
+def describe_photographs(photographs: Photographs) -> dict[str, str]:
+    """Facts about photographs; opens nothing but the first depth image."""
+    sizes = Counter(map(tuple, photographs.sizes.tolist()))
+    extent = extent_of(photographs.viewmats)
+    focus = ", ".join(f"{value:.2f}" for value in extent.focus)
+    times, splits, cloud = photographs.times, photographs.splits, photographs.cloud
+    listed = [f"{w} x {h}" + (f" ({n})" if len(sizes) > 1 else "") for (w, h), n in sizes.most_common(4)]
+    depth = "none"
+    if photographs.load_depth is not None:
+        known = photographs.depth(0)
+        valid = None if known is None else _range(known[known > 0])
+        depth = "some, none in the first" if valid is None else f"{valid} in the first"
+    return {
+        "photographs": f"{photographs.num}: {photographs.names[0]} to {photographs.names[-1]}",
+        "size": ", ".join([*listed, *(["..."] if len(sizes) > 4 else [])]),
+        "view": _fields_of_view(photographs.sizes[:, 0], photographs.Ks),
+        "cameras": f"within {extent.radius:.2f} of their middle, looking at ({focus})",
+        "splits": ", ".join(f"{n} {name}" for name, n in Counter(splits or ()).items()) or "none",
+        "points": "none" if cloud is None else f"{len(cloud.points):,}",
+        "depth": depth,
+        "masks": "none" if photographs.load_mask is None else "yes",
+        "times": "none" if times is None else f"{times.min():.3f} to {times.max():.3f} s",
+    }
+
+
+def first_masks(sequence: Sequence) -> dict[int, np.ndarray]:
+    """The first mask of each camera that has one, by camera id. One is enough, so files may be missing."""
+    masks = {}
+    for c, camera in enumerate(sequence.camera_ids):
+        with suppress(MissingFile):
+            masks[camera] = sequence.mask(0, c)
+    return {camera: mask for camera, mask in masks.items() if mask is not None}
+
+
+def describe_sequence(sequence: Sequence, masks: dict[int, np.ndarray]) -> dict[str, str]:
+    """Facts about a recording; opens the first depth images."""
+    ids, width = sequence.camera_ids, sequence.width
+    moving = np.ptp(sequence.viewmats, axis=0).max(axis=(1, 2)) > 1e-6
+    movement = "moving" if moving.all() else f"{moving.sum()} of them moving" if moving.any() else "fixed"
+    first, last = sequence.times[0], sequence.times[-1]
+    times = f"at {first:.3f} s"
+    if sequence.num_frames > 1:
+        step = np.median(np.diff(sequence.times))
+        times = f"{last - first:.2f} s, every {1e3 * step:.1f} ms ({1 / step:.1f} Hz)"
+    labels = ", ".join(map(str, _labels(masks))) or "none but the background"
+    return {
+        "cameras": f"{len(ids)}: {', '.join(map(str, ids))} ({movement})",
+        "image": f"{width} x {sequence.height}, {_fields_of_view(width, sequence.Ks[0])}",
+        "frames": f"{sequence.num_frames}, numbered {sequence.frame_ids[0]} to {sequence.frame_ids[-1]}",
+        "times": times,
+        "depth": _depth(sequence),
+        "masks": f"{_cameras(masks, sequence)}, labels {labels} in the first frame" if masks else "none",
+        "flow": "yes" if sequence.has_flow else "none",
+        "truth": _truth(sequence),
+        "shapes": ", ".join(f"{m.name} ({len(m.means):,} Gaussians)" for m in sequence.models) or "none",
+    }
+
+
+def mask_table(masks: dict[int, np.ndarray], sequence: Sequence) -> Table | None:
+    """The number of pixels of each label in the first masks, a row per camera; None without labels, or with
+    too many."""
+    labels, names = _labels(masks), sequence.names_of_labels
+    if not labels or len(labels) > MOST_LABELS:
+        return None
+    columns = [Column(f"{label} {names.get(label, '')}".strip(), str(label), "px") for label in labels]
+    rows = [
+        {"camera": f"camera {camera}"} | {str(label): int((mask == label).sum()) for label in labels}
+        for camera, mask in list(masks.items())[:MOST_CAMERAS]
+    ]
+    return Table("first masks", [Column("", "camera"), *columns], rows)
+
+
+def _labels(masks: dict[int, np.ndarray]) -> list[int]:
+    return sorted({int(value) for mask in masks.values() for value in np.unique(mask)} - {0})
+
+
+def _cameras(ids: Iterable[int], sequence: Sequence) -> str:
+    """Cameras by their ids, or all of them."""
+    known = [str(camera) for camera in ids]
+    if len(known) == sequence.num_cameras:
+        return "all cameras"
+    return f"camera{'s' if len(known) > 1 else ''} {', '.join(known)}"
+
+
+def _fields_of_view(widths: np.ndarray | int, Ks: Float[np.ndarray, "n 3 3"]) -> str:
+    degrees = np.degrees(2 * np.arctan(widths / (2 * Ks[:, 0, 0])))
+    low, high = degrees.min(), degrees.max()
+    return f"{low:.0f}° wide" if high - low < 1 else f"{low:.0f}° to {high:.0f}° wide"
+
+
+def _depth(sequence: Sequence) -> str:
+    depths = {camera: sequence.depth(0, c) for c, camera in enumerate(sequence.camera_ids)}
+    known = {camera: depth for camera, depth in depths.items() if depth is not None}
+    if not known:
+        return "none"
+    found = _range(np.concatenate([depth[depth > 0] for depth in known.values()]))
+    what = "but no pixel of the first frame is valid" if found is None else f"{found} m in the first frame"
+    return f"{_cameras(known, sequence)}, {what}"
+
+
+def _range(values: Float[np.ndarray, "n"]) -> str | None:
+    """The 1st and 99th percentile; None without values."""
+    return "{:.2f} to {:.2f}".format(*np.percentile(values, [1, 99])) if len(values) else None
+
+
+def _truth(sequence: Sequence) -> str:
+    truth = sequence.truth
+    if truth is None:
+        return "none"
+    named = [f"{name} (label {label})" for name, label in zip(truth.names, truth.label_ids, strict=True)]
+    known = ["poses of " + ", ".join(named)] if named else []
+    known += [] if truth.robot is None else [f"robot (label {truth.robot})"]
+    known += [] if truth.tracks is None else [f"tracks of {truth.tracks.shape[1]:,} points"]
+    return "; ".join(known)

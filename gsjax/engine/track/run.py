@@ -1,0 +1,301 @@
+"""A run of `gsjax track`: a recording in, a folder with the tracked scene, its scores and a report out."""
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+
+from gsjax.engine.ending import ended, exit_code, finish
+from gsjax.engine.folder import RunFolder, expect_dataset
+from gsjax.engine.machine import describe as describe_machine
+from gsjax.engine.messages import FITTING, Notes, reason, say_error, stage
+from gsjax.engine.options import (
+    RESUME_MAY_CHANGE,
+    FirstMasks,
+    OfRecording,
+    checked,
+    expect_positive,
+    preset_options,
+)
+from gsjax.engine.pictures import Film
+from gsjax.engine.recording import (
+    FirstMask,
+    Recording,
+    chosen_recording,
+    draw_ahead,
+    first_mask,
+    located,
+    warn_of_missing,
+)
+from gsjax.engine.scores import Scores
+from gsjax.engine.summary import Media, format_number
+from gsjax.engine.track.loop import Tracking, begin, follow
+from gsjax.engine.track.outputs import write_first_mask, write_plots, write_tracking
+from gsjax.engine.track.results import summarize
+from gsjax.engine.track.resume import Saver, load
+from gsjax.engine.track.scoring import (
+    budget_metrics,
+    group_values,
+    labels_of_groups,
+    lost_over_frames,
+    metrics,
+    object_names,
+    score_motion,
+    turn_unknown_from,
+)
+from gsjax.engine.track.views import views
+from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, scene_from_shapes, start_scene
+from gsjax.scene.frame import Frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(FirstMasks, OfRecording):
+    """Options of `gsjax track`."""
+
+    budget_ms: float | None = None
+    """Time that an update may take, milliseconds. Settings are then chosen by measured cost; of the tracker's
+    own, only the start of the scene, the limit of what may join it, and the seed are used."""
+    preset: Literal["accurate", "balanced", "fast", "paper"] = "accurate"
+    """Default settings of the tracker: for small errors, between, for 30 Hz, or as in the paper."""
+    track: TrackConfig = field(default_factory=TrackConfig)
+    """The tracker's own settings."""
+
+
+def options_for(arguments: list[str]) -> tuple[type[Options], list[str]]:
+    """The class of options, with the defaults of the preset that is named, and the arguments to parse. A
+    budget implies the preset `fast`, which starts from fewer Gaussians."""
+    flags = [argument.split("=")[0].replace("_", "-") for argument in arguments]
+    if "--budget-ms" in flags and "--preset" not in flags:
+        return preset_options(Options, [*arguments, "--preset", "fast"], "track", PRESETS)
+    return preset_options(Options, arguments, "track", PRESETS)
+
+
+def run(options: Options) -> int:
+    """Track a recording and report on it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: an option cannot be met; everything tracked before that is on disk.
+    """
+    options = checked(options)
+    expect_positive(options, "budget_ms")
+    console, begun = Console(stderr=True, highlight=False), perf_counter()
+    with Notes(console) as notes:
+        expect_dataset(options.dataset)
+        recording = chosen_recording(options)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
+        settings = replace(options, dataset=located(options.dataset), cameras=recording.tracked.camera_ids)
+        if options.resume:
+            folder.check_config(settings, but=RESUME_MAY_CHANGE)
+        mask = first_mask(recording.tracked, options.mask_camera, options.masks)
+        folder.write_config(settings)  # from here on an earlier run is gone
+        draw_ahead(recording, console)
+        seconds = {"preparing": perf_counter() - begun}
+        first = recording.tracked.frame(0)
+        if options.resume:
+            tracking = load(folder.resume, options.track)
+            notes.add(f"Resumed after {tracking.resumed} frames of an earlier run.")
+        else:
+            scene, seconds["start"] = _start(recording, first, mask, options.track, console, notes)
+            tracking = begin(scene)
+        saver, budget_ms = Saver(folder.resume, tracking.resumed), options.budget_ms
+        follow(tracking, first, recording.tracked, options.track, console, budget_ms=budget_ms, saved=saver)
+        seconds |= tracking.seconds()
+        write_tracking(folder, tracking, recording.tracked.times)
+        _note_if_stopped(tracking, recording, notes)
+        found, media, failed = _judge(
+            folder, tracking, recording, mask, seconds, notes, console, options.budget_ms
+        )
+        seconds["total"] = perf_counter() - begun
+        found |= {"seconds": seconds, "notes": notes.all}
+        finish(folder, found, partial(summarize, **media))
+    return exit_code(tracking.stopped or failed)
+
+
+def _start(
+    recording: Recording,
+    frame: Frame,
+    mask: FirstMask,
+    config: TrackConfig,
+    console: Console,
+    notes: Notes,
+) -> tuple[TrackedScene, float]:
+    """The scene at the first frame, and the seconds that it took."""
+    begun = perf_counter()
+    with stage(console, FITTING):
+        if mask.labels is not None:
+            scene = start_scene(frame, mask.labels, recording.tracked.camera_ids.index(mask.camera), config)
+        else:
+            scene = scene_from_shapes(recording.tracked.models, frame, config)
+    warn_of_missing(recording, mask, scene.label_ids, notes)
+    seconds = perf_counter() - begun
+    objects = len(set(scene.label_ids) - {0})
+    parts = f" ({scene.num_objects} rigid parts)" if scene.num_objects > objects else ""
+    made_by = "the file" if mask.source == "files" else "the weight-free segmenter"
+    origin = f"labels from {made_by} in camera {mask.camera}"
+    if mask.source == "shapes":
+        origin = "objects are the shapes that come with the recording"
+    console.print(
+        f"[bold]scene[/]     {format_number(scene.gaussians.num)} Gaussians, "
+        f"{format_number(scene.num_moving)} of them in {objects} objects{parts}, in {seconds:.1f} s; "
+        f"{origin}",
+        soft_wrap=not console.is_terminal,
+    )
+    return scene, seconds
+
+
+def _judge(
+    folder: RunFolder,
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    seconds: dict[str, float],
+    notes: Notes,
+    console: Console,
+    budget_ms: float | None,
+) -> tuple[dict[str, Any], dict[str, list[Media]], Exception | None]:
+    """Render and score what was tracked. Ctrl-C or an error ends it; what was scored until then counts.
+
+    Returns:
+        metrics.json but for seconds and notes; the plots and images of the report; and what ended the scoring
+        early, or None.
+    """
+    begun = perf_counter()
+    values, truth = group_values(tracking, mask, recording), recording.tracked.truth
+    labels = labels_of_groups(tracking, values)
+    scores, failed = Scores(values, None if truth is None else truth.robot), None
+    try:
+        film = Film(folder, recording, tracking.num_frames, labels)
+        film.score(views(tracking, recording), scores, tracking.num_frames, console)
+    except (KeyboardInterrupt, Exception) as error:
+        scored = f"{scores.num_frames} of {tracking.num_frames} frames"
+        notes.warn(f"scoring was stopped after {scored} by {reason(error)}")
+        failed = error if isinstance(error, Exception) else None
+    motion = score_motion(tracking, recording)
+    names = object_names(tracking, recording, values)
+    seconds["evaluation"] = perf_counter() - begun
+    found = _what_ran(tracking, recording, mask, scores, budget_ms)
+    found |= metrics(tracking, recording, mask, scores, motion, values)
+    _note_what_is_missing(found, tracking, recording, mask, values, notes)
+    _note_what_was_lost(tracking, values, names, notes)
+    media = {
+        "plots": write_plots(folder, tracking, recording, scores, motion, names, labels),
+        "images": write_first_mask(folder, recording, mask),
+    }
+    return found, media, failed
+
+
+def _what_ran(
+    tracking: Tracking, recording: Recording, mask: FirstMask, scores: Scores, budget_ms: float | None
+) -> dict[str, Any]:
+    """The part of metrics.json about what ran, and how fast."""
+    sequence, updates = recording.tracked, np.asarray(tracking.update_s[1:]) * 1e3
+    budget = None
+    if budget_ms is not None and tracking.chosen is not None:
+        budget = {
+            "ms": budget_ms,
+            **budget_metrics(tracking.chosen),
+            "late": int((updates > budget_ms).sum()),
+            "everywhere": tracking.everywhere,
+        }
+    return {
+        "kind": "track",
+        "dataset": sequence.name,
+        **ended(tracking.stopped),
+        "complete": tracking.stopped is None and scores.num_frames == tracking.num_frames,
+        "frames": {
+            "tracked": tracking.num_frames,
+            "asked": sequence.num_frames,
+            "in_data": recording.frames_in_data,
+            "scored": scores.num_frames,
+            "first_id": sequence.frame_ids[0],
+            "last_id": sequence.frame_ids[tracking.num_frames - 1],
+        },
+        "image": {"width": sequence.width, "height": sequence.height},
+        "tracked_cameras": list(sequence.camera_ids),
+        "held_out_cameras": list(recording.held_out),
+        "mask": {"source": mask.source, "camera": mask.camera},
+        "gaussians": {"all": tracking.scene.gaussians.num, "moving": tracking.scene.num_moving},
+        "update_hz": tracking.hz,
+        "update_ms": {
+            "mean": float(updates.mean()) if len(updates) else None,
+            "median": float(np.median(updates)) if len(updates) else None,
+            "p95": float(np.percentile(updates, 95)) if len(updates) else None,
+        },
+        "budget": budget,
+        "plans": tracking.plans,
+        "updates_skipped": tracking.skipped,
+        "machine": describe_machine(),
+    }
+
+
+def _note_if_stopped(tracking: Tracking, recording: Recording, notes: Notes) -> None:
+    if tracking.stopped is None:
+        return
+    after = f"after {tracking.num_frames} of {recording.tracked.num_frames} frames"
+    why = reason(tracking.stopped).rstrip(".")
+    notes.add(f"This run is not complete: it was stopped {after} by {why}.")
+    if isinstance(tracking.stopped, KeyboardInterrupt):
+        say_error(f"by Ctrl-C {after}; scoring those (Ctrl-C again to skip that)", word="stopped")
+
+
+def _note_what_is_missing(
+    found: dict[str, Any],
+    tracking: Tracking,
+    recording: Recording,
+    mask: FirstMask,
+    values: np.ndarray | None,
+    notes: Notes,
+) -> None:
+    """Note what was not scored, and why."""
+    sequence = recording.judged
+    if mask.source == "segment":
+        notes.add("Objects were found by the weight-free segmenter; they are named by size.")
+    if sequence.truth is None:
+        notes.add("Motion was not scored: the recording has no true poses.")
+    elif not (recording.tracked.has_masks and recording.tracked.has_depth):
+        notes.add("Motion was not scored: assigning Gaussians to true objects requires masks and depth.")
+    if values is None or not sequence.has_masks:
+        notes.add("Labels were not scored: the recording has no masks.")
+    if not sequence.has_depth:
+        notes.add("Depth was not scored: the recording has none.")
+    for name, scored in found["objects"].items():
+        if scored["gaussians"] == 0:
+            notes.add(f"{name}: not tracked, it is not in the first mask.")
+        elif sequence.truth is not None and scored["gaussians_scored"] == 0:
+            posed = name in sequence.truth.names
+            why = "no Gaussian certainly belongs to it" if posed else "the truth holds no pose of it"
+            notes.add(f"{name}: motion not scored, {why}.")
+    if tracking.chosen is not None and not tracking.chosen.fits:
+        base = f"{1e3 * tracking.chosen.costs.base:.0f} ms"
+        notes.warn(
+            f"no settings keep the budget on this machine; {tracking.chosen.name} take {base} an update"
+        )
+    if tracking.skipped:
+        notes.add(f"{tracking.skipped} updates gave numbers that are not finite and were left out.")
+
+
+def _note_what_was_lost(
+    tracking: Tracking, values: np.ndarray | None, names: dict[int, str], notes: Notes
+) -> None:
+    """Note when each object was lost, its rotation unknown, or no camera saw it."""
+    groups = labels_of_groups(tracking, values)[1:]
+    unseen = (~np.asarray(tracking.visible, bool).reshape(len(tracking.visible), len(groups))).sum(axis=0)
+    labels = sorted({*groups.tolist()} - {0})
+    for label in labels:
+        lost = 1 + np.flatnonzero(lost_over_frames(tracking, values, label))
+        to_the_end = len(lost) > 0 and lost[-1] == tracking.num_frames - 1
+        if len(lost):
+            last = "to the end" if to_the_end else f"to {lost[-1]}"
+            notes.add(f"{names[label]}: lost in {len(lost)} frames, from {lost[0]} {last}.")
+        unknown = turn_unknown_from(tracking, values, label)
+        if unknown is not None and not to_the_end:
+            why = "it was lost then" if unknown in lost else "other rotations agree as well"
+            notes.add(f"{names[label]}: its rotation is unknown from frame {unknown} on: {why}.")
+    for label in sorted({*groups.tolist()}):
+        frames = unseen[groups == label].max()
+        if frames:
+            name = names.get(label, f"object {label}")
+            notes.add(f"{name}: no camera saw it, or a part of it, in {frames} frames; it stood still then.")
