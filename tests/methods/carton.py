@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track.align import disagreement
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.points import sight_of
+from gsjax.methods.track.points import tone_images
 
 CONFIG = AlignConfig(iterations=12)
 CARTON = 2
@@ -13,7 +13,7 @@ SIZE = {"width": 160, "height": 120}
 
 
 def see(frame):
-    return sight_of(frame, CONFIG.shading)
+    return tone_images(frame, CONFIG.shading)
 
 
 def middle(points):

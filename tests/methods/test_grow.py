@@ -12,15 +12,15 @@ from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track import first_pose, render_labels
 from gsjax.methods.track.config import GrowConfig
 from gsjax.methods.track.grow import (
-    EMPTY,
+    _draw,
     _nearest,
-    _some_of,
     empty_slots,
     grow,
     unexplained,
     with_slots,
 )
 from gsjax.methods.track.layers import shown_by
+from gsjax.methods.track.scene import EMPTY
 from gsjax.metrics.tracking import true_labels
 from gsjax.scene.render import plan_render, render
 
@@ -65,7 +65,7 @@ def test_some_of_the_chosen_are_taken_and_all_get_their_turn(size, num_chosen):
     count = 16
     chosen = np.zeros(size, bool)
     chosen[np.random.default_rng(0).permutation(size)[:num_chosen]] = True
-    some_of = jax.jit(lambda step: _some_of(jnp.asarray(chosen), step, count))
+    some_of = jax.jit(lambda step: _draw(jnp.asarray(chosen), step, count))
     taken = set()
     for step in range(400):
         places, real = map(np.asarray, some_of(step))

@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track.lost import Confidence
 from gsjax.methods.track.recover import Relocation
-from gsjax.methods.track.search import TURN_KNOWN, Found, Sought, first_watch
+from gsjax.methods.track.search import TURN_KNOWN, Estimate, SearchResult, first_watch
 
 
 def test_a_watch_knows_what_is_usual_and_who_waits():
@@ -21,13 +21,13 @@ def test_a_watch_knows_what_is_usual_and_who_waits():
     np.testing.assert_allclose(watch.agrees, [0.9, 0.2])
 
 
-def nothing_of(looked_for, leads=jnp.inf):
+def nothing_of(searched, leads=jnp.inf):
     """A search that says just which groups were looked for, and what their turns agree better by."""
-    still = jnp.zeros((len(looked_for), 6))
-    found, none = Found(still, still[:, 0]), still[:, 0]
+    still = jnp.zeros((len(searched), 6))
+    estimate, none = Estimate(still, still[:, 0]), still[:, 0]
     sure = Confidence(none, none, none > 0)
     leads = jnp.broadcast_to(jnp.asarray(leads), len(still))
-    return Sought(found, jnp.array(looked_for), Relocation(still, sure, sure), none > 0, leads)
+    return SearchResult(estimate, jnp.array(searched), Relocation(still, sure, sure), none > 0, leads)
 
 
 def test_what_is_lost_is_found_only_when_it_shows_itself():
@@ -61,14 +61,14 @@ def test_what_is_found_elsewhere_once_is_glimpsed_and_checked_in_the_next_frame(
         (0.4, one, ~one, False),  # not there
         (0.9, ~one, ~one, False),  # not looked for, or no better than in its place
     ]
-    for agrees, elsewhere, retaken, glimpsed in told:
+    for agrees, elsewhere, relocated, glimpsed in told:
         there = Confidence(none + agrees, none + agrees, one)
-        sought = nothing_of([True])
-        sought = sought._replace(again=sought.again._replace(sure=there))
-        watch = watch.after(none, sought, none, unsure, elsewhere, retaken)
+        result = nothing_of([True])
+        result = result._replace(relocation=result.relocation._replace(confidence=there))
+        watch = watch.after(none, result, none, unsure, elsewhere, relocated)
         assert bool(watch.glimpsed[0]) == bool(glimpsed)
     certain = Confidence(none + 0.8, none + 0.7, one)  # and so not looked for elsewhere in the next frame
-    assert not watch.after(none, sought, none, certain, one, ~one).glimpsed[0]
+    assert not watch.after(none, result, none, certain, one, ~one).glimpsed[0]
 
 
 def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
@@ -78,7 +78,7 @@ def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
         (0.8, TURN_KNOWN - 0.01, False),
         (0.9, 0.2, False),  # it may have been turned in between
         (0.2, 0.2, False),  # lost
-        (0.62, 0.2, False),  # found, but hardly as it was
+        (0.62, 0.2, False),  # estimate, but hardly as it was
         (0.2, 0.2, False),
         (0.9, 0.2, True),
         (0.9, jnp.inf, True),  # not looked for
@@ -87,7 +87,10 @@ def test_a_turn_stays_unknown_until_its_group_is_found_as_it_was_at_first():
         sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
         watch = watch.after(none, nothing_of([True], lead), none, sure, ~one, ~one)
         assert bool(watch.turn_known[0]) == known, (agrees, lead)
-    for agrees, known in ((0.9, True), (0.62, False)):  # moved to where it was found, though it was not lost
+    for agrees, known in (
+        (0.9, True),
+        (0.62, False),
+    ):  # moved to where it was estimate, though it was not lost
         sure = Confidence(jnp.array([agrees]), jnp.array([agrees]), one)
         watch = watch.after(none, nothing_of([True]), none, sure, one, one)
         assert bool(watch.turn_known[0]) == known, agrees
