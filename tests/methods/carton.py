@@ -22,7 +22,7 @@ def middle(points):
 
 
 def gap(points, sight, config=CONFIG):
-    """How badly points agree where they are."""
+    """Disagreement of points where they are."""
     return float(disagreement(jnp.zeros(6), points, jnp.zeros(3), sight, config))
 
 

@@ -1,4 +1,4 @@
-"""Direct alignment finds a known motion of a textured object, and keeps away from what is not there."""
+"""Direct alignment finds a known motion of a textured object, and leaves what nobody sees where it is."""
 
 import jax
 import jax.numpy as jnp
@@ -119,14 +119,14 @@ def test_many_starts_at_once_are_each_alone(moved):
     np.testing.assert_allclose(together, alone, atol=2e-4)
 
 
-def test_a_ball_holds_the_origin_and_nothing_outside():
+def test_a_ball_grid_holds_the_origin_and_nothing_outside():
     grid = ball_grid(0.045, 0.015)
     assert (np.linalg.norm(grid, axis=1) <= 0.045).all()
     assert (np.abs(grid).sum(1) == 0).sum() == 1
     assert len(grid) == 123
 
 
-def test_turned_holds_the_start_and_turns_about_its_own_axes():
+def test_turn_hypotheses_hold_the_start_and_turns_about_its_own_axes():
     twist = jnp.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
     hypotheses = turn_hypotheses(twist, jnp.eye(3), (0.2, 0.6))
     assert hypotheses.shape == (13, 6)

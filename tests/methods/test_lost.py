@@ -1,4 +1,4 @@
-"""Whether a group is where it is believed to be, and where it is looked for when it is not."""
+"""Whether a group is where it is believed to be, and where it is searched for if not."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def moved(points: Points, *twist: float) -> Points:
     return jax.vmap(carry)(points, jnp.asarray([twist]), center)
 
 
-def test_what_is_where_it_was_agrees_and_what_is_elsewhere_does_not(carton):
+def test_a_group_agrees_in_its_place_and_nowhere_else(carton):
     images, points = carton
     here = group_confidence(points, images, GAP)
     assert here.agreement[0] > 0.95
@@ -70,8 +70,8 @@ def test_what_is_where_it_was_agrees_and_what_is_elsewhere_does_not(carton):
     assert group_confidence(moved(points, 0, 0, 0.1, 0, 0, 0), images, GAP).agreement[0] < LOST
 
 
-def test_what_hides_a_group_says_nothing_of_it(carton):
-    """A hand before the left camera: what the other sees decides, and both hidden, nobody tells."""
+def test_an_occluder_is_inconclusive(carton):
+    """A hand before the left camera: the other camera decides; with both hidden, none does."""
     images, points = carton
     near = images.pixels.at[0, ..., 3].set(0.2)
     one = group_confidence(points, images._replace(pixels=near), GAP)
@@ -99,12 +99,12 @@ def test_what_shows_the_background_does_not_show_the_group(carton):
     assert group_confidence(points, before_it, GAP).agreement[0] > 0.99 * usual.agreement[0]
     assert group_confidence(points, before_it, GAP, wall).agreement[0] == 0
     coarse = group_confidence(points, before_it, GAP, wall[:, ::2, ::2])
-    assert coarse.agreement[0] < FOUND  # on a slope the pixel beside is at another depth
+    assert coarse.agreement[0] < FOUND  # on a slope, the neighbouring pixel has another depth
     assert coarse.conclusive[0]
 
 
 def test_a_card_on_a_table_is_not_lost(carton):
-    """What is as flat as what it lies on is measured like it; colour decides."""
+    """A flat object is measured like the surface on which it lies; colour decides."""
     images, points = carton
     under = jnp.where(images.depths > 0, images.depths + GAP / 5, 0.0)
     usual = group_confidence(points, images, GAP)
@@ -113,17 +113,16 @@ def test_a_card_on_a_table_is_not_lost(carton):
     )
     other = images._replace(pixels=images.pixels.at[..., :3].add(0.5))
     assert group_confidence(points, other, GAP, under).agreement[0] < LOST
-    assert (
-        group_confidence(points, images, GAP, None, under).agreement[0] < LOST
-    )  # on another group nothing lies so
+    of_others = group_confidence(points, images, GAP, None, under)  # which exempt no card
+    assert of_others.agreement[0] < LOST
     nothing = jnp.zeros_like(under)
     assert group_confidence(points, images, GAP, None, nothing).agreement[0] == pytest.approx(
         float(usual.agreement[0])
     )
 
 
-def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera(table, started, quick):
-    """Where it is believed to be it may be hidden; of others, what cameras saw last counts."""
+def test_a_suspect_is_searched_for_with_all_points_that_face_a_camera(table, started, quick):
+    """It may be hidden where it is believed to be; for other groups, the points seen last count."""
     _, frames, _ = table()
     pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
     group = np.asarray(started.labels[: started.num_moving])
@@ -133,15 +132,17 @@ def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera
     unseen = Shown(nothing.astype(int), nothing, nothing > 0)
     assert not points_last_seen(reference, unseen, cameras, GAP).seen.any()
     images = tone_images(frames[0], config.shading)
-    asked = all_points_facing(reference, jnp.zeros((count, 6)), jnp.zeros((count, 3)), images)
+    facing_points = all_points_facing(reference, jnp.zeros((count, 6)), jnp.zeros((count, 3)), images)
     faces = facing(started, pose, camera_centers(cameras.viewmat))[:, : started.num_moving] > 0.5
     for k in range(count):
-        np.testing.assert_array_equal(asked.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
+        np.testing.assert_array_equal(facing_points.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
     about = jnp.array([0.0, 0.0, 0.1])
     around = points_facing(
         jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, images
     )
-    assert float((around.seen != asked.seen[0]).sum()) > 0  # what turns away faces them no more
+    assert (
+        float((around.seen != facing_points.seen[0]).sum()) > 0
+    )  # points that turn away no longer face them
 
 
 def test_without_depth_colour_alone_decides(carton):
@@ -151,7 +152,7 @@ def test_without_depth_colour_alone_decides(carton):
     assert group_confidence(moved(points, 0.1, 0.1, 0, 0, 0, 0), images, GAP).agreement[0] < 0.6
 
 
-def test_strangers_are_nearer_than_what_is_modelled(carton):
+def test_unexplained_pixels_are_nearer_than_the_model(carton):
     images, _ = carton
     model = jnp.full(images.depths.shape, 0.9)
     shown = Shown(jnp.ones(model.shape, jnp.int32), model, model > 0)
@@ -160,7 +161,7 @@ def test_strangers_are_nearer_than_what_is_modelled(carton):
     assert 0 < strange.mean() < 1
     np.testing.assert_array_equal(found.labels, np.where(strange, 2, 1))
     np.testing.assert_array_equal(found.depths, np.where(strange, images.depths, 0.9))
-    thick = label_unexplained(shown, images, 1, GAP, 0.1, 1)  # a group explains what is a little nearer
+    thick = label_unexplained(shown, images, 1, GAP, 0.1, 1)  # a group explains depth that is slightly nearer
     np.testing.assert_array_equal(thick.labels == 2, np.asarray((images.depths > 0) & (images.depths < 0.8)))
     blind = images._replace(pixels=images.tones)
     assert label_unexplained(shown, blind, 1, GAP, GAP, 1) is shown
@@ -182,7 +183,7 @@ def strangers_of(images, strange) -> Points:
     return jax.tree.map(lambda a: a[0], found)
 
 
-def test_guesses_bring_points_to_strangers_or_stay_near(one):
+def test_guesses_bring_points_to_unexplained_pixels_or_stay_near(one):
     reference, center, images, shown = one
     config, guess = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
     unexplained_pixels, shifts = strangers_of(images, shown), coarse_shifts(config, images)
@@ -212,8 +213,8 @@ def test_guesses_bring_points_to_strangers_or_stay_near(one):
     )
 
 
-def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one):
-    """From 15 cm and 57 degrees off; each frame goes on from the last one's guess."""
+def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
+    """From 15 cm and 57 degrees off; each frame continues from the guess of the last."""
     reference, center, images, shown = one
     off = jnp.array([0.1, -0.1, 0.05, 0.0, 0.0, 1.0])
     lost = reference._replace(
@@ -242,17 +243,15 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
     ).coverage
     assert is_found(jax.tree.map(lambda a: a[None], found.confidence), showed)[0]
     assert is_found(jax.tree.map(lambda a: a[None], found.guess_confidence), showed)[0]
-    first = after(1, others)  # nothing was said before: it is believed where it is not
+    first = after(1, others)  # the first guess is where the group is not
     assert not is_found(jax.tree.map(lambda a: a[None], first.guess_confidence), showed)[0]
     for explained, there in ((jnp.zeros_like(images.depths), True), (images.depths, False)):
-        from_there = after(
-            1, explained, found.twists
-        )  # where all that is measured is something else, it is not
+        from_there = after(1, explained, found.twists)  # it is not where all depth is of other groups
         assert is_found(jax.tree.map(lambda a: a[None], from_there.confidence), showed)[0] == there
 
 
 @given(st.integers(0, 2**31))
-def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
+def test_relative_twists_lead_to_the_same_place(seed):
     twists = 0.8 * jax.random.normal(jax.random.key(seed), (2, 6))
     points = Points(
         jax.random.normal(jax.random.key(seed + 1), (1, 3, 5)), jnp.zeros((1, 3, 5)), jnp.ones((1, 5))
@@ -264,7 +263,7 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
     np.testing.assert_allclose(again, there, atol=1e-4)
 
 
-def test_radii_are_of_those_that_there_are():
+def test_radii_ignore_padding():
     means = jnp.zeros((2, 3, 4)).at[0, 0].set(jnp.array([3.0, 5.0, 1.0, 9.0])).at[1, 2, 0].set(7.0)
     real = jnp.array([[True, True, False, False], [False] * 4])
     reference = ReferencePoints(means, means, means, real)
@@ -272,7 +271,7 @@ def test_radii_are_of_those_that_there_are():
     np.testing.assert_allclose(found, [5**0.5, 0.0], rtol=1e-6)
 
 
-def test_depths_of_others_are_those_of_what_is_not_in_doubt(carton):
+def test_depths_of_others_are_those_of_groups_not_in_doubt(carton):
     images, _ = carton
     labels = jnp.zeros(images.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
     shown = Shown(labels, jnp.full(labels.shape, 0.7), labels > 0)
@@ -289,8 +288,8 @@ def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
 
 @pytest.mark.parametrize("redraw", ["moving", "all"])
 @pytest.mark.slow
-def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick, redraw):
-    """The scene has the carton 12 cm beside where it is, too far to be looked for from there."""
+def test_an_object_that_is_elsewhere_is_reported_lost_and_then_found(table, started, quick, redraw):
+    """The scene has the carton 12 cm off, too far for a search from there."""
     _, frames, _ = table()
     config = replace(
         quick, redraw=redraw, matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
@@ -309,8 +308,8 @@ def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, qui
 
 
 @pytest.mark.slow
-def test_without_depth_what_vanishes_is_said_to_be_lost_and_stays(table, started, quick):
-    """Colour alone says so; nothing says where else to look."""
+def test_without_depth_a_vanished_object_is_reported_lost_and_stays(table, started, quick):
+    """Colour shows that it is gone, and nothing where else to search."""
     sequence, frames, _ = table()
     config = replace(
         quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)

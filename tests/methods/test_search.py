@@ -1,4 +1,4 @@
-"""What has jumped is found by looking everywhere, first of all where it is most urgent."""
+"""Groups that jump are found by a search everywhere, the most urgent ones first."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def jumped(moved, table):
 
 
 def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
-    """Nothing overlaps where it starts, and nobody tells how far it went."""
+    """There is no overlap at the start, and no hint how far it went."""
     *given, shift = jumped
     brief = replace(CONFIG, iterations=3)
     miss = [float(jnp.linalg.norm(look(*given, brief, n)[:3] - shift)) for n in (0, 1)]
@@ -51,7 +51,7 @@ def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
 
 
 def test_search_finds_what_is_pushed_while_it_turns(moved):
-    """It goes on turning as before, but 36 mm further than expected: only a shift from there finds it."""
+    """It keeps turning as before, but 36 mm further than expected: only a shift from there finds it."""
     points, center, images, then, _ = moved
     points = points._replace(means=jnp.asarray(then, jnp.float32))
     middle_then = center + (points.means - moved[0].means).mean((0, 2))
@@ -84,7 +84,7 @@ def test_something_in_front_does_not_pull(moved):
     assert error(points, np.asarray(carry(points, found, center).means), then) < 2e-3
 
 
-def test_without_turns_only_translation_is_result_and_found(moved):
+def test_without_turns_only_translations_are_tried_and_found(moved):
     points, center, images, _, _ = moved
     config = replace(CONFIG, max_turn=0.0)
     shift = jnp.array([0.006, -0.004, 0.003])
@@ -95,8 +95,9 @@ def test_without_turns_only_translation_is_result_and_found(moved):
 
 
 @pytest.mark.slow
-def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
-    """It may be where it was believed to be. What is lost is not, and what agrees as ever has not jumped."""
+def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(jumped):
+    """It may have been where it was believed to be. A lost one was not, and one that agrees as usual has not
+    jumped."""
     *given, shift = jumped
     points, centers = jax.tree.map(lambda a: a[None], given[:2])
     sure, yes = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True)), jnp.array([True])
@@ -116,8 +117,8 @@ def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
         assert elsewhere.recovered[0]
 
 
-def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jumped):
-    """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
+def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
+    """Of three groups that jumped alike, only as many are found as may be searched for, by urgency."""
     *given, shift = jumped
     points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
     visible, first = jnp.array([True, True, True]), first_watch(jnp.ones(3))
@@ -141,8 +142,8 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
 
 
 @pytest.mark.parametrize("printed", [True, False])
-def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
-    """A can that stands still: its print tells how it is turned, and without it nothing does."""
+def test_only_without_a_print_do_other_orientations_agree_as_well(table, printed):
+    """A can at rest: its print determines its orientation, and nothing else does."""
     sequence, (frame, *_), _ = table(8, 2, **SIZE)
     can = sequence.truth.label_ids[sequence.truth.names.index("can")]
     mine = jnp.stack([sequence.mask(0, c) == can for c in range(2)])
@@ -164,7 +165,7 @@ def test_principal_axes_are_those_of_a_rod():
     np.testing.assert_allclose(jnp.abs(principal_axes(points, jnp.zeros(3))[2]), [0.6, 0.8, 0.0], atol=1e-4)
 
 
-def test_the_least_is_taken_of_each_group_and_nothing_that_is_not_finite():
+def test_the_best_finite_hypothesis_of_each_group_is_taken():
     residuals = jnp.array([[0.3, jnp.nan, 0.5], [0.2, 0.9, 0.5]])
     twists = jnp.arange(36.0).reshape(2, 3, 6)
     found = best_of(residuals, twists)

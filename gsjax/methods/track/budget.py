@@ -24,21 +24,13 @@ class Costs(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Settings for a budget, and the measurements that led to them.
-
-    Attributes:
-        name: name of the rung.
-        config: its settings.
-        costs: its costs.
-        tried: costs of every rung that was measured, by name.
-        fits: False if even the cheapest rung exceeds the budget.
-    """
+    """A rung of the ladder chosen for a budget, and the measurements that led to it."""
 
     name: str
     config: TrackConfig
     costs: Costs
-    tried: dict[str, Costs]
-    fits: bool
+    tried: dict[str, Costs]  # of every rung that was measured, by name
+    fits: bool  # False if even the cheapest rung exceeds the budget
 
 
 def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:

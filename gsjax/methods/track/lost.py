@@ -25,17 +25,11 @@ elsewhere, above the third it is found. docs/results-hard-cases.md has measured 
 
 
 class Confidence(NamedTuple):
-    """How well the images agree with where each group is believed to be.
+    """How well the images agree with where each group is believed to be."""
 
-    Attributes:
-        agreement: fraction of the visible points that look as at first, 0 to 1.
-        coverage: the same of all points: hidden ones and those outside the image are missing.
-        conclusive: whether enough points were visible.
-    """
-
-    agreement: Float[Array, "k"]
-    coverage: Float[Array, "k"]
-    conclusive: Bool[Array, "k"]
+    agreement: Float[Array, "k"]  # fraction of the visible points that look as at first, 0 to 1
+    coverage: Float[Array, "k"]  # the same of all points: hidden ones and those outside the image are missing
+    conclusive: Bool[Array, "k"]  # whether enough points were visible
 
 
 def group_confidence(

@@ -34,17 +34,11 @@ def join(*several: Points) -> Points:
 
 
 class ToneImages(NamedTuple):
-    """A frame in the form that points are compared with: tones and, if measured, depth.
-
-    Attributes:
-        cameras: C cameras.
-        pixels: tones of red, green and blue and, with depth cameras, depth in metres.
-        measures: cameras that measured any depth; None without depth cameras.
-    """
+    """A frame in the form that points are compared with."""
 
     cameras: Camera
-    pixels: Float[Array, "c height width d"]
-    measures: Bool[Array, "c"] | None
+    pixels: Float[Array, "c height width d"]  # tones of red, green and blue and, if measured, depth in metres
+    measures: Bool[Array, "c"] | None  # cameras that measured any depth; None without depth cameras
 
     @property
     def tones(self) -> Float[Array, "c height width 3"]:

@@ -33,33 +33,20 @@ def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -
 
 
 class Relocation(NamedTuple):
-    """Another place where a lost group may be.
+    """Another place where a lost group may be."""
 
-    Attributes:
-        twists: twist from where it is believed to be.
-        confidence: confidence that it is there.
-        guess_confidence: the same for the last frame's guess, aligned: agreement by chance does not recur.
-    """
-
-    twists: Float[Array, "*k 6"]
+    twists: Float[Array, "*k 6"]  # from where it is believed to be
     confidence: Confidence
-    guess_confidence: Confidence
+    guess_confidence: Confidence  # in the last frame's guess, aligned: agreement by chance does not recur
 
 
 class SearchContext(NamedTuple):
-    """The images in which a lost group is searched for, and what hides it there.
-
-    Attributes:
-        images: the new frame.
-        background: depth of the background, metres, 0 if unknown.
-        others: depth of the groups that are not in doubt, see `depths_of_others`.
-        unexplained_pixels: pixels of the last frame that no group explains.
-    """
+    """The images in which a lost group is searched for, and what hides it there."""
 
     images: ToneImages
-    background: Float[Array, "c h w"] | None
-    others: Float[Array, "c h w"]
-    unexplained_pixels: Points
+    background: Float[Array, "c h w"] | None  # its depth, metres, 0 if unknown
+    others: Float[Array, "c h w"]  # depth of the groups that are not in doubt, see `depths_of_others`
+    unexplained_pixels: Points  # of the last frame
 
 
 def recover(

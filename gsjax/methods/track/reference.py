@@ -16,15 +16,7 @@ from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown, seen_from
 from gsjax.methods.track.motion import Pose
-from gsjax.methods.track.points import (
-    Points,
-    ToneImages,
-    carry,
-    first_members,
-    rotated,
-    sum_of_three,
-    tones,
-)
+from gsjax.methods.track.points import Points, ToneImages, carry, first_members, rotated, sum_of_three, tones
 from gsjax.methods.track.scene import TrackedScene
 
 

@@ -40,21 +40,13 @@ class Estimate(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """The result of a search.
-
-    Attributes:
-        estimate: where each group is.
-        searched: groups that were searched for everywhere.
-        relocation: where each group may be instead, valid where `relocation_tried`.
-        relocation_tried: groups that were searched for where they were not believed to be.
-        leads: see `search_everywhere`; infinite if unknown.
-    """
+    """The result of a search."""
 
     estimate: Estimate
-    searched: Bool[Array, "k"]
-    relocation: Relocation
+    searched: Bool[Array, "k"]  # groups that were searched for everywhere
+    relocation: Relocation  # where each group may be instead, valid only where it was tried
     relocation_tried: Bool[Array, "k"]
-    leads: Float[Array, "k"]
+    leads: Float[Array, "k"]  # see `search_everywhere`; infinite if unknown
 
 
 align_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))

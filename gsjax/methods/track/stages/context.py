@@ -20,124 +20,68 @@ from gsjax.scene.render import Rendered
 
 
 class UpdateContext(NamedTuple):
-    """The input that all stages of one update share.
+    """The input that all stages of one update share."""
 
-    Attributes:
-        scene: the scene before the update.
-        pose: pose of its objects in the last frame.
-        state: state of the tracker after the last frame.
-        frame: the new frame, of the tracked cameras.
-        plan: capacities for rendering.
-        images: the new frame in the form that points are compared with.
-        centers: centroids of the groups, about which they turn, metres.
-        reference: what each group has to look like.
-    """
-
-    scene: TrackedScene
-    pose: Pose
-    state: TrackState
-    frame: Frame
+    scene: TrackedScene  # before the update
+    pose: Pose  # in the last frame
+    state: TrackState  # after the last frame
+    frame: Frame  # the new one, of the tracked cameras
     plan: TrackPlan
-    images: ToneImages
-    centers: Float[Array, "k 3"]
-    reference: ReferencePoints
+    images: ToneImages  # the new frame in the form that points are compared with
+    centers: Float[Array, "k 3"]  # centroids of the groups, about which they turn, metres
+    reference: ReferencePoints  # what each group has to look like
 
 
 class Past(NamedTuple):
-    """What the scene shows before it moves.
-
-    Attributes:
-        shown: what it shows in `cameras`.
-        cameras: the cameras of the last frame, or those of the new one if the whole scene is redrawn.
-        template: the template for matching; None without matching.
-        rendered: the whole scene, if it is redrawn; else None.
-        backdrop: the background in the new cameras; None if the whole scene is redrawn.
-        background: depth of the backdrop, metres, 0 where it does not cover; None like `backdrop`.
-        needed: capacity that drawing the background needed.
-        counts: number of pixels that show each group.
-        visible: groups that enough pixels show.
-    """
+    """What the scene shows before it moves."""
 
     shown: Shown
-    cameras: Camera
-    template: Template | None
-    rendered: Rendered | None
-    backdrop: Backdrop | None
-    background: Float[Array, "c h w"] | None
-    needed: Int[Array, ""]
-    counts: Float[Array, "k"]
-    visible: Bool[Array, "k"]
+    cameras: Camera  # of `shown`: those of the last frame, or the new ones if the whole scene is redrawn
+    template: Template | None  # None without template matching
+    rendered: Rendered | None  # the whole scene, if it is redrawn; else None
+    backdrop: Backdrop | None  # the background in the new cameras; None if the whole scene is redrawn
+    background: Float[Array, "c h w"] | None  # its depth, metres, 0 where it does not cover; None likewise
+    needed: Int[Array, ""]  # capacity that drawing the background needed
+    counts: Float[Array, "k"]  # number of pixels that show each group
+    visible: Bool[Array, "k"]  # groups that enough pixels show
 
 
 class Starts(NamedTuple):
-    """Hypotheses of where each group has gone.
+    """Hypotheses of where each group has gone."""
 
-    Attributes:
-        twists: translation, metres, and rotation vector, radians, of each hypothesis.
-        delta: initial displacement of each Gaussian, metres.
-        found: groups that template matching found.
-        score: score of template matching in each camera.
-    """
-
-    twists: Float[Array, "h k 6"]
-    delta: Float[Array, "m 3"]
-    found: Bool[Array, "k"]
-    score: Float[Array, "c k"]
+    twists: Float[Array, "h k 6"]  # translation, metres, and rotation vector, radians
+    delta: Float[Array, "m 3"]  # initial displacement of each Gaussian, metres
+    found: Bool[Array, "k"]  # groups that template matching found
+    score: Float[Array, "c k"]  # of template matching
 
 
 class Alignment(NamedTuple):
-    """The result of alignment and search.
-
-    Attributes:
-        search: the best twist of each group, and where it may be instead.
-        points: the points that were aligned.
-        reference: the reference points among them, as the last frame saw them.
-        suspects: groups that are lost, or may be and whose turn it was to be relocated.
-        other_depths: depth of the groups that are not in doubt, metres; else 0.
-        needed: capacity that drawing the last scene in the new cameras needed.
-    """
+    """The result of alignment and search."""
 
     search: SearchResult
-    points: Points
-    reference: Points
-    suspects: Bool[Array, "k"]
-    other_depths: Float[Array, "c h w"]
-    needed: Int[Array, ""]
+    points: Points  # the points that were aligned
+    reference: Points  # the reference points among them, as the last frame saw them
+    suspects: Bool[Array, "k"]  # groups that are lost, or may be and whose turn it was to be relocated
+    other_depths: Float[Array, "c h w"]  # depth of the groups that are not in doubt, metres; else 0
+    needed: Int[Array, ""]  # capacity that drawing the last scene in the new cameras needed
 
 
 class Refined(NamedTuple):
-    """The motion after refinement, or as aligned without it.
-
-    Attributes:
-        motion: motion of groups and Gaussians.
-        residuals: disagreement of each group with the images: 0 perfect, 1 not at all.
-        scene: the scene with its background as refined.
-        shifts: displacement of each Gaussian of the background; None if that is frozen.
-        needed: capacities that the refinement needed.
-        info: info of the refinement; empty without it.
-    """
+    """The motion after refinement, or as aligned without it."""
 
     motion: Motion
-    residuals: Float[Array, "k"]
-    scene: TrackedScene
-    shifts: Float[Array, "b 3"] | None
-    needed: Needed
-    info: dict[str, Any]
+    residuals: Float[Array, "k"]  # disagreement with the images: 0 perfect, 1 not at all
+    scene: TrackedScene  # with the background as refined
+    shifts: Float[Array, "b 3"] | None  # of each Gaussian of the background; None if that is frozen
+    needed: Needed  # by the refinement
+    info: dict[str, Any]  # of the refinement; empty without it
 
 
 class Settled(NamedTuple):
-    """Where each group is, and whether it is lost.
-
-    Attributes:
-        motion: the motion that is kept.
-        confidence: confidence that each group is where it is believed to be.
-        elsewhere: groups of which more shows in another place than in their own.
-        relocated: those of them that are moved there.
-        guesses: twists to where each group may be instead, from its place in the last frame.
-    """
+    """Where each group is, and whether it is lost."""
 
     motion: Motion
-    confidence: Confidence
-    elsewhere: Bool[Array, "k"]
-    relocated: Bool[Array, "k"]
-    guesses: Float[Array, "k 6"]
+    confidence: Confidence  # that each group is where it is believed to be
+    elsewhere: Bool[Array, "k"]  # groups of which more shows in another place than in their own
+    relocated: Bool[Array, "k"]  # those of them that are moved there
+    guesses: Float[Array, "k 6"]  # twists from the place in the last frame to where each may be instead

@@ -61,18 +61,21 @@ def look_back(now: UpdateContext, config: TrackConfig) -> Past:
 def starting_points(now: UpdateContext, past: Past, config: TrackConfig, reduction: int) -> Starts:
     """Second stage: hypotheses of the motion up to now: none, the same as in the last frame, and that of
     template matching, for which `reduction` is the factor by which images shrink."""
-    jump, found, score = _match(past.template, now, config, reduction)
-    before = now.state.motion.twists
-    still = jnp.zeros_like(before)
-    jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
-    starts, delta = [still], jnp.zeros_like(now.state.motion.delta)
+    before, num_objects = now.state.motion, now.scene.num_objects
+    still, delta = jnp.zeros_like(before.twists), jnp.zeros_like(before.delta)
+    starts = [still]
+    found, score = jnp.zeros(num_objects, bool), jnp.zeros((len(now.frame.images), num_objects))
     if config.matching:
-        starts += [jumped]
+        assert past.template is not None
+        match = match_templates(past.template, now.frame, config.match, reduction)
+        shifts, found = lift(match, now.frame, config.match)
+        shifts, score = jnp.where(found[:, None], shifts, 0.0), match.score
+        starts += [still.at[:, :3].set(shifts)]
     if config.warm_start:
-        starts += [before]
-        delta = now.state.motion.delta
-    if config.matching and config.warm_start:
-        starts += [before.at[:, :3].set(jumped[:, :3])]
+        starts += [before.twists]
+        delta = before.delta
+        if config.matching:
+            starts += [before.twists.at[:, :3].set(shifts)]
     return Starts(jnp.stack(starts), delta, found, score)
 
 
@@ -165,17 +168,6 @@ def _show_again(
     moved = wanted & ~are_same(past.cameras, backdrop.cameras)
     again = partial(show, now.scene, now.pose, now.frame, backdrop, now.plan, config)
     return jax.lax.cond(moved, again, lambda: before)
-
-
-def _match(template: Template | None, now: UpdateContext, config: TrackConfig, reduction: int):
-    """Translation of each group by template matching [K, 3], whether it was found [K], and scores [C, K]."""
-    num_objects, num_cameras = now.scene.num_objects, len(now.frame.images)
-    if not config.matching:
-        nowhere, unfound = jnp.zeros((num_objects, 3)), jnp.zeros(num_objects, bool)
-        return nowhere, unfound, jnp.zeros((num_cameras, num_objects))
-    assert template is not None
-    match = match_templates(template, now.frame, config.match, reduction)
-    return *lift(match, now.frame, config.match), match.score
 
 
 def _refine(
