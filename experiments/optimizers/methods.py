@@ -23,7 +23,7 @@ from gsjax.geometry.cameras import pixel_grid, unproject
 from gsjax.methods.track.align import align, widened
 from gsjax.methods.track.config import AlignConfig, RefineConfig
 from gsjax.methods.track.motion import Motion, place
-from gsjax.methods.track.points import sight_of
+from gsjax.methods.track.points import tone_images
 from gsjax.methods.track.refine import refine_loss, refine_residual
 from gsjax.methods.track.search import first_watch, search
 from gsjax.optim.least_squares import least_squares_step
@@ -167,17 +167,17 @@ over_groups = jax.vmap(align, in_axes=(0, 0, 0, None, None))
 @partial(jitted, static_argnames="config")
 def aligned(start, points, centers, frame, config=ALIGN):
     """Wide scales first, then narrow ones, as in `search`."""
-    sight = sight_of(frame, config.shading)
-    wide = over_groups(start, points, centers, sight, widened(config))
-    return over_groups(wide, points, centers, sight, config)
+    images = tone_images(frame, config.shading)
+    wide = over_groups(start, points, centers, images, widened(config))
+    return over_groups(wide, points, centers, images, config)
 
 
 @partial(jitted, static_argnames="config")
 def searched(start, points, centers, frame, config=ALIGN):
     """The same, and then every group is looked for all around."""
-    sight, count = sight_of(frame, config.shading), len(centers)
+    images, count = tone_images(frame, config.shading), len(centers)
     seen = (config, first_watch(jnp.ones(count)), jnp.ones(count, bool), jnp.int32(count))
-    return search(start[None], points, centers, sight, *seen).found.twists
+    return search(start[None], points, centers, images, *seen).estimate.twists
 
 
 def direct(update: Update, counts: list[int], find: Callable = aligned) -> Trace:

@@ -116,23 +116,12 @@ def best_grasp(
     """
     if samples < 1:
         raise ValueError(f"samples: expected 1 or more, found {samples}")
-    poses = sample_poses(
-        key, points, normals, valid, gripper, samples, approach=approach, max_angle=max_angle
-    )
+    limits = {"approach": approach, "max_angle": max_angle}
+    poses = sample_poses(key, points, normals, valid, gripper, samples, **limits)
+    scene = (points, normals, valid, obstacles, obstacle_valid, gripper)
 
     def score(pose: Float[Array, "4 4"]) -> Grasp:
-        return score_grasp(
-            pose,
-            points,
-            normals,
-            valid,
-            obstacles,
-            obstacle_valid,
-            gripper,
-            approach=approach,
-            max_angle=max_angle,
-            unseen=unseen,
-        )
+        return score_grasp(pose, *scene, **limits, unseen=unseen)
 
     grasps = jax.lax.map(score, poses, batch_size=min(_BATCH, samples))
     best = jnp.argmax(grasps.score + grasps.feasible)

@@ -1,15 +1,15 @@
-"""Which view a step has, where each step has one."""
+"""The order in which steps visit views, one view per step."""
 
 import numpy as np
 
 
 def shuffled_index(seed: int, step: int, count: int) -> int:
-    """All views in a random order, and then in another; the same for the same seed and step.
+    """Index of the view of a step: epochs over all views, each in another random order.
 
     Args:
-        seed: of the orders.
-        step: 0 and up.
-        count: how many views.
+        seed: seed of the orders.
+        step: index of the step.
+        count: number of views.
     """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng((seed, epoch)).permutation(count)[place])

@@ -1,20 +1,23 @@
-"""What settings may be."""
+"""Validation of configurations."""
 
 from typing import Any
 
 import numpy as np
 
 ABOVE_ZERO = (np.nextafter(0.0, 1.0), np.inf)
-"""The range of what must be more than 0."""
+"""The range of values above 0."""
 
 
 def expect(config: Any, where: str = "", **ranges: tuple[float, float]) -> None:
-    """Raises ValueError for the first field of a config that lies outside its range, or is NaN.
+    """Check that fields of a config lie in their ranges and are not NaN.
 
     Args:
-        config: has the fields.
-        where: what stands before their names, "rates." say.
-        ranges: the least and the most that each may be.
+        config: the configuration.
+        where: prefix of the names of its fields in the error, such as "rates.".
+        ranges: smallest and largest value of each field.
+
+    Raises:
+        ValueError: a field is outside its range.
     """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)

@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track.align import disagreement
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.points import sight_of
+from gsjax.methods.track.points import tone_images
 
 CONFIG = AlignConfig(iterations=12)
 CARTON = 2
@@ -13,7 +13,7 @@ SIZE = {"width": 160, "height": 120}
 
 
 def see(frame):
-    return sight_of(frame, CONFIG.shading)
+    return tone_images(frame, CONFIG.shading)
 
 
 def middle(points):
@@ -22,7 +22,7 @@ def middle(points):
 
 
 def gap(points, sight, config=CONFIG):
-    """How badly points agree where they are."""
+    """Disagreement of points where they are."""
     return float(disagreement(jnp.zeros(6), points, jnp.zeros(3), sight, config))
 
 

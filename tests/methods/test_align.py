@@ -1,4 +1,4 @@
-"""Direct alignment finds a known motion of a textured object, and keeps away from what is not there."""
+"""Direct alignment finds a known motion of a textured object, and leaves what nobody sees where it is."""
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,10 @@ from gsjax.methods.track.align import (
     _normal_equations,
     _residuals,
     align,
-    ball,
+    ball_grid,
     bilinear,
-    spot,
-    turned,
+    pixel_position,
+    turn_hypotheses,
 )
 from gsjax.methods.track.points import Points, carry
 from tests.methods.carton import CONFIG, SIZE, error, gap, see
@@ -65,7 +65,7 @@ def test_disagreement_is_nothing_for_a_perfect_fit_and_half_outside_the_picture(
 def test_bilinear_reads_between_pixel_centres_and_knows_its_slope():
     image = jnp.asarray(np.mgrid[0:4, 0:5].transpose(1, 2, 0) + 0.5, jnp.float32)  # (row, column) of centres
     places = jnp.array([[2.3, 1.7], [0.5, 0.5], [4.5, 3.5]])
-    read = bilinear(image, spot(*places.T, 5, 4))
+    read = bilinear(image, pixel_position(*places.T, 5, 4))
     np.testing.assert_allclose(read.values.T, places[:, ::-1], atol=2e-3)
     np.testing.assert_allclose(read.slopes, np.tile([[[0], [1]], [[1], [0]]], 3), atol=1e-6)
     np.testing.assert_allclose(read.nearest.T, [[1.5, 2.5], [0.5, 0.5], [3.5, 4.5]])
@@ -119,16 +119,16 @@ def test_many_starts_at_once_are_each_alone(moved):
     np.testing.assert_allclose(together, alone, atol=2e-4)
 
 
-def test_a_ball_holds_the_origin_and_nothing_outside():
-    grid = ball(0.045, 0.015)
+def test_a_ball_grid_holds_the_origin_and_nothing_outside():
+    grid = ball_grid(0.045, 0.015)
     assert (np.linalg.norm(grid, axis=1) <= 0.045).all()
     assert (np.abs(grid).sum(1) == 0).sum() == 1
     assert len(grid) == 123
 
 
-def test_turned_holds_the_start_and_turns_about_its_own_axes():
+def test_turn_hypotheses_hold_the_start_and_turns_about_its_own_axes():
     twist = jnp.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4])
-    hypotheses = turned(twist, jnp.eye(3), (0.2, 0.6))
+    hypotheses = turn_hypotheses(twist, jnp.eye(3), (0.2, 0.6))
     assert hypotheses.shape == (13, 6)
     np.testing.assert_allclose(hypotheses[0], twist, atol=1e-6)
     np.testing.assert_allclose(hypotheses[:, :3], jnp.tile(twist[:3], (13, 1)))

@@ -1,4 +1,4 @@
-"""A budget is kept by leaving things out, and what was late is paid back."""
+"""A budget is met by omitting searches, and delays are compensated."""
 
 import pytest
 from hypothesis import given
@@ -68,13 +68,13 @@ def test_the_richest_rung_that_fits_is_chosen(budget_ms, expected, fits, most_me
     assert len(calls) == len(set(calls)) == len(chosen.tried) <= most_measured
 
 
-def test_as_many_groups_are_looked_for_as_there_is_time_for():
+def test_as_many_groups_are_searched_for_as_there_is_time_for():
     assert Governor(0.033, Costs(0.010, 0.004), 9).allowed() == 4
     assert Governor(0.100, Costs(0.010, 0.004), 9).allowed() == 9
     assert Governor(0.010, Costs(0.020, 0.004), 9).allowed() == 0
 
 
-def test_what_was_late_is_paid_back_and_then_forgotten():
+def test_a_delay_is_compensated_and_then_forgotten():
     governor, costs = Governor(0.033, Costs(0.010, 0.004), 9), Costs(0.010, 0.004)
     governor.spent(0.048, 4)  # something else took the processor
     allowed = []
@@ -88,7 +88,7 @@ def test_what_was_late_is_paid_back_and_then_forgotten():
 
 @given(st.lists(st.floats(0, 0.2), min_size=1, max_size=60))
 def test_a_governor_always_recovers(hiccups):
-    """However late updates were, undisturbed ones look for groups again within a second or so."""
+    """However late updates were, undisturbed ones search for groups again within a second or so."""
     governor, costs = Governor(0.033, Costs(0.010, 0.004), 9), Costs(0.010, 0.004)
     for hiccup in hiccups:
         count = governor.allowed()
@@ -106,7 +106,7 @@ def test_a_budget_of_nothing_is_refused(table, started):
         next(track(started, frames[0], frames[1:], budget_ms=-1))
 
 
-def test_what_updates_cost_is_measured_with_the_second_frame(table, started, monkeypatch):
+def test_costs_are_measured_with_the_second_frame(table, started, monkeypatch):
     """Where cameras move, updates to the first one again would draw no background."""
     _, frames, _ = table()
 

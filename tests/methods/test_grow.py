@@ -12,15 +12,15 @@ from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track import first_pose, render_labels
 from gsjax.methods.track.config import GrowConfig
 from gsjax.methods.track.grow import (
-    EMPTY,
+    _draw,
     _nearest,
-    _some_of,
     empty_slots,
     grow,
     unexplained,
     with_slots,
 )
 from gsjax.methods.track.layers import shown_by
+from gsjax.methods.track.scene import EMPTY
 from gsjax.metrics.tracking import true_labels
 from gsjax.scene.render import plan_render, render
 
@@ -35,7 +35,7 @@ def plan(table, started):
 
 @pytest.fixture(scope="module")
 def torn(started):
-    """The scene without the half of the carton that lies to one side: never seen, as it were."""
+    """The scene without one half of the carton, as if never seen."""
     member = np.asarray(started.labels) == started.label_ids.index(CARTON)
     x = np.asarray(started.gaussians.means[:, 0])
     gone = member & (x > np.median(x[member]))
@@ -61,11 +61,11 @@ def grown(scene, frame, plan, steps=1, config=CONFIG):
     ("size", "num_chosen"),
     [(1000, 0), (1000, 3), (1000, 16), (1000, 700), (1000, 1000), (600, 50), (63, 63), (65, 20), (1, 1)],
 )
-def test_some_of_the_chosen_are_taken_and_all_get_their_turn(size, num_chosen):
+def test_some_of_the_chosen_places_are_drawn_and_over_time_all_of_them(size, num_chosen):
     count = 16
     chosen = np.zeros(size, bool)
     chosen[np.random.default_rng(0).permutation(size)[:num_chosen]] = True
-    some_of = jax.jit(lambda step: _some_of(jnp.asarray(chosen), step, count))
+    some_of = jax.jit(lambda step: _draw(jnp.asarray(chosen), step, count))
     taken = set()
     for step in range(400):
         places, real = map(np.asarray, some_of(step))
@@ -80,7 +80,7 @@ def test_some_of_the_chosen_are_taken_and_all_get_their_turn(size, num_chosen):
 @pytest.mark.slow
 @pytest.mark.parametrize("none_taken", [False, True])
 def test_the_nearest_is_that_of_all_distances(started, none_taken):
-    """The count of Gaussians fills no row of lanes; empty slots are nobody's neighbour."""
+    """The count of Gaussians fills no row of lanes; empty slots are no neighbours."""
     scene = with_slots(started, 32)
     if none_taken:
         scene = eqx.tree_at(lambda s: s.labels, scene, jnp.full_like(scene.labels, scene.num_objects + 1))
@@ -119,7 +119,7 @@ def test_what_is_missing_joins_the_object_that_it_continues(table, torn, plan):
     new = slice(torn.num_moving, scene.num_moving)
     joined = ~np.asarray(empty_slots(scene))[new]
     values = np.asarray(scene.label_ids)[np.asarray(scene.labels)[new][joined]]
-    assert (values == CARTON).sum() >= 8  # one pixel in four is looked at
+    assert (values == CARTON).sum() >= 8  # one pixel in four is examined
     where = np.asarray(pose.means)[new][joined]
     masks, depths = [[np.asarray(a(0, c)) for c in range(2)] for a in (sequence.mask, sequence.depth)]
     truth = true_labels(where, masks, depths, list(sequence.viewmats[0]), list(sequence.Ks[0]))

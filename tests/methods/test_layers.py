@@ -1,4 +1,4 @@
-"""What moves, drawn over a background that is kept, shows what the whole scene shows."""
+"""Moving Gaussians over a stored background show what the whole scene shows."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -120,7 +120,7 @@ def test_what_stands_in_front_hides_what_moves(both, started, plans):
 def test_the_backdrop_is_drawn_again_only_when_a_camera_moves(both, started, plans, table):
     _, _, backdrop = both
     cameras = table()[1][0].cameras
-    marked = backdrop._replace(depths=backdrop.depths + 7.0)  # tells a kept one from one drawn anew
+    marked = backdrop._replace(depths=backdrop.depths + 7.0)  # distinguishes a stored one from a new one
     kept, needed = keep_backdrop(marked, started, cameras, plans[1])
     np.testing.assert_array_equal(kept.depths, marked.depths)
     assert needed == 0

@@ -1,4 +1,4 @@
-"""Whether a group is where it is believed to be, and where it is looked for when it is not."""
+"""Whether a group is where it is believed to be, and where it is searched for if not."""
 
 from dataclasses import replace
 
@@ -17,23 +17,23 @@ from gsjax.methods.track import GrowConfig, RefineConfig, first_pose
 from gsjax.methods.track.align import coarse_shifts
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
-from gsjax.methods.track.lost import FOUND, LOST, confidence, is_found
+from gsjax.methods.track.lost import FOUND, LOST, group_confidence, is_found
 from gsjax.methods.track.motion import facing
-from gsjax.methods.track.points import Points, carry, pixels_of_groups, sight_of
+from gsjax.methods.track.points import Points, carry, pixels_of_groups, tone_images
 from gsjax.methods.track.recover import (
     Relocation,
     SearchContext,
     depths_of_others,
-    guesses,
+    draw_guesses,
+    label_unexplained,
     recover,
     relative_twists,
-    with_unexplained,
 )
 from gsjax.methods.track.reference import (
     ReferencePoints,
-    all_facing,
-    as_facing,
-    as_last_seen,
+    all_points_facing,
+    points_facing,
+    points_last_seen,
     radii,
     reference_points,
 )
@@ -45,12 +45,12 @@ SIZE = {"width": 160, "height": 120}
 
 @pytest.fixture(scope="module")
 def carton(table):
-    """(sight, points that show the carton in it, as one group)."""
+    """(images, points that show the carton in it, as one group)."""
     sequence, frames, _ = table(8, 2, **SIZE)
     labels = np.stack([sequence.mask(6, c) for c in range(2)])
-    sight = sight_of(frames[6], 0.3)
+    images = tone_images(frames[6], 0.3)
     labels = jnp.asarray(np.where(labels == CARTON, 1, 0), jnp.int32)
-    return sight, pixels_of_groups(sight, labels, sight.depths, 1, AlignConfig())
+    return images, pixels_of_groups(images, labels, images.depths, 1, AlignConfig())
 
 
 def moved(points: Points, *twist: float) -> Points:
@@ -58,66 +58,71 @@ def moved(points: Points, *twist: float) -> Points:
     return jax.vmap(carry)(points, jnp.asarray([twist]), center)
 
 
-def test_what_is_where_it_was_agrees_and_what_is_elsewhere_does_not(carton):
-    sight, points = carton
-    here = confidence(points, sight, GAP)
-    assert here.agrees[0] > 0.95
-    assert here.shows[0] > 0.95
-    assert here.tells[0]
+def test_a_group_agrees_in_its_place_and_nowhere_else(carton):
+    images, points = carton
+    here = group_confidence(points, images, GAP)
+    assert here.agreement[0] > 0.95
+    assert here.coverage[0] > 0.95
+    assert here.conclusive[0]
     for shift in ((0.06, 0.0, 0.0), (0.0, -0.06, 0.0), (0.0, 0.0, 0.06)):
-        there = confidence(moved(points, *shift, 0, 0, 0), sight, GAP)
-        assert there.shows[0] < FOUND, shift
-    assert confidence(moved(points, 0, 0, 0.1, 0, 0, 0), sight, GAP).agrees[0] < LOST
+        there = group_confidence(moved(points, *shift, 0, 0, 0), images, GAP)
+        assert there.coverage[0] < FOUND, shift
+    assert group_confidence(moved(points, 0, 0, 0.1, 0, 0, 0), images, GAP).agreement[0] < LOST
 
 
-def test_what_hides_a_group_says_nothing_of_it(carton):
-    """A hand before the left camera: what the other sees decides, and both hidden, nobody tells."""
-    sight, points = carton
-    near = sight.pixels.at[0, ..., 3].set(0.2)
-    one = confidence(points, sight._replace(pixels=near), GAP)
-    assert one.agrees[0] > 0.95
-    assert one.tells[0]
+def test_an_occluder_is_inconclusive(carton):
+    """A hand before the left camera: the other camera decides; with both hidden, none does."""
+    images, points = carton
+    near = images.pixels.at[0, ..., 3].set(0.2)
+    one = group_confidence(points, images._replace(pixels=near), GAP)
+    assert one.agreement[0] > 0.95
+    assert one.conclusive[0]
     share = points.seen[0, 1].sum() / points.seen.sum()
-    assert one.shows[0] == pytest.approx(float(share * one.agrees[0]), rel=1e-3)
-    away = confidence(moved(points, 3.0, 0, 0, 0, 0, 0), sight, GAP)
-    assert not away.tells[0]
-    assert away.shows[0] == 0
-    both = confidence(points, sight._replace(pixels=sight.pixels.at[..., 3].set(0.2)), GAP)
-    assert not both.tells[0]
-    assert both.shows[0] == 0
+    assert one.coverage[0] == pytest.approx(float(share * one.agreement[0]), rel=1e-3)
+    away = group_confidence(moved(points, 3.0, 0, 0, 0, 0, 0), images, GAP)
+    assert not away.conclusive[0]
+    assert away.coverage[0] == 0
+    both = group_confidence(points, images._replace(pixels=images.pixels.at[..., 3].set(0.2)), GAP)
+    assert not both.conclusive[0]
+    assert both.coverage[0] == 0
 
 
 def test_what_shows_the_background_does_not_show_the_group(carton):
     """A can that slips into a garage's front agrees with it in depth and nearly in colour."""
-    sight, points = carton
-    usual = confidence(points, sight, GAP)
-    behind, unknown = jnp.where(sight.depths > 0, sight.depths + 0.05, 0.0), jnp.zeros_like(sight.depths)
+    images, points = carton
+    usual = group_confidence(points, images, GAP)
+    behind, unknown = jnp.where(images.depths > 0, images.depths + 0.05, 0.0), jnp.zeros_like(images.depths)
     for background in (behind, unknown, behind[:, ::2, ::2]):
-        assert confidence(points, sight, GAP, background).agrees[0] > 0.99 * usual.agrees[0]
-    wall = sight.depths + GAP / 2
-    before_it = sight._replace(pixels=sight.pixels.at[..., 3].set(wall))
-    assert confidence(points, before_it, GAP).agrees[0] > 0.99 * usual.agrees[0]
-    assert confidence(points, before_it, GAP, wall).agrees[0] == 0
-    coarse = confidence(points, before_it, GAP, wall[:, ::2, ::2])
-    assert coarse.agrees[0] < FOUND  # on a slope the pixel beside is at another depth
-    assert coarse.tells[0]
+        assert group_confidence(points, images, GAP, background).agreement[0] > 0.99 * usual.agreement[0]
+    wall = images.depths + GAP / 2
+    before_it = images._replace(pixels=images.pixels.at[..., 3].set(wall))
+    assert group_confidence(points, before_it, GAP).agreement[0] > 0.99 * usual.agreement[0]
+    assert group_confidence(points, before_it, GAP, wall).agreement[0] == 0
+    coarse = group_confidence(points, before_it, GAP, wall[:, ::2, ::2])
+    assert coarse.agreement[0] < FOUND  # on a slope, the neighbouring pixel has another depth
+    assert coarse.conclusive[0]
 
 
 def test_a_card_on_a_table_is_not_lost(carton):
-    """What is as flat as what it lies on is measured like it; colour decides."""
-    sight, points = carton
-    under = jnp.where(sight.depths > 0, sight.depths + GAP / 5, 0.0)
-    usual = confidence(points, sight, GAP)
-    assert confidence(points, sight, GAP, under).agrees[0] == pytest.approx(float(usual.agrees[0]))
-    other = sight._replace(pixels=sight.pixels.at[..., :3].add(0.5))
-    assert confidence(points, other, GAP, under).agrees[0] < LOST
-    assert confidence(points, sight, GAP, None, under).agrees[0] < LOST  # on another group nothing lies so
+    """A flat object is measured like the surface on which it lies; colour decides."""
+    images, points = carton
+    under = jnp.where(images.depths > 0, images.depths + GAP / 5, 0.0)
+    usual = group_confidence(points, images, GAP)
+    assert group_confidence(points, images, GAP, under).agreement[0] == pytest.approx(
+        float(usual.agreement[0])
+    )
+    other = images._replace(pixels=images.pixels.at[..., :3].add(0.5))
+    assert group_confidence(points, other, GAP, under).agreement[0] < LOST
+    of_others = group_confidence(points, images, GAP, None, under)  # which exempt no card
+    assert of_others.agreement[0] < LOST
     nothing = jnp.zeros_like(under)
-    assert confidence(points, sight, GAP, None, nothing).agrees[0] == pytest.approx(float(usual.agrees[0]))
+    assert group_confidence(points, images, GAP, None, nothing).agreement[0] == pytest.approx(
+        float(usual.agreement[0])
+    )
 
 
-def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera(table, started, quick):
-    """Where it is believed to be it may be hidden; of others, what cameras saw last counts."""
+def test_a_suspect_is_searched_for_with_all_points_that_face_a_camera(table, started, quick):
+    """It may be hidden where it is believed to be; for other groups, the points seen last count."""
     _, frames, _ = table()
     pose, cameras, count = first_pose(started), frames[0].cameras, started.num_objects
     group = np.asarray(started.labels[: started.num_moving])
@@ -125,39 +130,41 @@ def test_a_group_that_may_be_elsewhere_is_asked_for_with_all_that_faces_a_camera
     reference = reference_points(started, pose, config)
     nothing = jnp.zeros((2, cameras.height, cameras.width))
     unseen = Shown(nothing.astype(int), nothing, nothing > 0)
-    assert not as_last_seen(reference, unseen, cameras, GAP).seen.any()
-    sight = sight_of(frames[0], config.shading)
-    asked = all_facing(reference, jnp.zeros((count, 6)), jnp.zeros((count, 3)), sight)
+    assert not points_last_seen(reference, unseen, cameras, GAP).seen.any()
+    images = tone_images(frames[0], config.shading)
+    facing_points = all_points_facing(reference, jnp.zeros((count, 6)), jnp.zeros((count, 3)), images)
     faces = facing(started, pose, camera_centers(cameras.viewmat))[:, : started.num_moving] > 0.5
     for k in range(count):
-        np.testing.assert_array_equal(asked.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
+        np.testing.assert_array_equal(facing_points.seen[k].sum(-1), faces[:, group == k + 1].sum(-1))
     about = jnp.array([0.0, 0.0, 0.1])
-    around = as_facing(
-        jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, sight
+    around = points_facing(
+        jax.tree.map(lambda a: a[0], reference), jnp.array([0, 0, 0, 0, 0, np.pi]), about, images
     )
-    assert float((around.seen != asked.seen[0]).sum()) > 0  # what turns away faces them no more
+    assert (
+        float((around.seen != facing_points.seen[0]).sum()) > 0
+    )  # points that turn away no longer face them
 
 
 def test_without_depth_colour_alone_decides(carton):
-    sight, points = carton
-    sight = sight._replace(pixels=sight.tones)
-    assert confidence(points, sight, GAP).agrees[0] > 0.95
-    assert confidence(moved(points, 0.1, 0.1, 0, 0, 0, 0), sight, GAP).agrees[0] < 0.6
+    images, points = carton
+    images = images._replace(pixels=images.tones)
+    assert group_confidence(points, images, GAP).agreement[0] > 0.95
+    assert group_confidence(moved(points, 0.1, 0.1, 0, 0, 0, 0), images, GAP).agreement[0] < 0.6
 
 
-def test_strangers_are_nearer_than_what_is_modelled(carton):
-    sight, _ = carton
-    model = jnp.full(sight.depths.shape, 0.9)
+def test_unexplained_pixels_are_nearer_than_the_model(carton):
+    images, _ = carton
+    model = jnp.full(images.depths.shape, 0.9)
     shown = Shown(jnp.ones(model.shape, jnp.int32), model, model > 0)
-    found = with_unexplained(shown, sight, 1, GAP, GAP, 1)
-    strange = np.asarray((sight.depths > 0) & (sight.depths < 0.9 - GAP))
+    found = label_unexplained(shown, images, 1, GAP, GAP, 1)
+    strange = np.asarray((images.depths > 0) & (images.depths < 0.9 - GAP))
     assert 0 < strange.mean() < 1
     np.testing.assert_array_equal(found.labels, np.where(strange, 2, 1))
-    np.testing.assert_array_equal(found.depths, np.where(strange, sight.depths, 0.9))
-    thick = with_unexplained(shown, sight, 1, GAP, 0.1, 1)  # a group explains what is a little nearer
-    np.testing.assert_array_equal(thick.labels == 2, np.asarray((sight.depths > 0) & (sight.depths < 0.8)))
-    blind = sight._replace(pixels=sight.tones)
-    assert with_unexplained(shown, blind, 1, GAP, GAP, 1) is shown
+    np.testing.assert_array_equal(found.depths, np.where(strange, images.depths, 0.9))
+    thick = label_unexplained(shown, images, 1, GAP, 0.1, 1)  # a group explains depth that is slightly nearer
+    np.testing.assert_array_equal(thick.labels == 2, np.asarray((images.depths > 0) & (images.depths < 0.8)))
+    blind = images._replace(pixels=images.tones)
+    assert label_unexplained(shown, blind, 1, GAP, GAP, 1) is shown
 
 
 @pytest.fixture(scope="module")
@@ -168,21 +175,23 @@ def one(table, started, quick):
     mine = jax.tree.map(lambda a: a[started.label_ids.index(CARTON) - 1], reference)
     center = (mine.means * mine.real).sum(-1) / mine.real.sum()
     shown = jnp.stack([sequence.mask(0, c) == CARTON for c in range(2)])
-    return mine, center, sight_of(frame, quick.align.shading), shown
+    return mine, center, tone_images(frame, quick.align.shading), shown
 
 
-def strangers_of(sight, strange) -> Points:
-    found = pixels_of_groups(sight, strange.astype(jnp.int32), sight.depths, 1, AlignConfig())
+def strangers_of(images, strange) -> Points:
+    found = pixels_of_groups(images, strange.astype(jnp.int32), images.depths, 1, AlignConfig())
     return jax.tree.map(lambda a: a[0], found)
 
 
-def test_guesses_bring_points_to_strangers_or_stay_near(one):
-    reference, center, sight, shown = one
+def test_guesses_bring_points_to_unexplained_pixels_or_stay_near(one):
+    reference, center, images, shown = one
     config, guess = AlignConfig(), jnp.array([0.3, 0.0, 0.1, 0.0, 0.5, 0.0])
-    unexplained_pixels, shifts = strangers_of(sight, shown), coarse_shifts(config, sight)
+    unexplained_pixels, shifts = strangers_of(images, shown), coarse_shifts(config, images)
 
     def draw(seed, unexplained_pixels=unexplained_pixels, config=config):
-        return guesses(jax.random.key(seed), shifts, reference, center, unexplained_pixels, guess, config)
+        return draw_guesses(
+            jax.random.key(seed), shifts, reference, center, unexplained_pixels, guess, config
+        )
 
     drawn = [draw(0), draw(0), draw(1)]
     np.testing.assert_array_equal(drawn[0], drawn[1])
@@ -191,7 +200,7 @@ def test_guesses_bring_points_to_strangers_or_stay_near(one):
     np.testing.assert_array_equal(drawn[0][2::4, :3], shifts[2::4, :3])
     places = np.asarray(unexplained_pixels.means).transpose(0, 2, 1)[np.asarray(unexplained_pixels.seen) > 0]
     for twist in drawn[0][1:20:2]:
-        reached = np.asarray(as_facing(reference, twist, center, sight).means)[0].T[
+        reached = np.asarray(points_facing(reference, twist, center, images).means)[0].T[
             np.asarray(reference.real)
         ]
         assert np.linalg.norm(reached[:, None] - places, axis=-1).min() < 1e-5
@@ -204,16 +213,16 @@ def test_guesses_bring_points_to_strangers_or_stay_near(one):
     )
 
 
-def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one):
-    """From 15 cm and 57 degrees off; each frame goes on from the last one's guess."""
-    reference, center, sight, shown = one
+def test_a_lost_group_is_recovered_over_frames_but_not_at_another_object(one):
+    """From 15 cm and 57 degrees off; each frame continues from the guess of the last."""
+    reference, center, images, shown = one
     off = jnp.array([0.1, -0.1, 0.05, 0.0, 0.0, 1.0])
     lost = reference._replace(
         means=carry(Points(reference.means, reference.tones, reference.real), off, center).means,
         normals=jnp.einsum("ij,jp->ip", jaxlie.SO3.exp(off[3:]).as_matrix(), reference.normals),
     )
-    others, config = jnp.where(shown, 0.0, sight.depths), AlignConfig()
-    unexplained_pixels = strangers_of(sight, shown)
+    others, config = jnp.where(shown, 0.0, images.depths), AlignConfig()
+    unexplained_pixels = strangers_of(images, shown)
     look = jax.jit(
         lambda seed, guess, around: recover(
             jax.random.key(seed), lost, center + off[:3], guess, around, config, GAP
@@ -223,28 +232,26 @@ def test_what_is_lost_is_recovered_by_and_by_and_not_where_something_else_is(one
     def after(frames, others, start=0 * off):
         found = Relocation(start, None, None)
         for seed in range(frames):
-            found = look(seed, found.twists, SearchContext(sight, None, others, unexplained_pixels))
+            found = look(seed, found.twists, SearchContext(images, None, others, unexplained_pixels))
         return found
 
     found = after(8, others)
-    back = as_facing(lost, found.twists, center + off[:3], sight).means[0]
+    back = points_facing(lost, found.twists, center + off[:3], images).means[0]
     assert float(jnp.linalg.norm(back - reference.means, axis=0)[reference.real].max()) < 0.01
-    showed = confidence(
-        jax.tree.map(lambda a: a[None], as_facing(reference, 0 * off, center, sight)), sight, GAP
-    ).shows
-    assert is_found(jax.tree.map(lambda a: a[None], found.sure), showed)[0]
-    assert is_found(jax.tree.map(lambda a: a[None], found.before), showed)[0]
-    first = after(1, others)  # nothing was said before: it is believed where it is not
-    assert not is_found(jax.tree.map(lambda a: a[None], first.before), showed)[0]
-    for explained, there in ((jnp.zeros_like(sight.depths), True), (sight.depths, False)):
-        from_there = after(
-            1, explained, found.twists
-        )  # where all that is measured is something else, it is not
-        assert is_found(jax.tree.map(lambda a: a[None], from_there.sure), showed)[0] == there
+    showed = group_confidence(
+        jax.tree.map(lambda a: a[None], points_facing(reference, 0 * off, center, images)), images, GAP
+    ).coverage
+    assert is_found(jax.tree.map(lambda a: a[None], found.confidence), showed)[0]
+    assert is_found(jax.tree.map(lambda a: a[None], found.guess_confidence), showed)[0]
+    first = after(1, others)  # the first guess is where the group is not
+    assert not is_found(jax.tree.map(lambda a: a[None], first.guess_confidence), showed)[0]
+    for explained, there in ((jnp.zeros_like(images.depths), True), (images.depths, False)):
+        from_there = after(1, explained, found.twists)  # it is not where all depth is of other groups
+        assert is_found(jax.tree.map(lambda a: a[None], from_there.confidence), showed)[0] == there
 
 
 @given(st.integers(0, 2**31))
-def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
+def test_relative_twists_lead_to_the_same_place(seed):
     twists = 0.8 * jax.random.normal(jax.random.key(seed), (2, 6))
     points = Points(
         jax.random.normal(jax.random.key(seed + 1), (1, 3, 5)), jnp.zeros((1, 3, 5)), jnp.ones((1, 5))
@@ -256,7 +263,7 @@ def test_a_place_stays_where_it_is_when_its_group_is_moved(seed):
     np.testing.assert_allclose(again, there, atol=1e-4)
 
 
-def test_radii_are_of_those_that_there_are():
+def test_radii_ignore_padding():
     means = jnp.zeros((2, 3, 4)).at[0, 0].set(jnp.array([3.0, 5.0, 1.0, 9.0])).at[1, 2, 0].set(7.0)
     real = jnp.array([[True, True, False, False], [False] * 4])
     reference = ReferencePoints(means, means, means, real)
@@ -264,9 +271,9 @@ def test_radii_are_of_those_that_there_are():
     np.testing.assert_allclose(found, [5**0.5, 0.0], rtol=1e-6)
 
 
-def test_depths_of_others_are_those_of_what_is_not_in_doubt(carton):
-    sight, _ = carton
-    labels = jnp.zeros(sight.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
+def test_depths_of_others_are_those_of_groups_not_in_doubt(carton):
+    images, _ = carton
+    labels = jnp.zeros(images.depths.shape, jnp.int32).at[0, 0, :3].set(jnp.array([0, 1, 2]))
     shown = Shown(labels, jnp.full(labels.shape, 0.7), labels > 0)
     found = depths_of_others(shown, jnp.array([False, True]))
     np.testing.assert_allclose(found[0, 0, :3], [0.0, 0.7, 0.0])
@@ -281,8 +288,8 @@ def test_groups_in_doubt_take_turns_of_two_frames_in_a_row():
 
 @pytest.mark.parametrize("redraw", ["moving", "all"])
 @pytest.mark.slow
-def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, quick, redraw):
-    """The scene has the carton 12 cm beside where it is, too far to be looked for from there."""
+def test_an_object_that_is_elsewhere_is_reported_lost_and_then_found(table, started, quick, redraw):
+    """The scene has the carton 12 cm off, too far for a search from there."""
     _, frames, _ = table()
     config = replace(
         quick, redraw=redraw, matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)
@@ -301,8 +308,8 @@ def test_what_is_elsewhere_is_said_to_be_lost_and_then_found(table, started, qui
 
 
 @pytest.mark.slow
-def test_without_depth_what_vanishes_is_said_to_be_lost_and_stays(table, started, quick):
-    """Colour alone says so; nothing says where else to look."""
+def test_without_depth_a_vanished_object_is_reported_lost_and_stays(table, started, quick):
+    """Colour shows that it is gone, and nothing where else to search."""
     sequence, frames, _ = table()
     config = replace(
         quick, redraw="moving", matching=False, refine=RefineConfig(iterations=0), grow=GrowConfig(slots=0)

@@ -6,7 +6,7 @@ import pytest
 
 from gsjax.geometry.cameras import Camera, intrinsics, look_at, project
 from gsjax.methods.track.config import MatchConfig
-from gsjax.methods.track.matching import Match, Template, correlate, lift, match_templates
+from gsjax.methods.track.matching import Template, TemplateMatch, correlate, lift, match_templates
 from gsjax.scene.frame import Frame
 
 WIDTH, HEIGHT = 64, 48
@@ -119,7 +119,7 @@ def test_an_object_that_no_pixel_shows_is_not_found():
 START = np.array([[0.02, -0.01, 0.03]])
 
 
-def seen_to_move(moves, measured: bool, score=0.9) -> tuple[Match, Frame]:
+def seen_to_move(moves, measured: bool, score=0.9) -> tuple[TemplateMatch, Frame]:
     """What a perfect matcher reports when camera c sees START move by `moves[c]`."""
     count = len(moves)
     views = cameras(count)
@@ -130,7 +130,7 @@ def seen_to_move(moves, measured: bool, score=0.9) -> tuple[Match, Frame]:
     origin, depth = (jnp.stack(a) for a in zip(*before, strict=True))
     place, new_depth = (jnp.stack(a) for a in zip(*after, strict=True))
     scores = jnp.broadcast_to(jnp.asarray(score), (count,))[:, None]
-    match = Match(
+    match = TemplateMatch(
         score=scores,
         shift=place - origin,
         origin=origin,

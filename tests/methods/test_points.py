@@ -1,4 +1,4 @@
-"""Points that stand for a group: which pixels they are of, their tones, and the keyframe that keeps them."""
+"""The points of a group: their pixels, their tones, and the keyframe that stores them."""
 
 import equinox as eqx
 import jax.numpy as jnp

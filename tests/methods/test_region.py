@@ -5,7 +5,7 @@ import numpy as np
 
 from gsjax.methods.track import first_pose, place
 from gsjax.methods.track.plan import Needed, TrackPlan
-from gsjax.methods.track.region import near_background, near_scene, shift_background, spread
+from gsjax.methods.track.region import near_background, near_scene, scatter, shift_background
 from gsjax.rasterize.plan import Plan, rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render, render
@@ -55,7 +55,7 @@ def test_what_belongs_to_the_near_scene_is_given_back_to_the_whole(started):
     near = jnp.arange(num) % 3 == 1
     around = near_scene(started, near, int(near.sum()) + 7)
     shifts = jnp.arange(3.0 * (around.gaussians.num - around.num_moving)).reshape(-1, 3)
-    moved = shift_background(started, spread(near, shifts)).gaussians.means - started.gaussians.means
+    moved = shift_background(started, scatter(near, shifts)).gaussians.means - started.gaussians.means
     moved_near = shift_background(around, shifts).gaussians.means - around.gaussians.means
     rows = started.num_moving + np.flatnonzero(near)
     np.testing.assert_allclose(moved[rows], moved_near[around.num_moving : -7], rtol=1e-4)

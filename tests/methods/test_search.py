@@ -1,4 +1,4 @@
-"""What has jumped is found by looking everywhere, first of all where it is most urgent."""
+"""Groups that jump are found by a search everywhere, the most urgent ones first."""
 
 from dataclasses import replace
 
@@ -13,9 +13,9 @@ from gsjax.methods.track.points import Points, carry, pixels_of_groups, tones
 from gsjax.methods.track.recover import Relocation
 from gsjax.methods.track.search import (
     TURN_KNOWN,
-    Sought,
+    SearchResult,
+    best_of,
     first_watch,
-    least,
     principal_axes,
     search,
 )
@@ -25,11 +25,11 @@ from tests.methods.carton import CONFIG, SIZE, error, gap, middle, see
 search = jax.jit(search, static_argnums=(4, 9))
 
 
-def look(points, center, sight, config=CONFIG, everywhere=1):
+def look(points, center, images, config=CONFIG, everywhere=1):
     """The twist that a search of one group finds from standing still."""
     points = jax.tree.map(lambda a: a[None], points)
     how = (config, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(everywhere))
-    return search(jnp.zeros((1, 1, 6)), points, center[None], sight, *how).found.twists[0]
+    return search(jnp.zeros((1, 1, 6)), points, center[None], images, *how).estimate.twists[0]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def jumped(moved, table):
 
 
 def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
-    """Nothing overlaps where it starts, and nobody tells how far it went."""
+    """There is no overlap at the start, and no hint how far it went."""
     *given, shift = jumped
     brief = replace(CONFIG, iterations=3)
     miss = [float(jnp.linalg.norm(look(*given, brief, n)[:3] - shift)) for n in (0, 1)]
@@ -51,8 +51,8 @@ def test_search_finds_a_jump_that_alignment_alone_misses(jumped):
 
 
 def test_search_finds_what_is_pushed_while_it_turns(moved):
-    """It goes on turning as before, but 36 mm further than expected: only a shift from there finds it."""
-    points, center, sight, then, _ = moved
+    """It keeps turning as before, but 36 mm further than expected: only a shift from there finds it."""
+    points, center, images, then, _ = moved
     points = points._replace(means=jnp.asarray(then, jnp.float32))
     middle_then = center + (points.means - moved[0].means).mean((0, 2))
     expected = jnp.array([0.02, 0.02, 0.02, 0.0, 0.0, 0.6])
@@ -67,7 +67,7 @@ def test_search_finds_what_is_pushed_while_it_turns(moved):
         group = jax.tree.map(lambda a: a[None], before)
         starts = jnp.stack([jnp.zeros(6), expected])[:, None]
         how = (brief, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(everywhere))
-        return search(starts, group, (middle_then - true[:3])[None], sight, *how).found.twists[0]
+        return search(starts, group, (middle_then - true[:3])[None], images, *how).estimate.twists[0]
 
     assert jnp.linalg.norm(searched(0)[:3] - true[:3]) > 0.01
     np.testing.assert_allclose(searched(1)[:3], true[:3], atol=2e-3)
@@ -75,33 +75,34 @@ def test_search_finds_what_is_pushed_while_it_turns(moved):
 
 
 def test_something_in_front_does_not_pull(moved):
-    points, center, sight, then, _ = moved
+    points, center, images, then, _ = moved
     row, column = np.argwhere(np.asarray(moved[4][0]) == 1).mean(0).astype(int)
     patch = (0, slice(row, row + 6), slice(column - 20, column + 20))
     green = jnp.append(tones(jnp.array([0.1, 0.9, 0.1]), CONFIG.shading), 0.4)
-    hidden = sight._replace(pixels=sight.pixels.at[patch].set(green))
+    hidden = images._replace(pixels=images.pixels.at[patch].set(green))
     found = look(points, center, hidden)
     assert error(points, np.asarray(carry(points, found, center).means), then) < 2e-3
 
 
-def test_without_turns_only_translation_is_sought_and_found(moved):
-    points, center, sight, _, _ = moved
+def test_without_turns_only_translations_are_tried_and_found(moved):
+    points, center, images, _, _ = moved
     config = replace(CONFIG, max_turn=0.0)
     shift = jnp.array([0.006, -0.004, 0.003])
     behind, start = points._replace(means=points.means - shift[:, None]), center - shift
-    twist = look(behind, start, sight, config)
+    twist = look(behind, start, images, config)
     np.testing.assert_array_equal(twist[3:], 0)
-    assert gap(carry(behind, twist, start), sight, config) < gap(behind, sight, config)
+    assert gap(carry(behind, twist, start), images, config) < gap(behind, images, config)
 
 
 @pytest.mark.slow
-def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
-    """It may be where it was believed to be. What is lost is not, and what agrees as ever has not jumped."""
+def test_a_suspect_that_jumps_is_followed_before_it_is_relocated(jumped):
+    """It may have been where it was believed to be. A lost one was not, and one that agrees as usual has not
+    jumped."""
     *given, shift = jumped
     points, centers = jax.tree.map(lambda a: a[None], given[:2])
     sure, yes = Confidence(jnp.float32(1), jnp.float32(1), jnp.array(True)), jnp.array([True])
 
-    def searched(**changes) -> Sought:
+    def searched(**changes) -> SearchResult:
         watch = first_watch(jnp.ones(1))._replace(**changes)
         how = (replace(CONFIG, iterations=3), watch, yes, jnp.int32(1), yes)
         nowhere = Relocation(jnp.ones(6), sure, sure)
@@ -112,12 +113,12 @@ def test_what_may_be_elsewhere_is_followed_first_when_it_jumps(jumped):
     assert not followed.recovered[0]
     for changes in ({"usual": jnp.array([0.9])}, {"usual": jnp.array([0.05]), "lost": yes}):
         elsewhere = searched(**changes)
-        np.testing.assert_allclose(elsewhere.again.twists[0], 1.0)
+        np.testing.assert_allclose(elsewhere.relocation.twists[0], 1.0)
         assert elsewhere.recovered[0]
 
 
-def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jumped):
-    """Three groups that jumped alike: only as many are found as may be looked for, the most urgent ones."""
+def test_groups_that_agree_worst_or_have_waited_longest_are_searched_for_first(jumped):
+    """Of three groups that jumped alike, only as many are found as may be searched for, by urgency."""
     *given, shift = jumped
     points, centers = jax.tree.map(lambda a: jnp.stack([a] * 3), given[:2])
     visible, first = jnp.array([True, True, True]), first_watch(jnp.ones(3))
@@ -133,16 +134,16 @@ def test_those_are_looked_for_first_that_agree_worst_or_have_waited_longest(jump
     ]
     for watch, there, expected in watches:
         one = (replace(CONFIG, iterations=3), watch, there, jnp.int32(1))
-        sought = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
-        np.testing.assert_array_equal(np.flatnonzero(sought.looked_for), expected)
-        np.testing.assert_array_equal(np.flatnonzero(jnp.isfinite(sought.leads)), expected)
-        right = jnp.linalg.norm(sought.found.twists[:, :3] - shift, axis=1) < 1e-3
+        result = search(jnp.zeros((1, 3, 6)), points, centers, given[2], *one)
+        np.testing.assert_array_equal(np.flatnonzero(result.searched), expected)
+        np.testing.assert_array_equal(np.flatnonzero(jnp.isfinite(result.leads)), expected)
+        right = jnp.linalg.norm(result.estimate.twists[:, :3] - shift, axis=1) < 1e-3
         np.testing.assert_array_equal(np.flatnonzero(right), expected)
 
 
 @pytest.mark.parametrize("printed", [True, False])
-def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
-    """A can that stands still: its print tells how it is turned, and without it nothing does."""
+def test_only_without_a_print_do_other_orientations_agree_as_well(table, printed):
+    """A can at rest: its print determines its orientation, and nothing else does."""
     sequence, (frame, *_), _ = table(8, 2, **SIZE)
     can = sequence.truth.label_ids[sequence.truth.names.index("can")]
     mine = jnp.stack([sequence.mask(0, c) == can for c in range(2)])
@@ -153,9 +154,9 @@ def test_other_turns_agree_as_well_only_with_what_has_no_print(table, printed):
     points = pixels_of_groups(seen, mine.astype(jnp.int32), frame.depths, 1, CONFIG)
     center = middle(jax.tree.map(lambda a: a[0], points))
     how = (CONFIG, first_watch(jnp.ones(1)), jnp.array([True]), jnp.int32(1))
-    sought = search(jnp.zeros((1, 1, 6)), points, center[None], seen, *how)
-    assert (float(sought.leads[0]) > TURN_KNOWN) == printed
-    assert float(jnp.linalg.norm(sought.found.twists[0, :3])) < 1e-3
+    result = search(jnp.zeros((1, 1, 6)), points, center[None], seen, *how)
+    assert (float(result.leads[0]) > TURN_KNOWN) == printed
+    assert float(jnp.linalg.norm(result.estimate.twists[0, :3])) < 1e-3
 
 
 def test_principal_axes_are_those_of_a_rod():
@@ -164,9 +165,9 @@ def test_principal_axes_are_those_of_a_rod():
     np.testing.assert_allclose(jnp.abs(principal_axes(points, jnp.zeros(3))[2]), [0.6, 0.8, 0.0], atol=1e-4)
 
 
-def test_the_least_is_taken_of_each_group_and_nothing_that_is_not_finite():
+def test_the_best_finite_hypothesis_of_each_group_is_taken():
     residuals = jnp.array([[0.3, jnp.nan, 0.5], [0.2, 0.9, 0.5]])
     twists = jnp.arange(36.0).reshape(2, 3, 6)
-    found = least(residuals, twists)
+    found = best_of(residuals, twists)
     np.testing.assert_allclose(found.residuals, [0.2, 0.9, 0.5])
     np.testing.assert_allclose(found.twists, jnp.stack([twists[1, 0], twists[1, 1], twists[0, 2]]))

@@ -123,7 +123,7 @@ def test_a_scene_from_shapes_is_posed_coloured_and_labelled(frame):
 
 
 def test_a_shape_with_nothing_to_rest_on_is_told(frame):
-    with pytest.raises(ValueError, match="'block' has no pose"):
+    with pytest.raises(ValueError, match="'block': expected a pose"):
         scene_from_shapes([ground(), block()], frame)
-    with pytest.raises(ValueError, match="'block' has no pose"):
+    with pytest.raises(ValueError, match="'block': expected a pose"):
         scene_from_shapes([block(plane=np.array([0, 0, 1.0, 0]))], frame)

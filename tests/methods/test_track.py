@@ -106,7 +106,7 @@ def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, q
         errors = centroid_errors(sequence, started, now.result.pose, t)
         assert max(errors.values()) < 5e-3, errors
         assert not now.info["skipped"]
-    with pytest.raises(ValueError, match=r"redraw: expected all where refine.iterations is above 0"):
+    with pytest.raises(ValueError, match=r"redraw: expected all if refine.iterations is above 0"):
         replace(quick, redraw="moving")
 
 
@@ -115,7 +115,11 @@ def test_objects_are_followed_where_only_what_moves_is_redrawn(table, started, q
     [
         (AlignConfig, {"everywhere": -1}, "track.align.everywhere: expected at least 0, found -1"),
         (AlignConfig, {"shading": float("nan")}, "track.align.shading: expected at least 0, found nan"),
-        (AlignConfig, {"turns": (0.2, -0.2)}, "track.align.turns: expected more than 0, pi at most, found"),
+        (
+            AlignConfig,
+            {"turns": (0.2, -0.2)},
+            "track.align.turns: expected more than 0 and at most pi, found",
+        ),
         (AlignConfig, {"color_scale": 0}, "track.align.color_scale: expected more than 0, found 0"),
         (MatchConfig, {"min_score": float("nan")}, "track.match.min_score: expected at least -1, found nan"),
         (GrowConfig, {"min_gap": -0.1}, "track.grow.min_gap: expected more than 0, found -0.1"),

@@ -1,14 +1,15 @@
 """Direct alignment of a group with the images: Levenberg-Marquardt over six numbers, nothing rendered.
 
-What aligns is a set of points with colours: pixels that showed the group earlier, and centres (see `points`).
-Each has a colour and a depth to agree with at the pixel it falls on:
+A set of points with colours is aligned: pixels that showed the group earlier, and centres (see `points`).
+Each is compared in colour and depth with the pixel it projects to:
 
     r_i = ( (I(pi(D x_i)) - c_i) / s_color,  (Z(pi(D x_i)) - z(D x_i)) / s_depth )
 
-with I and c as tones (see `points`), which see little of shading, and weighted by 1 / (1 + r^2)^2
-(Geman-McClure), which forgets what is hidden by something else. An iteration costs a fraction of a rendered
-one, and depth pulls from further away than colour does, so groups arrive, large turns included, where
-rendering can finish. Everything here is of one group and one start; `jax.vmap` makes it many.
+with I and c as tones (see `points`), which depend little on shading, and weighted by 1 / (1 + r^2)^2
+(Geman-McClure), which ignores points that something else hides. An iteration costs a fraction of a rendered
+one, and depth converges from further away than colour, so groups get, even after large turns, to where
+refinement by rendering converges. All functions here are for one group and one start; `jax.vmap` makes it
+many.
 """
 
 from dataclasses import replace
@@ -21,57 +22,52 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gsjax.methods.track.config import AlignConfig
-from gsjax.methods.track.points import Points, Sight, carry, rotated, sum_of_three
+from gsjax.methods.track.points import Points, ToneImages, carry, rotated, sum_of_three
 from gsjax.optim.compiler import in_memory
 
 
 def widened(config: AlignConfig) -> AlignConfig:
-    """Wider scales of the residuals, which listen to more of what disagrees: for starts that are far off."""
+    """The configuration with wider scales of the residuals, for starts that are far off."""
     factor = config.widen
     return replace(config, color_scale=factor * config.color_scale, depth_scale=factor * config.depth_scale)
 
 
-_CHANNELS = (3, 1)  # of colour, each of which has the mean of the three, and of depth
+_CHANNELS = (3, 1)  # number of channels of colour, each of which has the mean of the three, and of depth
 
 
-class Read(NamedTuple):
-    """An image at p places, each of its d channels side by side."""
+class Sample(NamedTuple):
+    """An image of d channels, sampled at p positions."""
 
     values: Float[Array, "d p"]
-    slopes: Float[Array, "2 d p"]  # along x and y, a pixel
-    nearest: Float[Array, "d p"]  # of the pixel that the place lies in
+    slopes: Float[Array, "2 d p"]  # along x and y, per pixel
+    nearest: Float[Array, "d p"]  # values of the nearest pixel
 
 
-class Spot(NamedTuple):
-    """Where p places lie between the centres of four pixels, which are at +0.5."""
+class PixelPosition(NamedTuple):
+    """Positions between the centres of four pixels, which are at +0.5."""
 
-    pixel: Int[Array, "p"]  # the upper left one, counted row by row
-    right: Float[Array, "p"]  # how far right of it, pixels: 0 to 1
-    down: Float[Array, "p"]
+    pixel: Int[Array, "p"]  # flat index of the upper left one
+    right: Float[Array, "p"]  # distance to the right of its centre, pixels, 0 to 1
+    down: Float[Array, "p"]  # distance below its centre, pixels, 0 to 1
 
 
-def spot(x: Float[Array, "p"], y: Float[Array, "p"], width: int, height: int) -> Spot:
-    """The spot of a place (x, y), pixels; outside of the image, the nearest on its border.
-
-    Args:
-        x, y: pixels, centres at +0.5.
-        width, height: of the image, pixels.
-    """
+def pixel_position(x: Float[Array, "p"], y: Float[Array, "p"], width: int, height: int) -> PixelPosition:
+    """The positions (x, y), pixels with centres at +0.5, clamped to an image of this width and height."""
     x = jnp.clip(x - 0.5, 0.0, width - 1.001)
     y = jnp.clip(y - 0.5, 0.0, height - 1.001)
     column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
-    return Spot(row * width + column, x - column, y - row)
+    return PixelPosition(row * width + column, x - column, y - row)
 
 
-def bilinear(image: Float[Array, "h w d"], at: Spot) -> Read:
-    """`image` there."""
+def bilinear(image: Float[Array, "h w d"], at: PixelPosition) -> Sample:
+    """The image, interpolated bilinearly at these positions."""
     _, width, channels = image.shape
     (pixel, right, down), pixels = at, image.reshape(-1, channels)
     a, b, c, d = (pixels[pixel + offset].T for offset in (0, 1, width, width + 1))
     upper, lower = a + right * (b - a), c + right * (d - c)
     across = (b - a) + down * ((d - c) - (b - a))
     above, below = jnp.where(right < 0.5, a, b), jnp.where(right < 0.5, c, d)
-    return Read(
+    return Sample(
         upper + down * (lower - upper),
         jnp.stack([across, lower - upper]),
         jnp.where(down < 0.5, above, below),
@@ -79,16 +75,16 @@ def bilinear(image: Float[Array, "h w d"], at: Spot) -> Read:
 
 
 class Residuals(NamedTuple):
-    """How points differ from the images: red, green, blue and, where the frame has it, depth."""
+    """Differences between points and images: red, green, blue and, if the frame has it, depth."""
 
     values: Float[Array, "c d p"]  # in units of their scales
     counts: Bool[Array, "c kinds p"]  # whether there is a colour, and a depth, to compare with
-    gradients: Float[Array, "c 3 d p"]  # with respect to the point, a metre
+    gradients: Float[Array, "c 3 d p"]  # with respect to the point, per metre
 
 
-def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
+def _residuals(points: Points, images: ToneImages, config: AlignConfig) -> Residuals:
     """The residuals of one group's points."""
-    height, width, channels = sight.pixels.shape[1:]
+    height, width, channels = images.pixels.shape[1:]
     scales = jnp.array([config.color_scale] * 3 + [config.depth_scale] * (channels - 3))[:, None]
 
     def one(means, tones, viewmat, K, image):
@@ -96,12 +92,12 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
         z = jnp.maximum(local[2], 1e-6)
         x, y, _ = rotated(K, local) / z
         inside = (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5) & (local[2] > 1e-3)
-        # Not this camera's own K: over that is mapped, and a branch would be computed both ways.
-        at = in_memory(spot(x, y, width, height), sight.cameras.K)
+        # All cameras' K: under vmap, a condition on this camera's own would compute both branches.
+        at = in_memory(pixel_position(x, y, width, height), images.cameras.K)
         found, (across, along), nearest = bilinear(image, at)
         wanted, counts = tones, inside[None]
         if channels == 4:
-            # The depth between pixels that lie on two surfaces is nobody's: there, the nearest pixel's.
+            # No surface has the depth between pixels on two surfaces: take the nearest pixel's there.
             smooth = jnp.abs(found[3] - nearest[3]) < config.depth_scale
             found = found.at[3].set(jnp.where(smooth, found[3], nearest[3]))
             across, along = (slope.at[3].set(jnp.where(smooth, slope[3], 0.0)) for slope in (across, along))
@@ -115,7 +111,7 @@ def _residuals(points: Points, sight: Sight, config: AlignConfig) -> Residuals:
         gradients = jnp.swapaxes(rotated(viewmat[:3, :3].T, jnp.swapaxes(gradients / scales, 0, 1)), 0, 1)
         return Residuals((found - wanted) / scales, counts, gradients)
 
-    return jax.vmap(one)(points.means, points.tones, sight.cameras.viewmat, sight.cameras.K, sight.pixels)
+    return jax.vmap(one)(points.means, points.tones, images.cameras.viewmat, images.cameras.K, images.pixels)
 
 
 def _by_kind(products: Float[Array, "c d p"]) -> list[Float[Array, "c p"]]:
@@ -124,13 +120,13 @@ def _by_kind(products: Float[Array, "c d p"]) -> list[Float[Array, "c p"]]:
 
 
 def _squared(residuals: Residuals) -> list[Float[Array, "c p"]]:
-    """Squared residuals, in which each channel of colour has the mean of the three."""
+    """Squared residuals; for colour, the mean of the three channels."""
     color, *depth = _by_kind(residuals.values**2)
     return [color / 3, *depth]
 
 
 class _Fit(NamedTuple):
-    """A twist, and what it takes to go on from it."""
+    """A twist and its normal equations."""
 
     twist: Float[Array, "6"]
     cost: Float[Array, ""]
@@ -139,14 +135,18 @@ class _Fit(NamedTuple):
 
 
 def _normal_equations(
-    twist: Float[Array, "6"], points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig
+    twist: Float[Array, "6"],
+    points: Points,
+    center: Float[Array, "3"],
+    images: ToneImages,
+    config: AlignConfig,
 ) -> _Fit:
-    """Cost, J^T W J and J^T W r after `twist`, for a small one about the moved centre that follows it."""
+    """Cost, J^T W J and J^T W r after `twist`, for a small twist about the moved centre that follows it."""
     moved = carry(points, twist, center)
-    residuals = _residuals(moved, sight, config)
+    residuals = _residuals(moved, images, config)
     squared = _squared(residuals)
     kinds = list(zip(_CHANNELS[: len(squared)], squared, jnp.moveaxis(residuals.counts, 1, 0), strict=True))
-    # What falls outside the picture, or is truncated, costs as much as a bad fit.
+    # Where there is nothing to compare with, a point costs half as much as one that disagrees entirely.
     costs = points.seen * sum(n * jnp.where(counts, r / (1 + r), 0.5) for n, r, counts in kinds)
     weights = [points.seen * counts / (1 + r) ** 2 for _, r, counts in kinds]
     arms = tuple(jnp.moveaxis(moved.means - (center + twist[:3])[:, None], 1, 0))
@@ -156,12 +156,12 @@ def _normal_equations(
         return sum(w * ab for w, ab in zip(weights, _by_kind(a * b), strict=True))
 
     # A row of the Jacobian is (g, arm x g), so a point adds (F, F A^T; A F, A F A^T) with A v = arm x v and F
-    # the sum of g g^T over its channels. No row is written down, which XLA:CPU would do for a product.
+    # the sum of g g^T over its channels. No row is stored, which XLA:CPU would do for a matrix product.
     products = [over_channels(*pair) for pair in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
     pulls = [over_channels(a, residuals.values) for a in (x, y, z)]
-    (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), sight.cameras.K)
+    (xx, xy, xz, yy, yz, zz), pulls, costs = in_memory((products, pulls, costs), images.cameras.K)
     forces = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    levers = [_cross(arms, force) for force in forces]  # of A F, a column each
+    levers = [_cross(arms, force) for force in forces]  # the columns of A F
     torques = [_cross(arms, lever) for lever in zip(*levers, strict=True)]
     upper = [(*force, *lever) for force, lever in zip(forces, levers, strict=True)]
     lower = [(*lever, *torque) for lever, torque in zip(zip(*levers, strict=True), torques, strict=True)]
@@ -171,7 +171,7 @@ def _normal_equations(
 
 
 def _cross(a, b):
-    """a x b, of three arrays each."""
+    """a x b, with three arrays each."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -179,24 +179,24 @@ def align(
     twist: Float[Array, "6"],
     points: Points,
     center: Float[Array, "3"],
-    sight: Sight,
+    images: ToneImages,
     config: AlignConfig,
 ) -> Float[Array, "6"]:
-    """Levenberg-Marquardt from `twist` (translation, rotation vector).
+    """The twist (translation, metres, and rotation vector) that Levenberg-Marquardt finds.
 
     Args:
-        twist: where to start.
-        points: one group's, where they were in the last frame.
-        center: its centroid in the last frame.
-        sight: what the cameras see now.
+        twist: the start.
+        points: points of one group, in the last frame.
+        center: its centroid in the last frame, metres.
+        images: the new frame.
     """
     longest = jnp.array([config.max_step] * 3 + [config.max_turn] * 3)
-    # Directions that no pixel speaks of stand still.
+    # Regularises directions that no pixel constrains.
     floor = jnp.array([1.0] * 3 + [1e-2 if config.max_turn else 1e12] * 3)
 
     def iterate(carried, _):
         best, trial, damping = carried
-        new = _normal_equations(trial, points, center, sight, config)
+        new = _normal_equations(trial, points, center, images, config)
         better = new.cost < best.cost
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
         damping = jnp.clip(jnp.where(better, damping * 0.3, damping * 10.0), 1e-4, 1e4)
@@ -210,25 +210,25 @@ def align(
     return best.twist
 
 
-def ball(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
-    """The points of a cubic grid within `radius` of the origin."""
+def ball_grid(radius: float, spacing: float) -> Float[np.ndarray, "n 3"]:
+    """The points of a cubic grid within `radius` of the origin, `spacing` apart."""
     steps = spacing * np.arange(-(radius // spacing), radius // spacing + 1)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return grid[np.linalg.norm(grid, axis=1) <= radius]
 
 
-def coarse_shifts(config: AlignConfig, sight: Sight) -> Float[Array, "n 6"]:
-    """Twists that shift to all sides, for depth to choose from: by colour a plain thing slides about."""
-    if not config.reach or sight.depths is None:
+def coarse_shifts(config: AlignConfig, images: ToneImages) -> Float[Array, "n 6"]:
+    """Twists that shift to all sides; none without depth, because objects of one colour would slide about."""
+    if not config.reach or images.depths is None:
         return jnp.zeros((0, 6))
-    shifts = jnp.asarray(ball(config.reach, config.spacing), float)
+    shifts = jnp.asarray(ball_grid(config.reach, config.spacing), float)
     return jnp.concatenate([shifts, jnp.zeros_like(shifts)], axis=1)
 
 
-def turned(
+def turn_hypotheses(
     twist: Float[Array, "6"], axes: Float[Array, "3 3"], angles: tuple[float, ...]
 ) -> Float[Array, "h 6"]:
-    """The twist itself, and after a turn to either side by each angle about each of the axes."""
+    """The twist itself, and the twist after a turn to either side by each angle about each of the axes."""
     steps = jnp.concatenate([axes * s * angle for angle in angles for s in (1.0, -1.0)])
     steps = jnp.concatenate([jnp.zeros_like(steps[:1]), steps])
     rotations = (jaxlie.SO3.exp(twist[3:]) @ jaxlie.SO3.exp(steps)).log()
@@ -242,23 +242,20 @@ def compose(change: Float[Array, "*k 6"], twists: Float[Array, "*k 6"]) -> Float
 
 
 def disagreement(
-    twist: Float[Array, "6"], points: Points, center: Float[Array, "3"], sight: Sight, config: AlignConfig
+    twist: Float[Array, "6"],
+    points: Points,
+    center: Float[Array, "3"],
+    images: ToneImages,
+    config: AlignConfig,
 ) -> Float[Array, ""]:
-    """How badly a group's points agree with the images after its twist: 0 perfect, 1 not at all.
+    """Disagreement of a group's points with the images after its twist: 0 perfect, 1 not at all.
 
-    Colour and depth count the same; what falls outside the picture counts half.
-
-    Args:
-        twist: translation in metres, rotation vector.
-        points: of the group.
-        center: about which it turns, metres.
-        sight: what cameras saw.
-        config: limits of colour and depth.
+    Colour and depth have equal weight; a point outside the image counts half. Arguments as for `align`.
     """
-    residuals = _residuals(carry(points, twist, center), sight, config)
+    residuals = _residuals(carry(points, twist, center), images, config)
     kinds = list(zip(_squared(residuals), jnp.moveaxis(residuals.counts, 1, 0), strict=True))
     cost = sum(counts * r / (1 + r) for r, counts in kinds)
     compared = sum(counts.astype(cost.dtype) for _, counts in kinds)
     cost = jnp.where(compared > 0, cost / jnp.maximum(compared, 1), 0.5)
-    costs = in_memory(points.seen * cost, sight.cameras.K)
+    costs = in_memory(points.seen * cost, images.cameras.K)
     return jnp.sum(costs) / jnp.maximum(points.seen.sum(), 1e-6)

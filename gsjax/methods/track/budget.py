@@ -1,8 +1,8 @@
-"""A time budget for updates: what is left out so that each one is done in time.
+"""A time budget for updates, and what to omit to meet it.
 
-Once, before the first frame, the richest settings whose measured cost fits are chosen from a ladder. Then,
-from frame to frame, a `Governor` decides how many groups may be looked for everywhere, which a compiled
-update can vary. Updates that were late are paid back by those that follow.
+Before the first frame, the richest settings whose measured cost fits are chosen from a ladder. Then, from
+frame to frame, a `Governor` decides how many groups may be searched for everywhere, a number that a compiled
+update can vary. Delays are compensated by the updates that follow.
 """
 
 from collections.abc import Callable
@@ -11,39 +11,31 @@ from typing import NamedTuple
 
 from gsjax.methods.track.config import PRESETS, TrackConfig
 
-_USED = 0.9  # share of the budget that is planned with; the rest is for what no measurement foresaw
-_MOST_OWED = 5.0  # budgets of debt that are remembered: a machine that slept starts afresh
-_LEARNING = 0.1  # weight of an update in the running estimate of what one costs
+_USED = 0.9  # fraction of the budget that is planned; the rest is a reserve
+_MAX_DEBT = 5.0  # largest delay to be compensated, in budgets, in case the machine was suspended
+_NEW_WEIGHT = 0.1  # weight of an update in the running estimate of the cost
 
 
 class Costs(NamedTuple):
     """Cost of an update, in seconds."""
 
-    base: float  # without looking for anything everywhere
-    search: float  # for each group that is looked for everywhere
+    base: float  # without any search everywhere
+    search: float  # for each group that is searched for everywhere
 
 
 class Chosen(NamedTuple):
-    """Settings for a budget, and what was measured on the way to them.
-
-    Attributes:
-        name: the rung of the ladder.
-        config: its settings.
-        costs: what its updates cost.
-        tried: the costs of every rung that was measured, by name.
-        fits: False where even the cheapest rung costs more than the budget.
-    """
+    """A rung of the ladder chosen for a budget, and the measurements that led to it."""
 
     name: str
     config: TrackConfig
     costs: Costs
-    tried: dict[str, Costs]
-    fits: bool
+    tried: dict[str, Costs]  # of every rung that was measured, by name
+    fits: bool  # False if even the cheapest rung exceeds the budget
 
 
 def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
-    """Settings from the richest to the cheapest; how a scene starts, and how much may join it, is as in
-    `config` always."""
+    """Settings by name, from the richest to the cheapest, for this number of cameras. How a scene starts, and
+    how much may join it, is always as in `config`."""
 
     def rung(preset: TrackConfig) -> TrackConfig:
         grow = replace(preset.grow, slots=config.grow.slots)
@@ -61,13 +53,14 @@ def ladder(config: TrackConfig, num_cameras: int) -> dict[str, TrackConfig]:
 def choose(
     rungs: dict[str, TrackConfig], measure: Callable[[TrackConfig], Costs], budget: float, num_groups: int
 ) -> Chosen:
-    """The richest rung that leaves time to look for a group, or for all where the rung above fits too.
+    """The richest rung that leaves time to search for one group everywhere.
 
     Args:
-        rungs: from `ladder`. The search begins at "fast": each measurement compiles an update.
-        measure: what updates cost with these settings.
-        budget: seconds.
-        num_groups: groups that may be looked for.
+        rungs: from `ladder`. Each measurement compiles an update, so the choice starts at "fast", and a
+            richer rung is tried only if the one below leaves time to search for all groups.
+        measure: settings -> measured costs.
+        budget: seconds per update.
+        num_groups: number of groups.
     """
     names, tried = list(rungs), {}
 
@@ -87,25 +80,25 @@ def choose(
 
 
 class Governor:
-    """How many groups each update may look for everywhere.
+    """Decides how many groups each update may search for everywhere.
 
     Args:
-        budget: seconds an update may take.
-        costs: what was measured.
-        most: groups there are.
+        budget: seconds per update.
+        costs: measured costs.
+        most: number of groups.
     """
 
     def __init__(self, budget: float, costs: Costs, most: int):
         self._budget, self._costs, self._most, self._debt = budget, costs, most, 0.0
 
     def allowed(self) -> int:
-        """The number for the next update."""
+        """The number of groups for the next update."""
         left = _USED * self._budget - self._debt - self._costs.base
         return int(min(max(left / max(self._costs.search, 1e-6), 0), self._most))
 
     def spent(self, seconds: float, searched: int) -> None:
-        """Record what an update took, and how many groups it looked for."""
+        """Record the duration of an update, and how many groups it searched for."""
         owed = self._debt + seconds - self._budget
-        self._debt = min(max(owed, 0.0), _MOST_OWED * self._budget)
+        self._debt = min(max(owed, 0.0), _MAX_DEBT * self._budget)
         error = seconds - searched * self._costs.search - self._costs.base
-        self._costs = self._costs._replace(base=self._costs.base + _LEARNING * error)
+        self._costs = self._costs._replace(base=self._costs.base + _NEW_WEIGHT * error)

@@ -1,4 +1,4 @@
-"""The settings of the object-aware tracker, with their units and what they trade."""
+"""Settings of the object-aware tracker, with their units and trade-offs."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -14,19 +14,19 @@ class StartConfig:
     """How the first frame becomes Gaussians."""
 
     object_pixels: float = 1.5
-    """Width of the voxels that keep one point of an object each, in pixels of the camera that saw it."""
+    """Width of the voxels in which one point of an object is kept, in pixels of the camera that saw it."""
     background_pixels: float = 4.0
     """The same for the background, which is only rendered."""
     max_extent: float = 0.35
-    """Objects longer than this are seldom rigid (a robot arm): they are followed in parts, metres."""
+    """Longest extent of a rigid object, metres. Longer ones (a robot arm) are tracked in parts."""
     part_size: float = 0.15
-    """About how large those parts are, metres."""
+    """Approximate size of those parts, metres."""
     label_distance: float = 0.15
-    """A point unseen by the mask's camera takes the nearest label along the surface up to here, metres."""
+    """Longest path along the surface to the label of a point unseen by the mask's camera, metres."""
     label_step: float = 0.02
-    """Points further apart than this are on no common surface, metres."""
+    """Points further apart than this do not share a surface, metres."""
     depth_gap: float = 0.015
-    """How far a point's depth may be from the depth image and still be what the image shows, metres."""
+    """Tolerance between the depth of a point and the depth image that shows it, metres."""
     iterations: int = 150
     """Photometric optimisation steps on the first frame."""
 
@@ -38,18 +38,18 @@ class StartConfig:
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Template matching: where has each object gone?"""
+    """Template matching."""
 
     patch: int = 64
     """Edge of the template, pixels of the (possibly reduced) image."""
     radius: int = 24
-    """How far the template is searched to each side, pixels of the reduced image."""
+    """Range of the search to each side, pixels of the reduced image."""
     min_score: float = 0.3
-    """A correlation below this moves nothing."""
+    """Smallest correlation of a match."""
     margin: int = 2
-    """Pixels by which the object's mask is grown: an outline against its surroundings is texture too."""
+    """Pixels by which the object's mask is dilated: its outline against the surroundings is texture too."""
     max_residual: float = 0.03
-    """Cameras that disagree on where the object is by more than this lose to the best of them, metres."""
+    """If cameras disagree on the position by more than this, the best one alone decides, metres."""
 
     def __post_init__(self):
         expect(self, "track.match.", max_residual=ABOVE_ZERO, patch=(8, np.inf), radius=(1, np.inf))
@@ -58,40 +58,40 @@ class MatchConfig:
 
 @dataclass(frozen=True)
 class AlignConfig:
-    """Direct alignment of pixels, before anything is rendered."""
+    """Direct alignment of points with the images, without rendering."""
 
     iterations: int = 6
-    """Levenberg-Marquardt iterations a start; with 0, `reach` 0 and `turns` () alignment is left out."""
+    """Levenberg-Marquardt iterations per start; 0, with `reach` 0 and `turns` (), disables alignment."""
     color_scale: float = 0.1
-    """A difference of log colours that is large; they span about 0 to 1."""
+    """Scale of the difference of log colours, which span about 0 to 1."""
     depth_scale: float = 0.01
-    """A depth difference that is large, metres."""
+    """Scale of the depth difference, metres."""
     centers: int = 256
     """Gaussians of a group whose centres are aligned."""
     center_weight: float = 1.0
-    """Weight of a centre beside a pixel. Centres prevent drift; pixels look more like the new frame."""
+    """Weight of a centre relative to a pixel. Centres prevent drift; pixels look more like the new frame."""
     pixels: int = 192
-    """Pixels of the last frame that stand for a group in each camera, and as many of its keyframe."""
+    """Pixels of the last frame that are aligned per group and camera, and as many of its keyframe."""
     keyframe_turn: float = 0.4
-    """The keyframe counts less as a group turns, and beyond this turn the last frame replaces it, radians."""
+    """Turn of a group up to which the weight of its keyframe fades to 0; then it is replaced, radians."""
     max_thickness: float = 0.06
-    """Measured depth further than this from the model's is not of the same object, metres."""
+    """Measured depth that differs from the model by more than this is of another object, metres."""
     shading: float = 0.3
-    """Weight of brightness beside chroma, 0 to 1. What turns is lit differently."""
+    """Weight of brightness relative to chroma, 0 to 1: objects that turn are lit differently."""
     widen: float = 2.0
     """Factor on both scales while the start may be far off."""
     reach: float = 0.045
-    """How far a group is looked for by shifting it as it is, metres ..."""
+    """Radius in which shifts of a group are tried, metres."""
     spacing: float = 0.015
-    """... in steps of this length, metres."""
+    """Distance between those shifts, metres."""
     everywhere: int | None = None
-    """Groups that are looked for everywhere around in a frame, those first that agree worst; None: all."""
+    """Groups that are searched for everywhere around per frame, the worst first; default: all."""
     turns: tuple[float, ...] = (0.2, 0.6)
     """Turns by which the best start is varied, to either side about each principal axis, radians."""
     max_step: float = 0.1
     """Longest step of one iteration, metres."""
     max_turn: float = 0.1
-    """Longest turn of one iteration, radians; 0, with refine.rotation_rate 0, is the paper's translation."""
+    """Longest turn of one iteration, radians; 0, with refine.rotation_rate 0, allows translations only."""
 
     def __post_init__(self):
         scales = ("color_scale", "depth_scale", "max_thickness", "widen", "spacing", "max_step")
@@ -102,7 +102,7 @@ class AlignConfig:
         if self.everywhere is not None:
             expect(self, "track.align.", everywhere=(0, np.inf))
         if not all(0 < turn <= math.pi for turn in self.turns):
-            raise ValueError(f"track.align.turns: expected more than 0, pi at most, found {self.turns}")
+            raise ValueError(f"track.align.turns: expected more than 0 and at most pi, found {self.turns}")
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class RefineConfig:
     """Photometric refinement of the group displacements D_k and the individual ones delta_i."""
 
     iterations: int = 10
-    """Adam iterations a frame; 0 leaves refinement out."""
+    """Adam iterations per frame; 0 disables refinement."""
     translation_rate: float = 7e-4
     """Learning rate of D_k's translation, metres."""
     rotation_rate: float = 1e-2
@@ -120,15 +120,15 @@ class RefineConfig:
     delta_weight: float = 20.0
     """Weight of the mean |delta_i|^2 of a group, in units of delta_scale^2."""
     delta_scale: float = 0.004
-    """A displacement of its own that is large for a Gaussian, metres."""
+    """Scale of the individual displacement of a Gaussian, metres."""
     background_rate: float = 0.0
     """Learning rate of displacements of the background's Gaussians, metres; 0 freezes them (the paper)."""
     depth_weight: float = 2.0
-    """Weight of the depth difference in metres beside the colour difference (0 to 1)."""
+    """Weight of the depth difference (metres) relative to the colour difference (0 to 1)."""
     depth_limit: float = 0.05
-    """Depth differences beyond this are of something else, metres."""
+    """Limit to which depth differences are truncated, metres."""
     color_limit: float = 0.3
-    """Colour differences beyond this are of something else, 0 to 1."""
+    """Limit to which colour differences are truncated, 0 to 1."""
 
     def __post_init__(self):
         limits = ("delta_scale", "depth_limit", "color_limit")
@@ -140,20 +140,20 @@ class RefineConfig:
 
 @dataclass(frozen=True)
 class GrowConfig:
-    """Surfaces that come into view join the object that they continue."""
+    """Growth: surfaces that come into view join the object that they continue."""
 
     slots: int = 4096
-    """Gaussians that may join over the whole recording; 0 leaves growing out."""
+    """Gaussians that may join over the whole recording; 0 disables growth."""
     candidates: int = 256
-    """Pixels that are examined in a frame."""
+    """Pixels that are examined per frame."""
     reach: int = 6
-    """How far from an object's outline they may be, pixels."""
+    """Largest distance of those pixels from an object's outline, pixels."""
     min_gap: float = 0.008
-    """Depth measured this much nearer than the model is not explained by it, metres."""
+    """The model does not explain depth that is nearer by more than this, metres."""
     distance: float = 0.012
-    """How near a pixel must be to a Gaussian to continue its object, metres ..."""
+    """Largest distance from a pixel to a Gaussian whose object it continues, metres."""
     color: float = 0.15
-    """... and in colour, 0 to 1. Both count together, and the background's Gaussians compete."""
+    """Largest difference of their colours, 0 to 1. The two squares add up; the background competes."""
 
     def __post_init__(self):
         expect(self, "track.grow.", **dict.fromkeys(("min_gap", "distance", "color"), ABOVE_ZERO))
@@ -170,35 +170,35 @@ class TrackConfig:
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=0))
     grow: GrowConfig = field(default_factory=GrowConfig)
     matching: bool = False
-    """Look for each object by template matching first. Without, it is found from where it was."""
+    """Add the result of template matching to the starts of the alignment."""
     warm_start: bool = True
-    """Begin with the last frame's motion: delta_i as it was, and D_k as one of the places to look first."""
+    """Start from the last frame's motion too: delta_i as it was, and D_k as one of the starts."""
     cameras: tuple[int, ...] = ()
-    """Cameras of the frame to track with, counted from 0; default: all."""
+    """Indices of the cameras to track with; default: all."""
     shrink: int = 1
-    """Pictures are averaged over blocks of this many pixels each way before anything else."""
+    """Factor by which images are averaged down each way before anything else."""
     redraw: Literal["all", "moving"] = "moving"
-    """What an update draws: the whole scene, or what moves over a background that is drawn once and kept."""
+    """What an update draws: the whole scene, or the moving Gaussians over a background that is drawn once."""
     coarseness: int = 1
-    """With "moving": pictures shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
+    """With "moving": images shrink by this factor each way, and every coarseness^2-th Gaussian is drawn."""
     headroom: float = 1.5
-    """Room in the rasterizer's plan for what the motion will add."""
+    """Capacity of the rasterizer's plans relative to what is needed at first, 1 or more."""
     seed: int = 0
-    """Seed of the random places where what is lost is looked for."""
+    """Seed of the random guesses where a lost object may be."""
 
     def __post_init__(self):
         expect(self, "track.", headroom=(1, np.inf), coarseness=(1, np.inf), shrink=(1, np.inf))
         if self.coarseness > 1 and (self.redraw == "all" or self.matching):
             raise ValueError(
-                f"track.coarseness: expected 1 unless redraw is moving and matching off, found "
+                "track.coarseness: expected 1 unless redraw is moving and matching is off, found "
                 f"{self.coarseness}"
             )
         if self.redraw not in ("all", "moving"):
             raise ValueError(f"track.redraw: expected all or moving, found {self.redraw!r}")
         if self.redraw == "moving" and self.refine.iterations:
             raise ValueError(
-                "track.redraw: expected all where refine.iterations is above 0, found moving; set "
-                "refine.iterations to 0, or draw all"
+                "track.redraw: expected all if refine.iterations is above 0, found moving; set "
+                "refine.iterations to 0, or redraw all"
             )
 
 
@@ -215,6 +215,6 @@ FAST = replace(
     coarseness=2,
 )
 PRESETS = {"accurate": TrackConfig(), "balanced": BALANCED, "fast": FAST, "paper": PAPER}
-"""`accurate`, `balanced` and `fast` align pixels, with ever fewer of them; `fast` is for 30 Hz on one core,
-and searches everywhere for two objects in an update. `paper` has all of the paper's stages, template matching
-and photometric refinement too, which cost much and gain little: see docs/results-tracking.md."""
+"""`accurate`, `balanced` and `fast` align fewer and fewer points; `fast` is for 30 Hz on one core, and
+searches everywhere for two objects per update. `paper` has all stages of the paper, including template
+matching and photometric refinement, which cost much and gain little: see docs/results-tracking.md."""

@@ -1,9 +1,10 @@
-"""Features of Gaussians from features of pixels (section III-A): in the first frame; then they ride along.
+"""Features of Gaussians from features of pixels in the first frame (Object-Aware Gaussian Splatting for
+Robotic Manipulation, section III-A). Later frames need no others: the features move with the Gaussians.
 
 Rendering is linear in what is rendered: F = W f, where W [pixels, N] holds the weight of each Gaussian in
 each pixel. W is never formed: a render applies it, and the render's VJP applies its transpose, exactly. The
-paper names two ways from maps m to features f. *Projection* gives each Gaussian the mean of the pixels that
-it shows in, weighted by how much it shows there:
+paper names two ways from maps m to features f. *Projection* gives each Gaussian the mean of the pixels in
+which it shows, weighted by how much it shows there:
 
     f = (W^T m) / (W^T 1)
 
@@ -11,9 +12,9 @@ it shows in, weighted by how much it shows there:
 
     min_f  |W f - a m|^2 + damping |f - f_projected|^2
 
-in which a = W 1 is the rendered alpha: what is half transparent shows half a feature. It is a linear least
-squares problem, so conjugate gradients solve it without a learning rate; W^T 1 is
-the preconditioner, for it bounds what a row of W^T W can add up to. Both give a constant map back as it is.
+where a = W 1 is the rendered alpha: a half transparent pixel shows half a feature. It is a linear least
+squares problem, so conjugate gradients solve it without a learning rate. W^T 1 is the preconditioner, because
+it bounds the sum of each row of W^T W. Both reproduce a constant map exactly.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ from gsjax.scene.render import plan_render, render
 
 MIN_WEIGHT = 0.1
 """A Gaussian with less weight in all pixels together counts as unseen."""
-_CHANNELS = 16  # rendered at a time: hundreds, as foundation models have, compile slowly and fill the memory
+_CHANNELS = 16  # rendered at a time; hundreds, as of foundation models, compile slowly and fill the memory
 
 
 class FeatureBatch(NamedTuple):
@@ -46,11 +47,11 @@ class FeatureBatch(NamedTuple):
     Attributes:
         gaussians: the scene, frozen.
         cameras: C of them.
-        maps: the features of each pixel.
-        valid: 1 for each pixel that counts, 0 for the others.
-        prior: features that damping pulls towards.
-        weights: W^T 1 of each Gaussian.
-        damping: in the units of `weights`, pixels.
+        maps: features of each pixel.
+        valid: 1 for pixels that count, else 0.
+        prior: features towards which damping pulls.
+        weights: W^T 1 of each Gaussian, pixels.
+        damping: weight of the prior, pixels.
         plan: from `plan_render`.
     """
 
@@ -65,13 +66,13 @@ class FeatureBatch(NamedTuple):
 
 
 class DistillState(NamedTuple):
-    """Conjugate gradients, a solution of its own for each channel.
+    """State of conjugate gradients, which are independent for each channel.
 
     Attributes:
-        residual: of the normal equations.
-        direction: in which the features go next.
+        residual: residual of the normal equations.
+        direction: next search direction.
         energy: squared preconditioned residual of each channel.
-        begun: whether the residual is known; the first update only finds it.
+        begun: whether the residual is known; the first update only computes it.
     """
 
     residual: Float[Array, "n d"]
@@ -83,18 +84,18 @@ class DistillState(NamedTuple):
 def project_features(
     scene: TrackedScene, frame: Frame, maps: Float[Array | np.ndarray, "..."]
 ) -> Float[np.ndarray, "n d"]:
-    """Each Gaussian takes the mean of the pixels that it shows in. On the host.
+    """The mean feature of the pixels in which each Gaussian shows. On the host.
 
-    One that shows nowhere takes the feature of the nearest that does and has its label, for an object's far
-    side is mostly of the kind of its near one; where none of its label shows, it has zeros.
+    A Gaussian that shows nowhere takes the feature of the nearest visible one with its label, because the far
+    side of an object is mostly like its near side; zeros if none of its label is visible.
 
     Args:
-        scene: at the time of `frame`.
-        frame: its cameras see what `maps` describe.
-        maps: a feature for each pixel, [C,H,W,D]; pixels that are not finite do not count.
+        scene: the scene at the time of `frame`.
+        frame: the frame that `maps` describe.
+        maps: features of each pixel, [C,H,W,D]; pixels that are not finite do not count.
 
     Raises:
-        ValueError: maps have another number of cameras or another size than the frame.
+        ValueError: the maps differ from the frame in number of cameras or size.
     """
     maps, valid = _checked(maps, frame)
     return _project(scene, frame, maps, valid, plan_render(scene.gaussians, frame.cameras))[0]
@@ -108,19 +109,20 @@ def distill_features(
     iterations: int = 10,
     damping: float = 0.1,
 ) -> Float[np.ndarray, "n d"]:
-    """The features whose render comes closest to the maps; what shows nowhere stays projected. On the host.
+    """The features whose render is closest to the maps; hidden Gaussians keep their projected ones. On the
+    host.
 
     Args:
         scene, frame, maps: as for `project_features`.
-        iterations: steps of conjugate gradients; each is one render and its transpose.
-        damping: how strongly a Gaussian holds on to its projected feature, in pixels of weight. Without any,
-            those that hardly show would take whatever values make up for others.
+        iterations: steps of conjugate gradients, each a render and its transpose.
+        damping: weight of the projected feature of each Gaussian, in pixels. Without damping, Gaussians that
+            hardly show would take whatever values compensate for others.
 
     Raises:
         ValueError: as `project_features`; or damping is negative.
     """
     if not damping >= 0:
-        raise ValueError(f"damping: got {damping}, want 0 or more")
+        raise ValueError(f"damping: expected 0 or more, found {damping}")
     maps, valid = _checked(maps, frame)
     plan = plan_render(scene.gaussians, frame.cameras)
     prior, weights = _project(scene, frame, maps, valid, plan)
@@ -131,7 +133,7 @@ def distill_features(
     def solve(part: Array, prior: Array) -> Array:
         batch = FeatureBatch(scene.gaussians, frame.cameras, part, valid, prior, *known)
         features, state = prior, step.init(prior)
-        for i in range(iterations + 1):  # the first finds the residual
+        for i in range(iterations + 1):  # the first computes the residual
             features, state, _ = step.update(features, state, batch, step=i, key=None)
         return features
 
@@ -139,12 +141,12 @@ def distill_features(
 
 
 def feature_distiller() -> Step:
-    """Conjugate gradients on distillation's normal equations, one iteration an update. The first update finds
-    the residual that the others lessen, and moves nothing.
+    """Conjugate gradients on the normal equations of distillation, one iteration per update. The first update
+    only computes the residual.
 
-    params: the features [N,D], which begin as the batch's `prior`. state: `DistillState`. batch:
-    `FeatureBatch`, the same each time. `step` and `key` are not used. `info` has `energy` [D], the squared
-    preconditioned residual of each channel, whose sum is `loss`.
+    params: the features [N,D], initially the batch's `prior`. state: `DistillState`. batch: `FeatureBatch`,
+    always the same. `step` and `key` are not used. `info` has `energy` [D], the squared preconditioned
+    residual of each channel, whose sum is `loss`.
     """
 
     def init(params: Float[Array, "n d"]) -> DistillState:
@@ -152,9 +154,9 @@ def feature_distiller() -> Step:
         return DistillState(nothing, nothing, nothing.sum(0), jnp.asarray(False))
 
     def update(params, state: DistillState, batch: FeatureBatch, *, step: Any, key: Any):
-        gaussians, cameras, maps, valid, prior, _, damping, plan = batch
+        gaussians, cameras, maps, valid, prior, weights, damping, plan = batch
         begun = state.begun
-        # W is linear: with these two, one render serves to find the residual and to apply W^T W.
+        # W is linear: the same render computes the residual in the first update and applies W^T W later.
         at, towards = jnp.where(begun, state.direction, params), jnp.where(begun, 0.0, maps)
         pull, (overflow, needed) = _residual(at, towards, gaussians, cameras, valid, plan)
         along = damping * state.direction - pull
@@ -162,7 +164,7 @@ def feature_distiller() -> Step:
         features = jnp.where(begun, params + length * state.direction, params)
         first = pull + damping * (prior - params)
         residual = jnp.where(begun, state.residual - length * along, first)
-        scaled = residual / _bound(batch)
+        scaled = residual / (weights + damping + 1e-6)[:, None]
         energy = jnp.sum(residual * scaled, axis=0)
         direction = scaled + _ratio(energy, state.energy) * state.direction
         new = (features, DistillState(residual, direction, energy, jnp.asarray(True)))
@@ -181,13 +183,14 @@ def render_features(
     cameras: Camera,
     plan: Plan | None = None,
 ) -> tuple[Float[Array, "c height width d"], Float[Array, "c height width"]]:
-    """Feature maps of the scene as it stands, from any cameras, and their alphas.
+    """Feature maps of the scene at `pose`, in any cameras, and their alphas.
 
-    A pixel's feature is the mean over what it shows, so that it does not fade where alpha does; zero where
-    nothing is drawn.
+    The feature of a pixel is the mean over what it shows, so it does not fade with alpha; zero where nothing
+    is drawn.
 
     Args:
-        plan: from `plan_render(place(scene, pose), cameras)`; needed under jit.
+        features: features of each Gaussian.
+        plan: from `plan_render(place(scene, pose), cameras)`; required under jit.
     """
     rendered = render(place(scene, pose), cameras, plan, features=features)
     assert rendered.features is not None
@@ -205,8 +208,8 @@ def _residual(
     plan: Plan,
     faded: bool = True,
 ) -> tuple[Float[Array, "n d"], tuple[Bool[Array, ""], Int[Array, ""]]]:
-    """W^T (a m - W f) over the valid pixels; whether the plan overflowed, and what it needed. Not `faded`
-    leaves out a. All that is costly happens here."""
+    """W^T (a m - W f) over the valid pixels, without a unless `faded`; whether the plan overflowed, and the
+    capacity needed. All costly computation is here."""
 
     def draw(features):
         rendered = render(gaussians, cameras, plan, features=features)
@@ -239,13 +242,8 @@ def _project(
     return features, weights
 
 
-def _bound(batch: FeatureBatch) -> Float[Array, "n 1"]:
-    """The preconditioner."""
-    return (batch.weights + batch.damping + 1e-6)[:, None]
-
-
 def _ratio(a: Float[Array, "d"], b: Float[Array, "d"]) -> Float[Array, "d"]:
-    """a / b, and 0 where a channel has converged."""
+    """a / b, and 0 for a channel that has converged."""
     return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
 
 
@@ -253,19 +251,19 @@ def _checked(maps: Array | np.ndarray, frame: Frame) -> tuple[Array, Array]:
     """Finite maps, and 1 for each pixel where they were."""
     wanted = frame.images.shape[:3]
     if np.ndim(maps) != 4 or maps.shape[:3] != wanted:
-        raise ValueError(f"maps: got shape {np.shape(maps)}, want {[*wanted, 'D']} as the frame's images")
+        raise ValueError(f"maps: expected shape {[*wanted, 'D']} as the images, found {np.shape(maps)}")
     maps = jnp.asarray(maps, frame.images.dtype)
     valid = jnp.isfinite(maps).all(-1)
     return jnp.where(valid[..., None], maps, 0.0), valid.astype(maps.dtype)
 
 
 def _in_chunks(function: Callable, *arrays: Array | np.ndarray) -> np.ndarray:
-    """`function` of a few channels at a time, the last axis of each array; its results side by side."""
+    """The concatenated results of `function` for a few channels at a time, the last axis of each array."""
     count, results = arrays[0].shape[-1], []
     size = min(count, _CHANNELS)
     for start in range(0, count, size):
         parts = [jnp.asarray(array[..., start : start + size]) for array in arrays]
-        # One shape for all, so that one program serves all.
+        # Padded to one shape, so that one compiled program serves all.
         pad = size - parts[0].shape[-1]
         parts = [jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, pad)]) for part in parts]
         results.append(np.array(function(*parts)))

@@ -19,7 +19,7 @@ from gsjax.rasterize.plan import with_room
 from gsjax.scene.frame import Frame, without_broken
 from gsjax.scene.render import plan_render, render
 
-# Means hardly move: depth has measured them. What is learned is how to blend into the pictures.
+# Depth has measured the means, so they hardly move; the other fields learn to blend into the images.
 RATES = {"means": 2e-5, "quats": 5e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 1e-2}
 _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
 
@@ -27,13 +27,13 @@ _DEPTH_WEIGHT, _DEPTH_LIMIT = 1.0, 0.05
 def start_scene(
     frame: Frame, mask: np.ndarray, mask_camera: int = 0, config: TrackConfig | None = None
 ) -> TrackedScene:
-    """A labelled, photometrically optimised scene from the first RGB-D frame and one camera's mask.
+    """A labelled, photometrically optimised scene from the first RGB-D frame and the mask of one camera.
 
     Args:
-        frame: what the cameras see at first, with depth.
+        frame: the first frame, with depth.
         mask: labels [H, W] of one camera's image; 0 is background.
-        mask_camera: which camera of the frame the mask belongs to, counted from 0.
-        config: how it starts; default: the default settings.
+        mask_camera: index of that camera.
+        config: configuration of the tracker (default: `TrackConfig()`).
 
     Raises:
         ValueError: there is no depth, or the mask does not fit the images.
@@ -41,7 +41,7 @@ def start_scene(
     config = TrackConfig() if config is None else config
     frame, broken = without_broken(eqx.tree_at(lambda f: f.images, frame, frame.colors))
     if broken:
-        warnings.warn(f"the first frame has {broken} pixels that are not finite; unused", stacklevel=2)
+        warnings.warn(f"the first frame has {broken} pixels that are not finite; ignored", stacklevel=2)
     scene = scene_from_cloud(labelled_cloud(frame, mask, mask_camera, config.start), config.start)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
@@ -50,9 +50,9 @@ def fit_loss(gaussians, batch, *, step, key):
     """L1 and D-SSIM on the images, and a truncated depth difference where depth is known.
 
     Args:
-        gaussians: what trains.
+        gaussians: the parameters.
         batch: (frame, plan).
-        step, key: not used; they are part of a loss's form.
+        step, key: not used; they belong to the signature of a loss.
     """
     frame, plan = batch
     rendered = render(gaussians, frame.cameras, plan)
@@ -71,16 +71,9 @@ def fit_loss(gaussians, batch, *, step, key):
 def fit_scene(
     scene: TrackedScene, frame: Frame, iterations: int, headroom: float = 1.5
 ) -> tuple[TrackedScene, dict]:
-    """The scene after `iterations` steps of Adam on the first frame; re-plans where splats outgrow the plan.
+    """The scene after `iterations` steps of Adam on the first frame, and the info of the last step.
 
-    Args:
-        scene: as it starts.
-        frame: the first.
-        iterations: of Adam.
-        headroom: of the plan, 1 or more.
-
-    Returns:
-        The scene, and the info of the last step.
+    `headroom` is that of the plan, 1 or more, which grows if it overflows.
 
     Raises:
         ValueError: no step had a finite loss.
@@ -98,7 +91,7 @@ def fit_scene(
         (gaussians, state, info), plan = with_room(step, plan, headroom)
         skipped += int(info["skipped"])
     if iterations and skipped == iterations:
-        raise ValueError("the first frame could not be fitted: its loss is not finite, whatever the step")
+        raise ValueError("first frame: expected a finite loss, found none in any step; check the images")
     return eqx.tree_at(lambda s: s.gaussians, scene, gaussians), info
 
 
@@ -107,7 +100,7 @@ _STEP = gradient_step(fit_loss, per_field_adam(RATES))
 
 @cache
 def _advance() -> Callable:
-    """The jitted step; made late, because its options depend on the machine."""
+    """The jitted step, made on first use, because its compiler options depend on the machine."""
     return jax.jit(
         lambda params, state, batch, i: _STEP.update(params, state, batch, step=i, key=None),
         compiler_options=host_options(),

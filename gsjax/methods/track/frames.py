@@ -1,4 +1,4 @@
-"""Frames as the tracker takes them: of the cameras that are followed with, shrunk, and mended."""
+"""Preparation of frames: only the tracked cameras, reduced in size, without pixels that are not finite."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from gsjax.scene.frame import Frame, part_of, without_broken
 
 @dataclass(frozen=True)
 class FrameShape:
-    """The form that all frames of a recording share.
+    """The shape that all frames of a recording share.
 
     Attributes:
-        cameras: how many there are.
-        width, height: of a picture, pixels.
-        near: what is nearer to a camera is not drawn, metres.
+        cameras: number of cameras.
+        width, height: size of the images, pixels.
+        near: distance of the near plane, metres.
     """
 
     cameras: int
@@ -27,19 +27,16 @@ class FrameShape:
 
 
 def shape_of(frame: Frame) -> FrameShape:
-    """The form of a frame."""
+    """The shape of a frame."""
     return FrameShape(len(frame.images), frame.cameras.width, frame.cameras.height, frame.cameras.near)
 
 
 def prepared(frame: Frame, config: TrackConfig) -> tuple[Frame, Int[Array, ""]]:
-    """The frame as the tracker sees it, and how many of its pixels were not finite.
-
-    Args:
-        frame: what all cameras saw, in floats or bytes.
-        config: which cameras are followed with, and by how much pictures shrink.
+    """The frame of `config.cameras`, with images reduced by `config.shrink`, and the number of its pixels
+    that were not finite.
 
     Raises:
-        ValueError: there is no such camera, or nothing is left of the pictures.
+        ValueError: a camera does not exist, or nothing is left of the images.
     """
     frame = eqx.tree_at(lambda f: f.images, frame, frame.colors)
     return without_broken(part_of(frame, config.cameras, config.shrink))

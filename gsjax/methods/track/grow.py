@@ -1,12 +1,11 @@
-"""Surfaces that the first frame did not see join the object that they continue.
+"""Surfaces that the first frame did not show join the object that they continue.
 
-A box that turns shows its back, and a gripper that leaves shows what it hid. A measured pixel that the model
-does not explain, because it lies in front of what is drawn there or because nothing is, is compared with the
-scene's Gaussians in position and colour at once. If the nearest belongs to an object, the pixel becomes a
-Gaussian of that object. Shapes are static: new ones take slots that were laid out empty.
+A box that turns shows its back, and a gripper that leaves reveals what it hid. A measured pixel that the
+model does not explain, because it lies in front of what is drawn there or nothing is drawn, is compared with
+the scene's Gaussians in position and colour together. If the nearest belongs to an object, the pixel becomes
+a Gaussian of that object. Array shapes are static, so new Gaussians take slots that were reserved for them.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,24 +16,21 @@ from gsjax.geometry.spherical_harmonics import SH_C0, rgb_to_sh0
 from gsjax.methods.track.config import GrowConfig
 from gsjax.methods.track.layers import Shown
 from gsjax.methods.track.motion import Pose
-from gsjax.methods.track.scene import TrackedScene
+from gsjax.methods.track.scene import TrackedScene, emptied
 from gsjax.rasterize.lanes import LANES, columns_in_lanes, in_lanes
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, take
 
-EMPTY = -30.0  # logit of an empty slot's opacity
-_BORN = 2.0  # and of a new Gaussian
+_LOGIT = 2.0  # opacity logit of a new Gaussian
 
 
 def with_slots(scene: TrackedScene, slots: int) -> TrackedScene:
-    """The scene with `slots` empty places after its moving Gaussians. Their label, K+1, belongs to nobody."""
+    """The scene with empty slots after its moving Gaussians. Their label, K+1, is that of no object."""
     count, moving = scene.gaussians.num, scene.num_moving
     rows = jnp.concatenate([jnp.arange(moving), jnp.zeros(slots, int), jnp.arange(moving, count)])
-    gaussians = take(scene.gaussians, rows)
     empty = (jnp.arange(count + slots) >= moving) & (jnp.arange(count + slots) < moving + slots)
-    logits = jnp.where(empty, EMPTY, gaussians.logit_opacities)
     return TrackedScene(
-        gaussians=eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits),
+        gaussians=emptied(take(scene.gaussians, rows), empty),
         normals=jnp.concatenate([scene.normals, jnp.zeros((slots, 3), scene.normals.dtype)]),
         labels=jnp.where(empty, scene.num_objects + 1, scene.labels[rows]),
         label_ids=scene.label_ids,
@@ -43,12 +39,12 @@ def with_slots(scene: TrackedScene, slots: int) -> TrackedScene:
 
 
 def empty_slots(scene: TrackedScene) -> Bool[Array, "m"]:
-    """Which moving places are still empty."""
-    return scene.labels[: scene.num_moving] > scene.num_objects
+    """Which rows of the moving Gaussians are empty slots."""
+    return scene.groups > scene.num_objects
 
 
 def unexplained(shown: Shown, measured: Float[Array, "c h w"], config: GrowConfig) -> Bool[Array, "c h w"]:
-    """Pixels measured in front of the model, or where there is none."""
+    """Pixels whose measured depth lies in front of the model, or where the model covers nothing."""
     in_front = shown.covered & (shown.depths - measured > config.min_gap)
     return (measured > 0) & (in_front | ~shown.covered)
 
@@ -66,23 +62,23 @@ def grow(
     """Fill empty slots with pixels that continue an object.
 
     Args:
-        scene, pose: with slots (see `with_slots`), as they stand.
+        scene, pose: the scene, with slots (see `with_slots`).
         shown: what they show in the frame's cameras.
-        frame: what the cameras saw at this pose, with depth.
-        step: any number that differs from frame to frame: it picks which pixels are examined.
-        coarseness: n, where `shown` has every n-th pixel.
-        lost: objects that nothing joins, for they are not where they are believed to be.
+        frame: the frame at this pose, with depth.
+        step: a number that differs from frame to frame, and selects which pixels are examined.
+        coarseness: n, if `shown` has every n-th pixel.
+        lost: objects that nothing joins, because they are not where they are believed to be.
     """
     assert frame.depths is not None
-    # Only pixels near an object can continue it; other places wait until one comes by.
+    # Only pixels near an object can continue it; others wait until one comes by.
     near, width = shown.labels > 0, 2 * (config.reach // coarseness) + 1
     for reach in ((1, width, 1), (1, 1, width)):
         near = jax.lax.reduce_window(near, False, jnp.logical_or, reach, (1, 1, 1), "SAME")
-    # Every second pixel each way, or those that are shown if these are fewer.
+    # Every second pixel each way, or the pixels of `shown` if they are fewer.
     lattice = max(2, coarseness)
     chosen = unexplained(shown, frame.depths[:, ::coarseness, ::coarseness], config) & near
     chosen = chosen[:, :: lattice // coarseness, :: lattice // coarseness]
-    places, real = _some_of(chosen.ravel(), step, config.candidates)
+    places, real = _draw(chosen.ravel(), step, config.candidates)
     camera, row, column = jnp.unravel_index(places, chosen.shape)
     row, column = lattice * row, lattice * column
     depth, color = frame.depths[camera, row, column], frame.images[camera, row, column]
@@ -98,35 +94,35 @@ def grow(
     slots = jnp.nonzero(empty_slots(scene), size=config.candidates, fill_value=scene.num_moving)[0]
     rank = jnp.cumsum(wanted) - 1
     target = jnp.where(wanted, slots[jnp.maximum(rank, 0)], scene.gaussians.num)
-    target = jnp.where(target < scene.num_moving, target, scene.gaussians.num)  # dropped where none is left
+    target = jnp.where(target < scene.num_moving, target, scene.gaussians.num)  # dropped if none is left
     scale = 0.55 * lattice * depth / frame.cameras.K[camera, 0, 0]
-    born = Gaussians(
+    new = Gaussians(
         means=points,
         quats=jnp.zeros((config.candidates, 4), points.dtype).at[:, 0].set(1.0),
         log_scales=jnp.log(jnp.maximum(scale, 1e-6))[:, None] * jnp.ones(3, points.dtype),
-        logit_opacities=jnp.full(config.candidates, _BORN, points.dtype),
+        logit_opacities=jnp.full(config.candidates, _LOGIT, points.dtype),
         sh0=rgb_to_sh0(color)[:, None],
         shN=None
         if scene.gaussians.shN is None
         else jnp.zeros((config.candidates, *scene.gaussians.shN.shape[1:]), points.dtype),
     )
-    gaussians = jax.tree.map(lambda a, b: a.at[target].set(b, mode="drop"), scene.gaussians, born)
+    gaussians = jax.tree.map(lambda a, b: a.at[target].set(b, mode="drop"), scene.gaussians, new)
     labels = scene.labels.at[target].set(label, mode="drop")
     scene = TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
     pose = Pose(
-        pose.means.at[target].set(born.means, mode="drop"), pose.quats.at[target].set(born.quats, mode="drop")
+        pose.means.at[target].set(new.means, mode="drop"), pose.quats.at[target].set(new.quats, mode="drop")
     )
     return scene, pose
 
 
-def _some_of(
+def _draw(
     chosen: Bool[Array, "n"], step: Int[Array, ""], count: int
 ) -> tuple[Int[Array, "count"], Bool[Array, "count"]]:
-    """Up to `count` chosen places, others in every step, and which of them are real.
+    """Indices of up to `count` chosen places, drawn at random in each step, and which of them are real.
 
-    All places are dealt out at random, to four times as many hands. From a random round and hand on, those
-    come first that have a chosen place first; of two in one hand, one waits for another step. That takes a
-    CPU a fraction of the time of ordering all places.
+    All places are dealt at random to 4 `count` hands, once and for all. Starting from a random round and a
+    random hand, each hand contributes the chosen place that is first in it; the hands with the earliest ones
+    win. On a CPU this takes a fraction of the time of sorting all places.
     """
     size, hands = chosen.shape[0], 4 * count
     rounds = -(-size // hands)
@@ -148,15 +144,16 @@ def _nearest(
     pose: Pose,
     config: GrowConfig,
 ) -> tuple[Int[Array, "p"], Float[Array, "p"]]:
-    """Label of the nearest Gaussian in position and colour, and its distance in units of the two reaches."""
+    """Label of the nearest Gaussian in position and colour, and its distance in units of `config.distance`
+    and `config.color`."""
     means = jnp.concatenate([pose.means, scene.gaussians.means[scene.num_moving :]])
     own = (means / config.distance, (scene.gaussians.sh0[:, 0] * SH_C0 + 0.5) / config.color)
     columns = [column for array in own for column in columns_in_lanes(array)]
-    ask = jnp.concatenate([points / config.distance, colors / config.color], axis=1)
+    queries = jnp.concatenate([points / config.distance, colors / config.color], axis=1)
     taken = (scene.labels <= scene.num_objects).at[: scene.num_moving].min(~empty_slots(scene))
-    squared = sum((a - b[:, None, None]) ** 2 for a, b in zip(columns, ask.T, strict=True))
+    squared = sum((a - b[:, None, None]) ** 2 for a, b in zip(columns, queries.T, strict=True))
     squared = jnp.where(in_lanes(taken), squared, jnp.inf)
-    # XLA:CPU's argmin is slow over many numbers: first the lane of the least, then its row.
+    # XLA:CPU's argmin is slow over many numbers: first the lane of the minimum, then its row.
     lane = jnp.argmin(squared.min(1), axis=1)
     rows = jnp.take_along_axis(squared, lane[:, None, None], axis=2)[..., 0]
     row = jnp.argmin(rows, axis=1)

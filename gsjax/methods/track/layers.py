@@ -1,9 +1,9 @@
-"""What a scene shows: which label is on top in each pixel, and how deep it lies.
+"""What a scene shows: the label on top in each pixel, and its depth.
 
-Two ways. The whole scene is drawn, or what moves is drawn over what stands: the background is drawn once and
-kept, and drawn again only when a camera has moved. Where the background is opaque and a pixel's moving
-Gaussians lie all in front of it or all behind, the second is exact but for what `plan_moving` leaves out;
-else a pixel belongs to what is nearer.
+Either the whole scene is drawn, or the moving Gaussians are drawn over the background, which is drawn once
+and stored until a camera moves. If the background is opaque and the moving Gaussians of a pixel lie all in
+front of it or all behind it, the second way is exact, but for what `plan_moving` omits; else a pixel belongs
+to whichever is nearer.
 """
 
 from typing import NamedTuple
@@ -28,13 +28,13 @@ from gsjax.scene.render import Rendered, plan_render, render
 class Shown(NamedTuple):
     """What each pixel of C cameras shows."""
 
-    labels: Int[Array, "c height width"]  # the group on top; 0 for background and for nothing
+    labels: Int[Array, "c height width"]  # group on top; 0 for the background or nothing
     depths: Float[Array, "c height width"]  # metres; 0 where nothing is drawn
     covered: Bool[Array, "c height width"]  # more than half opaque
 
 
 class Backdrop(NamedTuple):
-    """The background alone, and the cameras that it was drawn for."""
+    """The background alone, drawn for these cameras."""
 
     cameras: Camera
     depths: Float[Array, "c height width"]
@@ -42,17 +42,20 @@ class Backdrop(NamedTuple):
 
     @property
     def covers(self) -> Bool[Array, "c height width"]:
-        """Pixels where it is more than half opaque."""
+        """Pixels in which the background is more than half opaque."""
         return self.alphas > 0.5
 
 
 def render_labels(
     scene: TrackedScene, pose: Pose, frame: Frame, plan: Plan, *, one_sided: bool = False
 ) -> Rendered:
-    """The scene as it stands, with the share of each label in each pixel as features [C, H, W, K+1].
+    """The scene at `pose`, with the weight of each label in each pixel as features [C, H, W, K+1].
 
-    `one_sided` leaves out what a camera sees from behind: right for comparing with images, while for
-    silhouettes the far side of an object stands in for a near side that no camera has seen yet.
+    Args:
+        scene, pose, plan: what is drawn.
+        frame: its cameras.
+        one_sided: omit surfaces that a camera sees from behind. Comparisons with images need this; for
+            silhouettes, the far side of an object stands in for a near side that no camera has seen yet.
     """
     one_hot = jax.nn.one_hot(scene.labels, scene.num_objects + 1)
     visibility = facing(scene, pose, camera_centers(frame.cameras.viewmat)) if one_sided else None
@@ -60,7 +63,7 @@ def render_labels(
 
 
 def shown_by(rendered: Rendered) -> Shown:
-    """What the whole scene shows, drawn by `render_labels`."""
+    """What the whole scene shows, as drawn by `render_labels`."""
     assert rendered.features is not None
     covered = rendered.alphas > 0.5
     labels = jnp.where(covered, jnp.argmax(rendered.features, axis=-1), 0)
@@ -68,30 +71,30 @@ def shown_by(rendered: Rendered) -> Shown:
 
 
 def background_of(scene: TrackedScene) -> Gaussians:
-    """The Gaussians that do not move."""
+    """The Gaussians of the background."""
     return jax.tree.map(lambda a: a[scene.num_moving :], scene.gaussians)
 
 
 def moving_of(scene: TrackedScene, pose: Pose) -> Gaussians:
-    """The Gaussians that move, placed by `pose`."""
+    """The moving Gaussians at `pose`."""
     moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
     return eqx.tree_at(lambda g: (g.means, g.quats), moving, (pose.means, pose.quats))
 
 
 def thinned(gaussians: Gaussians, coarseness: int) -> Gaussians:
-    """Every coarseness^2-th Gaussian, `coarseness` times as large: the same surface for smaller pictures."""
+    """Every coarseness^2-th Gaussian, `coarseness` times as large: the same surface for smaller images."""
     some = jax.tree.map(lambda a: a[:: coarseness**2], gaussians)
     return eqx.tree_at(lambda g: g.log_scales, some, some.log_scales + np.log(coarseness))
 
 
 def reduced(cameras: Camera, coarseness: int) -> Camera:
-    """The same views in smaller pictures, pixels `coarseness` times as wide."""
+    """The same views in smaller images, with pixels `coarseness` times as wide."""
     width, height = (-(-size // coarseness) for size in (cameras.width, cameras.height))
     return resized(cameras, 1 / coarseness, width, height)
 
 
 def draw_backdrop(scene: TrackedScene, cameras: Camera, plan: Plan) -> tuple[Backdrop, Int[Array, ""]]:
-    """The background in these cameras, and what capacity that needed."""
+    """The background in these cameras, and the capacity needed."""
     drawn = render(background_of(scene), cameras, plan)
     return Backdrop(cameras, drawn.depths, drawn.alphas), drawn.meta.needed.max()
 
@@ -99,27 +102,24 @@ def draw_backdrop(scene: TrackedScene, cameras: Camera, plan: Plan) -> tuple[Bac
 def keep_backdrop(
     backdrop: Backdrop, scene: TrackedScene, cameras: Camera, plan: Plan
 ) -> tuple[Backdrop, Int[Array, ""]]:
-    """The backdrop for these cameras: the one there is, unless a camera has moved."""
+    """The backdrop for these cameras, drawn again only if a camera has moved, and the capacity needed."""
     same = are_same(backdrop.cameras, cameras)
     return jax.lax.cond(same, lambda: (backdrop, jnp.int32(0)), lambda: draw_backdrop(scene, cameras, plan))
 
 
 def are_same(a: Camera, b: Camera) -> Bool[Array, ""]:
-    """Whether these cameras of one size are in the same places, and see the same of it."""
+    """Whether cameras of the same image size have equal poses and intrinsics."""
     return jnp.array_equal(a.viewmat, b.viewmat) & jnp.array_equal(a.K, b.K)
 
 
 def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
-    """A plan for `show_moving`, of which only labels and depths are needed: shares of a pixel below 3 % are
-    left out, and all that lies behind once less than a tenth is left. A Gaussian that would leave less than
-    1 % is not drawn, so none may take that much alone: `alpha_max`. So where one alone is all that shows of
-    an opaque thing, depth leans by up to 9 % of the way to what moves behind it. Small tiles fit small
-    Gaussians, and a few of them end sooner than many (tuned on a CPU).
+    """A plan for `show_moving`, which needs only labels and depths, with a relative `headroom` of 1 or more.
 
-    Args:
-        moving: the Gaussians that move.
-        cameras: all that look at them.
-        headroom: 1 or more.
+    Alphas below 3 % of a pixel are omitted, and so is all that lies behind once less than a tenth of the
+    light is left. A Gaussian that would leave less than 1 % is not drawn, so `alpha_max` prevents a single
+    one from taking that much. Therefore, if a single Gaussian shows an opaque object, the depth shifts by up
+    to 9 % of the way to whatever moves behind it. Small tiles fit small Gaussians, and batches of fewer tiles
+    finish sooner (tuned on a CPU).
     """
     limits = {"alpha_min": 0.03, "alpha_max": 0.9, "min_transmittance": 0.01}
     tiles = {"tile_size": 4, "tiles_per_batch": 384}
@@ -129,21 +129,20 @@ def plan_moving(moving: Gaussians, cameras: Camera, headroom: float) -> Plan:
 def show_moving(
     scene: TrackedScene, pose: Pose, backdrop: Backdrop, plan: Plan, coarseness: int = 1
 ) -> tuple[Shown, Int[Array, ""]]:
-    """What moves, `thinned` and drawn alone, over the backdrop; and what capacity that needed.
+    """What the moving Gaussians, `thinned`, show over the backdrop; and the capacity needed.
 
-    Labels are drawn as their binary digits, which are few channels: where one label has more than half of a
+    Labels are drawn as their binary digits, which take few channels: if one label has more than half of a
     pixel's weight, so has each of its digits.
 
     Args:
-        scene: what is tracked.
-        pose: where it is.
-        backdrop: what does not move, drawn once.
+        scene, pose: the tracked scene.
+        backdrop: the background.
         plan: from `plan_moving`.
-        coarseness: that of the backdrop; Gaussians are `thinned` by as much.
+        coarseness: coarseness of the backdrop, by which the Gaussians are thinned.
     """
     moving, cameras = thinned(moving_of(scene, pose), coarseness), backdrop.cameras
     powers = np.left_shift(1, np.arange(max(1, scene.num_objects.bit_length())))
-    labels = scene.labels[: scene.num_moving : coarseness**2]
+    labels = scene.groups[:: coarseness**2]
     digits = ((labels[:, None] & powers) > 0).astype(pose.means.dtype)
     images, alphas, meta = rasterization(
         moving.means,
@@ -171,14 +170,14 @@ def show_moving(
 def seen_from(
     means: Float[Array, "m 3"], groups: Int[Array, "m"], shown: Shown, cameras: Camera, gap: float
 ) -> Float[Array, "c m"]:
-    """1 for each Gaussian of a group that a camera sees: its label is on top there and its depth agrees.
+    """1 for each Gaussian that a camera sees, else 0: its group is on top there and the depth agrees.
 
     Args:
-        means: of the Gaussians, metres.
-        groups: 1 and up.
-        shown: what each camera has on top.
-        cameras: C of them.
-        gap: by how much depths may differ, metres.
+        means: centres of the Gaussians, metres.
+        groups: their groups, 1 and up.
+        shown: what the cameras show.
+        cameras: C cameras.
+        gap: tolerance of depth, metres.
     """
     width, height = cameras.width, cameras.height
 

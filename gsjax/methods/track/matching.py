@@ -1,4 +1,5 @@
-"""Object-centric initialisation (section II-B): find each object's template in the image, and lift it to 3D.
+"""Template matching: find each object's template in the image, and lift its shift to 3D (the object-centric
+initialisation of Object-Aware Gaussian Splatting for Robotic Manipulation, section II-B).
 
 The template is the last scene as rendered, masked by the object's visible alpha. The score is the zero-mean
 normalised cross-correlation under that mask, over all shifts at once by FFT:
@@ -6,9 +7,10 @@ normalised cross-correlation under that mask, over all shifts at once by FFT:
     score(d) = sum_p m T'(p) I(p+d) / sqrt(sum_p m T'(p)^2  V(d)),
     V(d) = sum_p m I(p+d)^2 - (sum_p m I(p+d))^2 / sum_p m,
 
-with T' = T minus its mean under m, sums over channels as well.
+with T' = T minus its mean under m; sums include the channels.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -21,26 +23,26 @@ from gsjax.scene.frame import Frame
 
 
 class Template(NamedTuple):
-    """The last scene, or the last images, with the share of each object in each pixel."""
+    """The last scene as rendered, or the last images, with the weight of each object in each pixel."""
 
     colors: Float[Array, "c h w 3"]
     depths: Float[Array, "c h w"]
     weights: Float[Array, "c h w k"]
 
 
-class Match(NamedTuple):
-    """Where one object's template was found in one camera."""
+class TemplateMatch(NamedTuple):
+    """Where the template of each object was found in each camera."""
 
-    score: Float[Array, "*ck"]  # correlation at the peak, -1 to 1; 0 where nothing was visible
+    score: Float[Array, "*ck"]  # correlation at the peak, -1 to 1; 0 if nothing was visible
     shift: Float[Array, "*ck 2"]  # pixels
     origin: Float[Array, "*ck 2"]  # centre of the visible mask, pixels
     depth: Float[Array, "*ck"]  # rendered depth of the visible surface, metres
     depth_change: Float[Array, "*ck"]  # measured minus rendered, metres
-    measured: Bool[Array, "*ck"]  # whether the depth image knew the surface
+    measured: Bool[Array, "*ck"]  # whether the depth image has the surface
 
 
 def _peak(scores: Float[Array, "s s"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Sub-pixel position (x, y) of the largest score: a parabola through it and its neighbours, each way."""
+    """Sub-pixel position (x, y) of the largest score, from a parabola along each axis, and that score."""
     size = scores.shape[0]
     flat = jnp.argmax(scores)
     y, x = flat // size, flat % size
@@ -48,9 +50,8 @@ def _peak(scores: Float[Array, "s s"]) -> tuple[Float[Array, "2"], Float[Array, 
 
     def vertex(before, after):
         bend = before - 2 * best + after
-        return jnp.where(
-            bend < -1e-6, jnp.clip(0.5 * (before - after) / jnp.minimum(bend, -1e-6), -0.5, 0.5), 0.0
-        )
+        offset = jnp.clip(0.5 * (before - after) / jnp.minimum(bend, -1e-6), -0.5, 0.5)
+        return jnp.where(bend < -1e-6, offset, 0.0)
 
     xs = jnp.clip(jnp.array([x - 1, x + 1]), 0, size - 1)
     ys = jnp.clip(jnp.array([y - 1, y + 1]), 0, size - 1)
@@ -82,37 +83,32 @@ def correlate(
     squares = placed(spectrum((search**2).sum(-1)) * of_mask)
     sums = placed(of_search * of_mask[..., None])
     energy = jnp.maximum(squares - (sums**2).sum(-1) / total, 0.0)
-    # Patches without contrast correlate with everything: they count as if they had a little noise.
+    # Patches without contrast correlate with everything: regularise as if there were a little noise.
     floor = 1e-4 * total
     return product / jnp.sqrt((energy + floor) * (template_energy + floor))
 
 
 def match_templates(
-    template: Template,
-    frame: Frame,
-    config: MatchConfig,
-    reduction: int = 1,
-) -> Match:
+    template: Template, frame: Frame, config: MatchConfig, reduction: int = 1
+) -> TemplateMatch:
     """Match every object in every camera: fields [C, K].
 
     Args:
         template: the last scene in the new frame's cameras.
-        frame: what the cameras see now.
-        reduction: images are averaged down by this factor first, for objects larger than the template.
+        frame: the new frame.
+        reduction: factor by which images are averaged down first, for objects larger than the template.
     """
     shrink = jax.vmap(lambda a: _reduce(a, reduction))
     (colors, depths, weights), images = template, frame.images
     rendered_small, image_small, weight_small = shrink(colors), shrink(images), shrink(weights)
-
-    def one(color, image, weight, full_weight, depth, measured_depth):
-        return _match_one(color, image, weight, full_weight, depth, measured_depth, config, reduction)
-
+    one = partial(_match_one, config=config, reduction=reduction)
     measured = jnp.zeros_like(depths) if frame.depths is None else frame.depths
     over_objects = jax.vmap(one, in_axes=(None, None, -1, -1, None, None))
     return jax.vmap(over_objects)(rendered_small, image_small, weight_small, weights, depths, measured)
 
 
 def _reduce(image: Float[Array, "h w k"], factor: int) -> Float[Array, "h2 w2 k"]:
+    """Means over blocks; the border is repeated to fill the last ones."""
     if factor == 1:
         return image
     height, width, channels = image.shape
@@ -122,6 +118,7 @@ def _reduce(image: Float[Array, "h w k"], factor: int) -> Float[Array, "h2 w2 k"
 
 
 def _match_one(color, image, weight, full_weight, depth, measured_depth, config: MatchConfig, reduction: int):
+    """The match of one object in one camera."""
     patch, radius = config.patch, config.radius
     height, width = weight.shape
     mass = weight.sum()
@@ -149,7 +146,7 @@ def _match_one(color, image, weight, full_weight, depth, measured_depth, config:
     found_depth = _shifted(measured_depth, moved)
     change, measured = _weighted_median(found_depth - depth, seen & (found_depth > 0) & (depth > 0))
     enough = known & (seen.sum() >= 8)
-    return Match(
+    return TemplateMatch(
         score=jnp.where(enough, score, 0.0),
         shift=shift,
         origin=center * reduction,
@@ -176,12 +173,14 @@ def _weighted_median(values: Float[Array, "h w"], chosen: Bool[Array, "h w"]):
     return jnp.where(count > 0, middle, 0.0), count > 0
 
 
-def lift(match: Match, frame: Frame, config: MatchConfig) -> tuple[Float[Array, "k 3"], Bool[Array, "k"]]:
-    """Each object's translation in the world from its matches in all cameras, and whether it was found.
+def lift(
+    match: TemplateMatch, frame: Frame, config: MatchConfig
+) -> tuple[Float[Array, "k 3"], Bool[Array, "k"]]:
+    """Translation of each object in the world from its matches in all cameras, and whether it was found.
 
-    A camera says that the point it saw at `origin` now lies on the ray through `origin + shift` (two
-    equations), and, with depth, how far along it (one more). All are solved together by least squares: one
-    camera with depth, or two without, fix the translation; one without moves the object across its image.
+    In each camera, the point seen at `origin` now lies on the ray through `origin + shift` (two equations)
+    and, with depth, at a known depth (one more). Least squares solves all together: one camera with depth, or
+    two without, determine the translation; one without moves the object parallel to its image.
     """
     viewmats, Ks = frame.cameras.viewmat, frame.cameras.K
     usable = match.score >= config.min_score
@@ -190,11 +189,11 @@ def lift(match: Match, frame: Frame, config: MatchConfig) -> tuple[Float[Array, 
         before = unproject(origin, depth, viewmat, K)
         center = camera_centers(viewmat)
         on_ray = unproject(origin + shift, depth, viewmat, K) - center
-        ray = on_ray / jnp.maximum(jnp.linalg.norm(on_ray), 1e-9)  # 0 where the object was not seen
+        ray = on_ray / jnp.maximum(jnp.linalg.norm(on_ray), 1e-9)  # 0 if the object was not seen
         across = jnp.eye(3) - jnp.outer(ray, ray)
         axis = viewmat[2, :3]
         along = jnp.where(measured, 1.0, 0.0)
-        # In metres across: a pixel's worth of error is the same for both kinds of equation.
+        # Both kinds of equation are in metres.
         matrix = weight * (across + along * jnp.outer(axis, axis))
         right = weight * (across @ (center - before) + along * axis * change)
         return matrix, right

@@ -1,8 +1,7 @@
-"""The tracker as one value. Its frames are no steps of descent, so no `drive` runs it but the generator of
-`gsjax.engine.track.tracking`, on the same runs and ticks."""
+"""The tracker as one value. Its frames are not steps of descent, so it is run not by `drive` but by the
+generator of `gsjax.engine.track.tracking`, on the same runs and ticks."""
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ from gsjax.methods.track.grow import with_slots
 from gsjax.methods.track.motion import first_pose
 from gsjax.methods.track.plan import plan_tracker
 from gsjax.methods.track.scene import TrackedScene
-from gsjax.methods.track.state import TrackBatch, Tracked, TrackState
+from gsjax.methods.track.state import TrackBatch, Tracked
 from gsjax.methods.track.update import first_look, track_step
 from gsjax.optim.method import Run
 from gsjax.optim.step import Step
@@ -27,11 +26,11 @@ PLAN = "track"
 
 
 class Kept(NamedTuple):
-    """What a run keeps beside parameters, state and plan.
+    """What a run stores beside parameters, state and plan.
 
     Attributes:
         reduction: factor by which images shrink for template matching.
-        chosen: the settings that were chosen for a budget; None without one.
+        chosen: settings chosen for a time budget; None without one.
     """
 
     reduction: int
@@ -43,8 +42,8 @@ class Track:
     """The object-aware tracker.
 
     Attributes:
-        config: how objects are tracked.
-        extra_losses: custom losses beside the refinement's; see `track_step`.
+        config: configuration of the tracker.
+        extra_losses: custom losses of the refinement; see `track_step`.
     """
 
     config: TrackConfig = field(default_factory=TrackConfig)
@@ -54,23 +53,19 @@ class Track:
         named_losses(self.extra_losses)
 
     def start(self, scene: TrackedScene, first: Frame) -> tuple[FrameShape, Run]:
-        """The tracker at the first frame, with slots for what joins objects where there is depth.
+        """The shape of the frames and the run at the first frame, with slots if there is depth.
 
         Args:
             scene: from `start_scene` or `scene_from_shapes`.
-            first: the frame that it shows, as all cameras saw it.
+            first: the frame that it shows, of all cameras.
         """
         if self.config.grow.slots and first.depths is not None:
             scene = with_slots(scene, self.config.grow.slots)
         return self.start_at(Tracked(scene, first_pose(scene)), first)
 
     def start_at(self, params: Tracked, frame: Frame) -> tuple[FrameShape, Run]:
-        """The tracker at a frame that shows its objects where `params` has them; the scene stays as it is.
-
-        Args:
-            params: a scene with its slots, and a pose.
-            frame: as all cameras saw it.
-        """
+        """The shape of the frames and the run at a frame of all cameras that shows the scene, with its slots
+        as they are, at the pose of `params`."""
         plan = plan_tracker(params.scene, params.pose, frame, self.config)
         state = _first_look(params, TrackBatch(frame, plan), self.config)
         kept = Kept(matching_reduction(params.scene, frame, self.config))
@@ -81,27 +76,18 @@ class Track:
         return track_step(self.config, shape, reduction, self.extra_losses)
 
     def result(self, problem: FrameShape | None, run: Run) -> Tracked:
-        """The scene and where its objects are."""
+        """The scene and the pose of its objects."""
         return run.params
 
 
-@partial(jax.jit, static_argnames="config")
-def _first_look(params: Tracked, batch: TrackBatch, config: TrackConfig) -> TrackState:
-    return first_look(params, batch, config)
+_first_look = jax.jit(first_look, static_argnames="config")
 
 
 def matching_reduction(scene: TrackedScene, frame: Frame, config: TrackConfig) -> int:
-    """By how much images shrink for matching, so that the largest object but one fits its template.
-
-    The largest is commonly a robot, which is far larger than what it handles. On the host.
-
-    Args:
-        scene: at the first frame.
-        frame: as all cameras saw it.
-        config: the tracker's.
-    """
+    """Factor by which images of all cameras shrink for matching, so that the second largest object fits the
+    template: the largest is usually a robot, far larger than what it handles. On the host."""
     frame, _ = prepared(frame, config)
-    groups = np.asarray(scene.labels[: scene.num_moving])
+    groups = np.asarray(scene.groups)
     means = np.asarray(scene.gaussians.means[: scene.num_moving], np.float64)
     sizes = []
     for viewmat, K in zip(np.asarray(frame.cameras.viewmat), np.asarray(frame.cameras.K), strict=True):

@@ -1,4 +1,5 @@
-"""x_t = D_k x_{t-1} + delta_i: how groups and their members move (section II-C)."""
+"""x_t = D_k x_{t-1} + delta_i: the motion of groups and of their Gaussians (Object-Aware Gaussian Splatting
+for Robotic Manipulation, section II-C)."""
 
 import equinox as eqx
 import jax
@@ -12,18 +13,18 @@ from gsjax.scene.gaussians import Gaussians
 
 
 class Pose(eqx.Module):
-    """Where the M moving Gaussians are."""
+    """Positions, metres, and orientations (w x y z) of the M moving Gaussians."""
 
     means: Float[Array, "m 3"]
     quats: Float[Array, "m 4"]
 
 
 class Motion(eqx.Module):
-    """One frame's motion: a twist a group, about the group's centroid, and a displacement a Gaussian.
+    """The motion of one frame.
 
     Attributes:
-        twists: of each group: translation, metres, and axis times angle, radians.
-        delta: of each Gaussian, metres.
+        twists: translation, metres, and rotation vector, radians, of each group about its centroid.
+        delta: displacement of each Gaussian, metres.
     """
 
     twists: Float[Array, "k 6"]
@@ -33,27 +34,15 @@ class Motion(eqx.Module):
 def group_means(
     values: Float[Array, "m *d"], groups: Int[Array, "m"], num_groups: int
 ) -> Float[Array, "k *d"]:
-    """Mean of `values` over each group 1..K.
-
-    Args:
-        values: of Gaussians.
-        groups: 1..K, of each.
-        num_groups: K, static.
-    """
+    """Mean of the `values` of Gaussians over each of the groups 1..K; `num_groups` is K, static."""
     total = jax.ops.segment_sum(values, groups - 1, num_groups)
     count = jax.ops.segment_sum(jnp.ones(groups.shape, values.dtype), groups - 1, num_groups)
     return total / jnp.maximum(count, 1).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[Array, "m"]) -> Pose:
-    """Each group turned about its centre and shifted, then each Gaussian shifted by its delta.
-
-    Args:
-        pose: before.
-        motion: a twist a group, a delta a Gaussian.
-        centers: of groups, metres.
-        groups: 1..K, of each Gaussian.
-    """
+    """The pose after each group is rotated about its center, metres, and translated, and each Gaussian is
+    displaced; `groups` has the group of each Gaussian, 1..K."""
     rotation = jaxlie.SO3.exp(motion.twists[:, 3:])
     member = groups - 1
     center = centers[member]
@@ -63,13 +52,7 @@ def move(pose: Pose, motion: Motion, centers: Float[Array, "k 3"], groups: Int[A
 
 
 def select_motion(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Array, "m"]) -> Motion:
-    """The motion `a` of the chosen groups, and `b` of the others.
-
-    Args:
-        chosen: of all groups.
-        a, b: motions of all groups and Gaussians.
-        groups: 1..K, of each Gaussian.
-    """
+    """The motion `a` for the chosen groups, `b` for the others; `groups` has the group of each Gaussian."""
     return Motion(
         jnp.where(chosen[:, None], a.twists, b.twists),
         jnp.where(chosen[groups - 1][:, None], a.delta, b.delta),
@@ -77,7 +60,7 @@ def select_motion(chosen: Bool[Array, "k"], a: Motion, b: Motion, groups: Int[Ar
 
 
 def place(scene: TrackedScene, pose: Pose) -> Gaussians:
-    """The scene's Gaussians with the moving ones put where `pose` says."""
+    """The scene's Gaussians, with the moving ones at `pose`."""
     still = scene.num_moving
     gaussians = scene.gaussians
     means = jnp.concatenate([pose.means, gaussians.means[still:]])
@@ -86,20 +69,16 @@ def place(scene: TrackedScene, pose: Pose) -> Gaussians:
 
 
 def first_pose(scene: TrackedScene) -> Pose:
-    """Where the moving Gaussians are in the first frame."""
+    """The pose in the first frame."""
     return Pose(scene.gaussians.means[: scene.num_moving], scene.gaussians.quats[: scene.num_moving])
 
 
 def facing(scene: TrackedScene, pose: Pose, eyes: Float[Array, "c 3"]) -> Float[Array, "c n"]:
-    """How much of each Gaussian's outer side each camera sees, 0 to 1; a surface hides its own inside.
+    """How far the outer side of each Gaussian faces each camera, 0 to 1; 1 without a normal.
 
-    Without this, the front of a box that has turned away would be compared with its back. It fades from 1 to
-    0 as the angle between normal and ray passes 90 degrees. A constant: no gradient.
-
-    Args:
-        scene: with outward normals.
-        pose: where the Gaussians are.
-        eyes: places of the cameras, metres.
+    Without this factor, the front of a box that has turned away would be compared with images of its back. It
+    fades from 1 to 0 as the angle between normal and ray passes 90 degrees, and has no gradient. `eyes` are
+    the positions of the cameras, metres.
     """
     normals = jnp.einsum("mij,mj->mi", quats_to_matrices(pose.quats), scene.normals)
     rays = eyes[:, None] - pose.means

@@ -1,4 +1,4 @@
-"""Capacities of the tracker's step, static as shapes are, and what a step needed of them."""
+"""Capacities of the tracker's step, which are static like shapes, and what a step needed of them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,9 +24,9 @@ class TrackPlan:
     """Static capacities of a tracker's step.
 
     Attributes:
-        full: for rendering the whole scene.
-        near: for rendering what lies in the region of interest.
-        num_near: background Gaussians that may lie there.
+        full: plan of the whole scene or, with `redraw` "moving", of the background.
+        near: plan of the refined region or, with `redraw` "moving", of the moving Gaussians.
+        num_near: number of background Gaussians that may lie in the refined region.
     """
 
     full: Plan
@@ -34,7 +34,7 @@ class TrackPlan:
     num_near: int
 
     def grown(self, needed: "Needed", headroom: float) -> "TrackPlan":
-        """The same with every capacity on the lowest rung that holds what was needed."""
+        """The plan with every capacity on the lowest rung that holds what was needed."""
         return TrackPlan(
             self.full.grown(int(needed.full), headroom),
             self.near.grown(int(needed.near), headroom),
@@ -43,7 +43,7 @@ class TrackPlan:
 
 
 class Needed(NamedTuple):
-    """How much of each capacity a step needed."""
+    """How much of each capacity of a `TrackPlan` a step needed."""
 
     full: Int[Array, ""]
     near: Int[Array, ""]
@@ -56,21 +56,17 @@ class Needed(NamedTuple):
 
 
 def plan_tracker(scene: TrackedScene, pose: Pose, frame: Frame, config: TrackConfig) -> TrackPlan:
-    """Capacities for a step from `pose` with cameras as in `frame`, with headroom for what motion adds.
-
-    On the host.
+    """Capacities for a step from `pose`, with the cameras of `frame` and headroom for what motion adds. On
+    the host.
 
     Args:
-        scene, pose: as they stand, with slots for what joins.
-        frame: what all cameras saw at this pose.
-        config: the tracker's.
+        scene, pose: the scene, with its slots.
+        frame: the frame of all cameras at this pose.
     """
     headroom, (frame, _) = config.headroom, prepared(frame, config)
     if config.redraw == "moving":
-        views, moving = (
-            reduced(frame.cameras, config.coarseness),
-            thinned(moving_of(scene, pose), config.coarseness),
-        )
+        views = reduced(frame.cameras, config.coarseness)
+        moving = thinned(moving_of(scene, pose), config.coarseness)
         full = plan_render(background_of(scene), views, headroom=headroom)
         near = plan_moving(moving, views, headroom)
         return TrackPlan(full, near, 0)

@@ -1,4 +1,5 @@
-"""Which object a text means (section III-B): the one whose embedding is nearest to the text's by cosine."""
+"""Language queries: the object whose embedding has the largest cosine with that of the text (Object-Aware
+Gaussian Splatting for Robotic Manipulation, section III-B)."""
 
 from typing import NamedTuple
 
@@ -7,13 +8,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class Match(NamedTuple):
-    """What a query found.
+    """The result of a query.
 
     Attributes:
-        best: row of the object with the highest score; the first of several.
-        scores: the cosine of each object with the query; 0 for one without an embedding (all zeros).
-        margin: how far the best score lies above the next; infinite where there is one object only.
-        found: whether the best score reaches `min_score`; if not, the query means none of them.
+        best: index of the object with the highest score; the first of several.
+        scores: cosine of each object with the query; 0 for an object without embedding (all zeros).
+        margin: difference between the two highest scores; infinite if there is only one object.
+        found: whether the best score reaches `min_score`; if not, the query matches no object.
     """
 
     best: Int[Array, ""]
@@ -25,20 +26,21 @@ class Match(NamedTuple):
 def find_object(
     text_embedding: Float[Array, "size"], object_embeddings: Float[Array, "k d"], min_score: float = -1.0
 ) -> Match:
-    """The object that a text means.
+    """The object that matches a text best.
 
     Args:
-        text_embedding, object_embeddings: of any length, from one `LanguageEncoder`.
-        min_score: a best score below this means none of the objects; encoders suggest one.
+        text_embedding, object_embeddings: embeddings from one `LanguageEncoder`, of any length.
+        min_score: if the best score is below this, no object matches; encoders suggest a value.
 
     Raises:
         ValueError: there is no object, or the embeddings differ in dimension.
     """
     count, size = object_embeddings.shape
     if count == 0:
-        raise ValueError("object_embeddings: got no object, want at least one")
+        raise ValueError("object_embeddings: expected at least one object, found none")
     if text_embedding.shape != (size,):
-        raise ValueError(f"text_embedding: got shape {text_embedding.shape}, want [{size}] as the objects'")
+        found = text_embedding.shape
+        raise ValueError(f"text_embedding: expected shape [{size}] as the objects', found {found}")
     scores = _unit(object_embeddings) @ _unit(text_embedding)
     best = jnp.argmax(scores)
     rest = jnp.where(jnp.arange(count) == best, -jnp.inf, scores)
@@ -46,5 +48,6 @@ def find_object(
 
 
 def _unit(vectors: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+    """Vectors scaled to length 1; zeros stay zeros."""
     length = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
     return jnp.where(length > 0, vectors / jnp.where(length > 0, length, 1.0), 0.0)

@@ -1,9 +1,9 @@
-"""Recovery of a lost group: many places are guessed and aligned, and the one where most of it shows is kept.
+"""Relocation of a lost group: many guesses are aligned, and the one where most of the group shows is kept.
 
-Residuals cannot choose, for they take what hides a group, or lies outside the pictures, for a disagreement.
-So `confidence` does, with the Gaussians of the first frame that would face each camera. The result is a
-guess, from which the next frame goes on, until enough of the group shows there for it to be found: in two
-frames, for of many guesses one may agree by chance.
+Residuals cannot choose among guesses, because they count as disagreement what hides a group or lies outside
+the images. So `group_confidence` chooses, from the Gaussians of the first frame that would face each camera.
+The result is again a guess, from which the next frame continues, until enough of the group shows there for it
+to be found, in two frames: among many guesses one may agree by chance.
 """
 
 from typing import NamedTuple
@@ -13,21 +13,21 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Key
 
-from gsjax.methods.track.align import align, coarse_shifts, compose, turned, widened
+from gsjax.methods.track.align import align, coarse_shifts, compose, turn_hypotheses, widened
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown
-from gsjax.methods.track.lost import COLOR_SCALE, Confidence, confidence
-from gsjax.methods.track.points import Points, Sight, sum_of_three
-from gsjax.methods.track.reference import ReferencePoints, as_facing
+from gsjax.methods.track.lost import COLOR_SCALE, Confidence, group_confidence
+from gsjax.methods.track.points import Points, ToneImages, sum_of_three
+from gsjax.methods.track.reference import ReferencePoints, points_facing
 
-_LARGEST_TURN = 2.0  # radians; a camera that looks for a point has seldom lost it from sight by less
-_NEAR_GUESS = 0.3  # radians; how a guess that goes on from a guess is turned
+_LARGEST_TURN = 2.0  # radians; beyond it, the points that were visible seldom still face the camera
+_NEAR_TURN = 0.3  # radians; standard deviation of turns near the last guess, per axis
 _STARTS = 8  # guesses that are aligned
-_ROUNDS = 2  # in which turns of the best are tried
+_ROUNDS = 2  # of turns that are tried from the best
 
 
 def relative_twists(twists: Float[Array, "*k 6"], moved: Float[Array, "*k 6"]) -> Float[Array, "*k 6"]:
-    """The same places as after `twists`, from where groups are after `moved`, both about the same centres."""
+    """The twists that lead from the places after `moved` to those after `twists`, about the same centres."""
     turns = jaxlie.SO3.exp(twists[..., 3:]) @ jaxlie.SO3.exp(moved[..., 3:]).inverse()
     return jnp.concatenate([twists[..., :3] - moved[..., :3], turns.log()], axis=-1)
 
@@ -36,17 +36,17 @@ class Relocation(NamedTuple):
     """Another place where a lost group may be."""
 
     twists: Float[Array, "*k 6"]  # from where it is believed to be
-    sure: Confidence
-    before: Confidence  # of the last frame's guess, aligned: what agreed by chance does not again
+    confidence: Confidence
+    guess_confidence: Confidence  # in the last frame's guess, aligned: agreement by chance does not recur
 
 
 class SearchContext(NamedTuple):
-    """The images that a lost group is looked for in, and what hides it there."""
+    """The images in which a lost group is searched for, and what hides it there."""
 
-    sight: Sight
-    background: Float[Array, "c h w"] | None  # its depth, metres, where it is known; else 0
-    others: Float[Array, "c h w"]  # depth of groups that are not in doubt, see `depths_of_others`
-    unexplained_pixels: Points  # pixels of the last frame that no group explains
+    images: ToneImages
+    background: Float[Array, "c h w"] | None  # its depth, metres, 0 if unknown
+    others: Float[Array, "c h w"]  # depth of the groups that are not in doubt, see `depths_of_others`
+    unexplained_pixels: Points  # of the last frame
 
 
 def recover(
@@ -54,88 +54,92 @@ def recover(
     reference: ReferencePoints,
     center: Float[Array, "3"],
     guess: Float[Array, "6"],
-    around: SearchContext,
+    context: SearchContext,
     config: AlignConfig,
     gap: float,
 ) -> Relocation:
     """The place where most of one lost group shows.
 
     Args:
-        key: of the random places.
-        reference: of the group.
-        center: what it turns about.
-        guess: the result of the last frame, from where the group is believed to be now.
-        around: what it is looked for in.
-        gap: see `confidence`.
+        key: random key of the guesses.
+        reference: reference points of the group.
+        center: centroid of the group, metres.
+        guess: result of the last frame, as a twist from where the group is believed to be now.
+        context: the images.
+        config: configuration of the alignment.
+        gap: see `group_confidence`.
     """
-    sight = around.sight
+    images = context.images
 
     def shown(twists, reference) -> Confidence:
-        points = jax.vmap(as_facing, in_axes=(None, 0, None, None))(reference, twists, center, sight)
-        return confidence(points, sight, gap, around.background, around.others)
+        points = jax.vmap(points_facing, in_axes=(None, 0, None, None))(reference, twists, center, images)
+        return group_confidence(points, images, gap, context.background, context.others)
 
     def aligned(twist):
-        faces = as_facing(reference, twist, center, sight).seen
-        points = as_facing(reference, jnp.zeros_like(twist), center, sight)._replace(seen=faces)
+        faces = points_facing(reference, twist, center, images).seen
+        points = points_facing(reference, jnp.zeros_like(twist), center, images)._replace(seen=faces)
         for scales in (widened(config), config):
-            twist = align(twist, points, center, sight, scales)
+            twist = align(twist, points, center, images, scales)
         return twist
 
     def places(twists) -> tuple[Float[Array, "n 6"], Confidence]:
-        """As they are, and then aligned."""
+        """The twists as they are, and then aligned."""
         twists = jnp.concatenate([twists, jax.vmap(aligned)(twists)])
         return twists, shown(twists, reference)
 
     def best(places) -> tuple[Float[Array, "6"], Confidence]:
         return jax.tree.map(lambda a: a[jnp.argmax(evidence(places[1]))], places)
 
-    tried, shifts = guess[None], coarse_shifts(config, sight)
+    tried, shifts = guess[None], coarse_shifts(config, images)
     if len(shifts):
         few = jax.tree.map(lambda a: a[..., ::4], reference)
-        drawn = guesses(key, shifts, reference, center, around.unexplained_pixels, guess, config)
+        drawn = draw_guesses(key, shifts, reference, center, context.unexplained_pixels, guess, config)
         most = jax.lax.top_k(evidence(shown(drawn, few)), min(_STARTS, len(drawn)))[1]
         tried = jnp.concatenate([tried, drawn[most]])
     found = places(tried)
-    _, before = best(jax.tree.map(lambda a: a[:: len(tried)], found))  # the guess, and the guess aligned
-    twist, sure = best(found)
+    _, of_guess = best(jax.tree.map(lambda a: a[:: len(tried)], found))  # the guess as it is, and aligned
+    twist, confidence = best(found)
     if config.max_turn and config.turns:
         for _ in range(_ROUNDS):
-            twist, sure = best(places(turned(twist, jnp.eye(3), config.turns)))
-    return Relocation(twist, sure, before)
+            twist, confidence = best(places(turn_hypotheses(twist, jnp.eye(3), config.turns)))
+    return Relocation(twist, confidence, of_guess)
 
 
-def evidence(sure: Confidence) -> Float[Array, "*k"]:
-    """Evidence that a group is in a place: much of it shows there, and what shows agrees."""
-    return jnp.where(sure.tells, sure.agrees * sure.shows, 0.0)
+def evidence(confidence: Confidence) -> Float[Array, "*k"]:
+    """Evidence that a group is in a place: much of it shows there, and agrees."""
+    return jnp.where(confidence.conclusive, confidence.agreement * confidence.coverage, 0.0)
 
 
 def depths_of_others(shown: Shown, doubtful: Bool[Array, "k"]) -> Float[Array, "c h w"]:
-    """Depth of the groups that are not in doubt, where they were last seen; else 0. What shows these shows no
-    group that is looked for: that may be where another is believed to be that is elsewhere itself."""
+    """Depth of the groups that are not in doubt, where they were last seen; else 0. A pixel that shows one of
+    these shows no group that is searched for. A doubtful group may be elsewhere itself, so it has none."""
     sound = (shown.labels > 0) & ~doubtful[shown.labels - 1]
     return jnp.where(sound, shown.depths, 0.0)
 
 
-def with_unexplained(
-    shown: Shown, sight: Sight, num_groups: int, gap: float, thickness: float, coarseness: int
+def label_unexplained(
+    shown: Shown, images: ToneImages, num_groups: int, gap: float, thickness: float, coarseness: int
 ) -> Shown:
-    """`shown`, where pixels that no group explains have the label num_groups + 1 and their measured depth.
+    """`shown`, in which pixels that no group explains have the label num_groups + 1 and their measured depth.
 
     Args:
-        gap: what is measured this much nearer than the background is not explained by it, metres ...
-        thickness: ... and this much nearer than a group, metres.
-        coarseness: n, where `shown` has every n-th pixel.
+        shown: what the scene shows, of every n-th pixel.
+        images: the frame.
+        num_groups: K.
+        gap: the background does not explain depth that is nearer by more than this, metres.
+        thickness: a group does not explain depth that is nearer by more than this, metres.
+        coarseness: n.
     """
-    if sight.depths is None:
+    if images.depths is None:
         return shown
-    measured = sight.depths[:, ::coarseness, ::coarseness]
+    measured = images.depths[:, ::coarseness, ::coarseness]
     nearest = shown.depths - jnp.where(shown.labels > 0, thickness, gap)
     unexplained = (measured > 0) & shown.covered & (measured < nearest)
     labels = jnp.where(unexplained, num_groups + 1, shown.labels)
     return shown._replace(labels=labels, depths=jnp.where(unexplained, measured, shown.depths))
 
 
-def guesses(
+def draw_guesses(
     key: Key[Array, ""],
     shifts: Float[Array, "h 6"],
     reference: ReferencePoints,
@@ -144,17 +148,17 @@ def guesses(
     guess: Float[Array, "6"],
     config: AlignConfig,
 ) -> Float[Array, "h 6"]:
-    """Places where a lost group may be: half of them at unexplained pixels and a quarter near by, turned at
-    random, and a quarter near the guess.
+    """Random places where a lost group may be: half of them at unexplained pixels and a quarter nearby, both
+    turned at random, and a quarter near the last guess.
 
     Args:
-        key: of the random places.
-        shifts: what is tried near by.
-        reference: of the group. Those of about an unexplained pixel's colour are brought to it.
-        center: what the group turns about.
-        unexplained_pixels: pixels that no group explains, as each camera sees them.
+        key: random key.
+        shifts: shifts of the places nearby.
+        reference: reference points of the group. One of a similar colour is brought to an unexplained pixel.
+        center: centroid of the group, metres.
+        unexplained_pixels: pixels that no group explains, in each camera.
         guess: see `recover`.
-        config: without `max_turn` nothing is turned.
+        config: nothing is turned if its `max_turn` is 0.
     """
     count = len(shifts)
     place, pair, axis, angle, small = jax.random.split(key, 5)
@@ -170,6 +174,7 @@ def guesses(
     away = to[:, chosen].T - center - jaxlie.SO3.exp(turns).apply(offsets)
     unexplained = (jnp.arange(count) % 2 == 1) & any_there
     far = jnp.concatenate([jnp.where(unexplained[:, None], away, shifts[:, :3]), turns], axis=1)
-    nearly = _NEAR_GUESS * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
-    near = compose(jnp.concatenate([shifts[:, :3] / 2, nearly], axis=1), jnp.broadcast_to(guess, far.shape))
+    small_turns = _NEAR_TURN * jax.random.normal(small, (count, 3)) * (config.max_turn > 0)
+    nearby = jnp.concatenate([shifts[:, :3] / 2, small_turns], axis=1)
+    near = compose(nearby, jnp.broadcast_to(guess, far.shape))
     return jnp.where((jnp.arange(count) % 4 == 0)[:, None], near, far)

@@ -1,6 +1,6 @@
-"""Reference points: the Gaussians that the first mask named, carried along with their groups.
+"""Reference points: the Gaussians that the first mask labelled, carried along with their groups.
 
-They define what a group has to look like. What joined it later may be a neighbour's.
+They define what a group has to look like. Gaussians that joined it later may belong to a neighbour.
 """
 
 from typing import NamedTuple
@@ -16,15 +16,7 @@ from gsjax.geometry.spherical_harmonics import SH_C0
 from gsjax.methods.track.config import AlignConfig
 from gsjax.methods.track.layers import Shown, seen_from
 from gsjax.methods.track.motion import Pose
-from gsjax.methods.track.points import (
-    Points,
-    Sight,
-    carry,
-    first_members,
-    rotated,
-    sum_of_three,
-    tones,
-)
+from gsjax.methods.track.points import Points, ToneImages, carry, first_members, rotated, sum_of_three, tones
 from gsjax.methods.track.scene import TrackedScene
 
 
@@ -32,17 +24,16 @@ class ReferencePoints(NamedTuple):
     """Up to p reference points of each group, where it is believed to be."""
 
     means: Float[Array, "*k 3 p"]
-    normals: Float[Array, "*k 3 p"]  # outward; 0 where both sides can be seen
+    normals: Float[Array, "*k 3 p"]  # outward; 0 if both sides are visible
     tones: Float[Array, "*k 3 p"]
-    real: Bool[Array, "*k p"]  # what is not fills up a row
+    real: Bool[Array, "*k p"]  # False for padding
 
 
 def reference_points(scene: TrackedScene, pose: Pose, config: AlignConfig) -> ReferencePoints:
-    """The reference points of every group, as many as are aligned."""
-    groups = scene.labels[: scene.num_moving]
-    # What joins has no normal. Neither have shapes known beforehand, but nothing joins those.
+    """The reference points of every group, up to `config.centers`."""
+    # Gaussians that join have no normal. Nor do known shapes, but nothing joins those.
     with_normal = jnp.any(scene.normals != 0, axis=-1)
-    named = jnp.where(with_normal | ~with_normal.any(), groups, 0)
+    named = jnp.where(with_normal | ~with_normal.any(), scene.groups, 0)
     rows, real = first_members(named, scene.num_objects, min(config.centers, scene.num_moving))
     normals = jnp.einsum("kpij,kpj->kpi", quats_to_matrices(pose.quats[rows]), scene.normals[rows])
     colors = tones(scene.gaussians.sh0[rows, 0] * SH_C0 + 0.5, config.shading)
@@ -55,13 +46,13 @@ def radii(reference: ReferencePoints, centers: Float[Array, "k 3"]) -> Float[Arr
     return jnp.sqrt(jnp.sum(squared * reference.real, axis=-1) / jnp.maximum(reference.real.sum(-1), 1))
 
 
-def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap: float) -> Points:
-    """The reference points of every group; each camera looks for those that it saw in the last frame.
+def points_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap: float) -> Points:
+    """The reference points of every group, with weight 1 in the cameras that saw them in the last frame.
 
     Args:
-        reference: of every group.
-        shown: the last scene, as `cameras` saw it.
-        gap: how far depth may be off, metres.
+        reference: reference points of every group.
+        shown: what the last scene shows in `cameras`.
+        gap: tolerance of depth, metres.
     """
     count, _, size = reference.means.shape
     groups = jnp.repeat(jnp.arange(1, count + 1), size)
@@ -72,22 +63,21 @@ def as_last_seen(reference: ReferencePoints, shown: Shown, cameras: Camera, gap:
     return Points(*of_each, jnp.moveaxis(seen, 0, 1) * reference.real[:, None])
 
 
-def as_facing(
-    reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], sight: Sight
+def points_facing(
+    reference: ReferencePoints, twist: Float[Array, "6"], center: Float[Array, "3"], images: ToneImages
 ) -> Points:
-    """The reference points of one group after a twist about its centre; cameras look for what faces them.
-
-    What hides a group where it is believed to be need not hide it elsewhere.
+    """The reference points of one group after a twist (translation, metres, and rotation vector) about its
+    center, with weight 1 in the cameras that they face: whatever hides the group where it is believed to be
+    need not hide it elsewhere.
 
     Args:
-        reference: of the group.
-        twist: translation in metres, rotation vector.
-        center: about which it turns, metres.
-        sight: of the cameras.
+        reference: reference points of the group.
+        twist, center: as for `carry`.
+        images: their cameras.
     """
     moved = carry(Points(reference.means, reference.tones, reference.real), twist, center)
     normals = rotated(jaxlie.SO3.exp(twist[3:]).as_matrix(), reference.normals)
-    rays = camera_centers(sight.cameras.viewmat)[:, :, None] - moved.means
+    rays = camera_centers(images.cameras.viewmat)[:, :, None] - moved.means
     one_sided = jnp.any(normals != 0, axis=0)
     toward = sum_of_three(normals * rays, axis=1)
     faces = reference.real & ((toward > 0) | ~one_sided)
@@ -95,5 +85,5 @@ def as_facing(
     return Points(*of_each, faces.astype(rays.dtype))
 
 
-all_facing = jax.vmap(as_facing, in_axes=(0, 0, 0, None))
-"""`as_facing` of many groups."""
+all_points_facing = jax.vmap(points_facing, in_axes=(0, 0, 0, None))
+"""`points_facing` of many groups, each after its own twist."""

@@ -1,4 +1,5 @@
-"""Photometric refinement of D_k and delta_i against the new images (section II-C)."""
+"""Photometric refinement of D_k and delta_i against the new images (Object-Aware Gaussian Splatting for
+Robotic Manipulation, section II-C)."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from gsjax.scene.render import Rendered, render
 
 
 class RefineBatch(NamedTuple):
-    """What the refinement does not train."""
+    """The fixed input of the refinement."""
 
     scene: TrackedScene
     frame: Frame
@@ -44,33 +45,32 @@ def refine_loss(
     config: RefineConfig,
     extra_losses: ExtraLosses = (),
 ) -> tuple[Float[Array, ""], dict[str, Any]]:
-    """Truncated colour and depth differences over the region of interest, and what delta costs.
+    """Truncated colour and depth differences over the region of interest, and a penalty on delta.
 
-    Pixels of the region count by their rendered alpha, taken as a constant: what no Gaussian covers counts
-    nothing, and uncovering it gains nothing.
+    Pixels of the region are weighted by their rendered alpha, taken as a constant: uncovered pixels do not
+    count, and uncovering one gains nothing.
 
     Args:
-        motion: of groups and Gaussians, which trains.
-        batch: scene, frame, pose and plan.
-        step, key: not used; they are part of a loss's form.
+        motion: motion of groups and Gaussians, the parameters.
+        batch: see `RefineBatch`.
+        step, key: not used; they belong to the signature of a loss.
         config: limits and weights.
-        extra_losses: added to it (`gsjax.losses.extra`); their scene is a `TrackedScene` after the motion.
+        extra_losses: added to the loss (`gsjax.losses.extra`); their scene is the `TrackedScene` after the
+            motion.
     """
     scene, frame = batch.scene, batch.frame
-    groups = scene.labels[: scene.num_moving]
     gaussians, rendered, weights = _moved(motion, batch)
     difference = jnp.minimum(jnp.abs(rendered.colors - frame.images), config.color_limit).mean(-1)
-    # Sums over pixels, in units of a thousand: an object's pull does not depend on what else is in view.
+    # Sums over pixels, in thousands: the gradient of an object does not depend on what else is in view.
     color = 1e-3 * jnp.sum(difference * weights)
     loss = color
     if frame.depths is not None:
         known = weights * (frame.depths > 0)
         gap = jnp.minimum(jnp.abs(rendered.depths - frame.depths), config.depth_limit)
         loss += 1e-3 * config.depth_weight * jnp.sum(gap * known)
-    spread = group_means(
-        jnp.sum((motion.delta / config.delta_scale) ** 2, axis=-1), groups, scene.num_objects
-    )
-    loss += 1e-3 * config.delta_weight * spread.sum()
+    squared = jnp.sum((motion.delta / config.delta_scale) ** 2, axis=-1)
+    penalty = group_means(squared, scene.groups, scene.num_objects).sum()
+    loss += 1e-3 * config.delta_weight * penalty
     info = {
         "color": weighted_mean(difference, weights),
         "overflow": rendered.meta.overflow.any(),
@@ -95,15 +95,16 @@ def refine_residual(
 ) -> tuple[dict[str, Float[Array, "..."]], dict[str, Any]]:
     """The differences of `refine_loss` as residuals of rigid motions, for `gsjax.optim.least_squares`.
 
-    Half their squares sum up to a thousand times that loss (with blocks of one pixel), but for differences
-    below `softness` times their limit, which are rounded off.
+    Half their sum of squares is a thousand times that loss (with blocks of one pixel), except that
+    differences below `softness` times their limit are smoothed.
 
     Args:
-        motions: of each group, K of them, about its centre.
-        batch: with a plan whose derivative is "forward" where the Jacobian is made by columns.
-        step, key: not used; they are part of a residual's form.
+        motions: motion of each of the K groups about its centre.
+        batch: see `RefineBatch`. If the Jacobian is computed by columns, the plan's derivative must be
+            "forward".
+        step, key: not used; they belong to the signature of a residual.
         config: limits and weights.
-        block, softness: of `block_residual`.
+        block, softness: as for `block_residual`.
     """
     twists = jnp.concatenate([motions.translation(), motions.rotation().log()], axis=-1)
     _, rendered, weights = _moved(Motion(twists, jnp.zeros_like(batch.pose.means)), batch)
@@ -120,9 +121,9 @@ def refine_residual(
 
 
 def _moved(motion: Motion, batch: RefineBatch) -> tuple[Gaussians, Rendered, Float[Array, "c height width"]]:
-    """The scene after the motion, drawn, and what each of its pixels counts."""
+    """The scene after the motion, its render, and the weight of each pixel."""
     scene, cameras = batch.scene, batch.frame.cameras
-    pose = move(batch.pose, motion, batch.centers, scene.labels[: scene.num_moving])
+    pose = move(batch.pose, motion, batch.centers, scene.groups)
     visibility = facing(scene, pose, camera_centers(cameras.viewmat))
     gaussians = place(scene, pose)
     rendered = render(gaussians, cameras, batch.plan, roi=batch.roi, visibility=visibility)
@@ -132,17 +133,17 @@ def _moved(motion: Motion, batch: RefineBatch) -> tuple[Gaussians, Rendered, Flo
 def refine(
     motion: Motion, batch: RefineBatch, config: RefineConfig, extra_losses: ExtraLosses = ()
 ) -> tuple[Motion, Float[Array, "b 3"] | None, dict[str, Any]]:
-    """Adam from `motion`, with rates that fall to a tenth over the iterations.
+    """Adam from `motion`, with learning rates that fall to a tenth over the iterations.
 
     Args:
-        motion: of groups and Gaussians, where to start.
-        batch: scene, frame, pose and plan.
+        motion: initial motion of groups and Gaussians.
+        batch: see `RefineBatch`.
         config: rates, limits and weights.
-        extra_losses: beside that of pictures; see `refine_loss`.
+        extra_losses: see `refine_loss`.
 
     Returns:
-        the motion, how far each Gaussian of the batch's background moved (None if that is frozen), info. Its
-        `culled` counts numbers of gradients that were not finite, and were taken as 0.
+        The motion, the displacement of each Gaussian of the batch's background (None if that is frozen), and
+        info, whose `culled` counts elements of gradients that were not finite and were set to 0.
     """
     rates = jnp.array([config.translation_rate] * 3 + [config.rotation_rate] * 3)
     still = batch.scene.num_moving

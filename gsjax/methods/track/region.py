@@ -1,11 +1,11 @@
-"""Only what may change is refined: tiles a moving Gaussian touches, and the background that reaches them."""
+"""The refined region: tiles that moving Gaussians touch, and the background Gaussians that reach them."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gsjax.methods.track.scene import TrackedScene
+from gsjax.methods.track.scene import TrackedScene, emptied
 from gsjax.scene.gaussians import take
 from gsjax.scene.region import TILE
 from gsjax.scene.render import Rendered
@@ -14,7 +14,8 @@ from gsjax.scene.render import Rendered
 def near_background(
     scene: TrackedScene, rendered: Rendered, tiles: Bool[Array, "c rows columns"]
 ) -> Bool[Array, "background"]:
-    """Which background Gaussians reach a chosen tile in some camera: their box holds one, by summed areas."""
+    """Background Gaussians that reach one of the tiles in some camera, by their bounding boxes, which a
+    summed-area table tests."""
     rows, columns = tiles.shape[1:]
     still = scene.num_moving
 
@@ -33,25 +34,23 @@ def near_background(
 
 
 def near_scene(scene: TrackedScene, near: Bool[Array, "background"], num_near: int) -> TrackedScene:
-    """The moving Gaussians and the chosen background: `num_near` rows, those left over invisible."""
+    """The scene with only the near Gaussians of the background, in `num_near` rows, of which surplus ones are
+    invisible."""
     rows = jnp.nonzero(near, size=num_near, fill_value=0)[0] + scene.num_moving
-    empty = jnp.arange(num_near) >= near.sum()
-    background = take(scene.gaussians, rows)
-    faint = jnp.where(empty, -30.0, background.logit_opacities)
-    background = eqx.tree_at(lambda g: g.logit_opacities, background, faint)
-    moving = jax.tree.map(lambda a: a[: scene.num_moving], scene.gaussians)
-    gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moving, background)
-    labels = jnp.concatenate([scene.labels[: scene.num_moving], jnp.zeros(num_near, jnp.int32)])
+    rows = jnp.concatenate([jnp.arange(scene.num_moving), rows])
+    surplus = jnp.arange(len(rows)) >= scene.num_moving + near.sum()
+    labels = jnp.concatenate([scene.groups, jnp.zeros(num_near, jnp.int32)])
+    gaussians = emptied(take(scene.gaussians, rows), surplus)
     return TrackedScene(gaussians, scene.normals, labels, scene.label_ids, scene.num_moving)
 
 
 def shift_background(scene: TrackedScene, shifts: Float[Array, "b 3"]) -> TrackedScene:
-    """The scene with its background's Gaussians moved, each by its own."""
+    """The scene with each Gaussian of its background displaced, metres."""
     means = scene.gaussians.means.at[scene.num_moving :].add(shifts)
     return eqx.tree_at(lambda s: s.gaussians.means, scene, means)
 
 
-def spread(near: Bool[Array, "background"], values: Float[Array, "near 3"]) -> Float[Array, "background 3"]:
-    """Values of the rows of `near_scene`, scattered to the whole background; 0 elsewhere."""
+def scatter(near: Bool[Array, "background"], values: Float[Array, "near 3"]) -> Float[Array, "background 3"]:
+    """Values of the background rows of `near_scene`, scattered to the whole background; 0 elsewhere."""
     rows = jnp.nonzero(near, size=len(values), fill_value=len(near))[0]
     return jnp.zeros((len(near), 3), values.dtype).at[rows].set(values, mode="drop")

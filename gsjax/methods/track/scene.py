@@ -1,11 +1,12 @@
-"""The first frame (section II-A): a dense labelled cloud of Gaussians from RGB-D cameras and one mask."""
+"""The scene at the first frame: a dense labelled cloud of Gaussians from RGB-D cameras and one mask
+(Object-Aware Gaussian Splatting for Robotic Manipulation, section II-A)."""
 
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.cluster.vq import kmeans2
 
 from gsjax.geometry.cameras import camera_centers
@@ -17,17 +18,20 @@ from gsjax.scene.gaussians import Gaussians, concatenate, take
 from gsjax.scene.initialize import estimate_normals, gaussians_from_points, points_from_rgbd, valid_depth
 from gsjax.scene.labels import inherit_labels, lift_labels
 
+EMPTY = -30.0
+"""Opacity logit of a Gaussian that is invisible, such as that of an empty slot."""
+
 
 class TrackedScene(eqx.Module):
     """Gaussians with labels, the moving ones first.
 
     Attributes:
         gaussians: the scene at the first frame.
-        normals: outward normals of the moving ones in their own axes; zero where both sides can be seen.
+        normals: outward normals of the moving ones in their own axes; zero if both sides are visible.
         labels: group of each Gaussian: 0 is the background, 1..K the objects in the order of `label_ids`.
-        label_ids: the mask value that each group came from, background first (static). Parts of one
-            large object are groups of their own with the same value.
-        num_moving: how many Gaussians, from the front, belong to objects (static).
+        label_ids: mask value of each group, background first (static). The parts of a large object are
+            separate groups with the same value.
+        num_moving: number of Gaussians that belong to objects, which come first (static).
     """
 
     gaussians: Gaussians
@@ -38,50 +42,63 @@ class TrackedScene(eqx.Module):
 
     @property
     def num_objects(self) -> int:
-        """How many objects there are; the background is none."""
+        """K, the number of objects; the background is none."""
         return len(self.label_ids) - 1
+
+    @property
+    def groups(self) -> Int[Array, "m"]:
+        """Group of each moving Gaussian, 1..K; K+1 for an empty slot."""
+        return self.labels[: self.num_moving]
+
+
+def emptied(gaussians: Gaussians, rows: Bool[Array, "n"]) -> Gaussians:
+    """The Gaussians with some rows made invisible."""
+    logits = jnp.where(rows, EMPTY, gaussians.logit_opacities)
+    return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 class Cloud(NamedTuple):
-    """Points, on the host."""
+    """A labelled point cloud, on the host."""
 
     points: Float[np.ndarray, "n 3"]
     colors: Float[np.ndarray, "n 3"]
     labels: Int[np.ndarray, "n"]
-    footprints: Float[np.ndarray, "n"]  # width of a pixel at the point, as its camera saw it, metres
-    eyes: Float[np.ndarray, "n 3"]  # where that camera stood
+    footprints: Float[np.ndarray, "n"]  # width of a pixel at the depth of the point, metres
+    eyes: Float[np.ndarray, "n 3"]  # position of the camera that saw the point
 
 
 def labelled_cloud(
     frame: Frame, mask: Int[np.ndarray, "height width"], mask_camera: int, config: StartConfig
 ) -> Cloud:
-    """All cameras' points; labels come from one camera's mask, and from it to near neighbours unseen there.
+    """The points of all cameras. Their labels come from the mask of one camera, and spread from the points
+    that it saw to near neighbours.
 
     Raises:
-        ValueError: the frame has no depth or no valid depth, there is no mask or one of another size, or no
-            such camera.
+        ValueError: the frame has no depth or no valid depth, the mask is missing or has another size, or the
+            camera does not exist.
     """
     if frame.depths is None:
         raise ValueError(
-            "the first frame needs depth to become Gaussians; without depth cameras give shapes (models)"
+            "depths: expected those of the first frame, found None; without depth cameras, give models of "
+            "the objects as shapes"
         )
     images, depths = np.asarray(frame.images), np.asarray(frame.depths)
     viewmats, Ks = np.asarray(frame.cameras.viewmat, np.float64), np.asarray(frame.cameras.K, np.float64)
     if not 0 <= mask_camera < len(depths):
-        raise ValueError(f"mask_camera is {mask_camera}; the frame has {len(depths)} cameras, counted from 0")
+        raise ValueError(f"mask_camera: expected 0 to {len(depths) - 1}, found {mask_camera}")
     if mask is None:
         raise ValueError(
-            "mask: expected labels [H, W] of one camera's image, found None, as of data without masks; "
-            "a segmenter of gsjax.perception makes one"
+            "mask: expected labels [H, W] of one camera's image, found None, because the data has no masks; "
+            "make one with a segmenter of gsjax.perception"
         )
     if mask.shape != depths.shape[1:]:
-        raise ValueError(f"mask has shape {mask.shape}; the images have {depths.shape[1:]} (height, width)")
+        raise ValueError(f"mask: expected shape {depths.shape[1:]} as the images, found {mask.shape}")
     clouds = [points_from_rgbd(*view) for view in zip(images, depths, viewmats, Ks, strict=True)]
     footprints = [depth[valid_depth(depth)] / K[0, 0] for depth, K in zip(depths, Ks, strict=True)]
     points = np.concatenate([points for points, _ in clouds])
     colors = np.concatenate([colors for _, colors in clouds])
     if len(points) == 0:
-        raise ValueError("the first frame has no valid depth in any camera: depth images are all zero")
+        raise ValueError("depths: expected positive values in the first frame, found none in any camera")
     view = (depths[mask_camera], viewmats[mask_camera], Ks[mask_camera])
     labels = lift_labels(points, mask, *view, max_depth_gap=config.depth_gap)
     counts = [len(footprint) for footprint in footprints]
@@ -94,7 +111,7 @@ def labelled_cloud(
 
 
 def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
-    """Rows of the chosen points that are left when each voxel, `pixels` pixels wide, keeps one."""
+    """Indices of the chosen points, thinned to one in each voxel about `pixels` pixels wide."""
     rows = np.flatnonzero(chosen)
     octave = np.floor(np.log2(pixels * cloud.footprints[rows]))
     kept = [
@@ -106,15 +123,15 @@ def _thin(cloud: Cloud, chosen: np.ndarray, pixels: float) -> np.ndarray:
 
 
 def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
-    """(mask value, its points) of every body that moves as one; the background comes last.
+    """(mask value, mask of its points) of every rigid body; the background comes last.
 
-    What is too large to be rigid is cut by k-means into parts, which keep the mask value they came from.
+    Objects too large to be rigid are divided by k-means into parts, which keep the mask value.
     """
     bodies = []
     for value in sorted(set(np.unique(cloud.labels).tolist()) - {0}):
         rows = np.flatnonzero(cloud.labels == value)
         points = cloud.points[rows]
-        # Quantiles: a few pixels that fly off an edge, as depth cameras have them, make nothing large.
+        # Quantiles, so that a few flying pixels, as depth cameras have at edges, do not count.
         extent = float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
         parts = np.zeros(len(rows), int)
         if extent > config.max_extent:
@@ -129,7 +146,7 @@ def _bodies(cloud: Cloud, config: StartConfig) -> list[tuple[int, np.ndarray]]:
 
 
 def scene_from_cloud(cloud: Cloud, config: StartConfig) -> TrackedScene:
-    """Thin the cloud, objects finely, background coarsely; each point becomes a disc on its surface."""
+    """Thin the cloud, objects less than the background, and make each point a disc on its surface."""
     parts, labels, towards, label_ids = [], [], [], [0]
     for value, chosen in _bodies(cloud, config):
         kept = _thin(cloud, chosen, config.object_pixels if value else config.background_pixels)
@@ -148,19 +165,19 @@ def assemble(
     label_ids: tuple[int, ...],
     towards: list[np.ndarray] | None = None,
 ) -> TrackedScene:
-    """A scene from Gaussians and their groups, sorted so that what can move comes first.
+    """A scene from Gaussians and their groups, sorted so that the moving ones come first.
 
     Args:
         parts, labels: Gaussians, and the group (0 to K) of each.
-        label_ids: the mask value of each group.
-        towards: for discs, a direction on the side they were seen from; None: seen from both sides.
+        label_ids: mask value of each group.
+        towards: a direction from each disc to the side it was seen from; None if both sides are visible.
 
     Raises:
-        ValueError: all of it is background.
+        ValueError: there is no object.
     """
     gaussians, group = concatenate(parts), np.concatenate(labels)
     if len(label_ids) == 1:
-        raise ValueError("no object to track: the mask labels nothing, or nothing that has depth")
+        raise ValueError("mask: expected an object, found none, or none that has depth")
     order = np.argsort(group == 0, kind="stable")
     num_moving = int((group != 0).sum())
     normals = np.zeros((num_moving, 3), np.float32)

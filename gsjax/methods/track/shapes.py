@@ -1,9 +1,9 @@
-"""Starting without depth: from shapes that are known as Gaussians, posed and coloured by the first images.
+"""Start without depth: from shapes known as Gaussians, with poses and colours fitted to the first images.
 
-A shape with a pose (the ground) is placed as it is. One without is laid on its plane where the images look
-like it: a search over position and heading, scored by the colours its centres fall on, then refined against
-rendered images. Colours of everything are then read off the images, and at last all of it is optimised
-photometrically, as a scene from depth is: shapes that are too fat for their pictures become slimmer.
+A shape with a pose (the ground) is placed as it is. One without is placed on its plane where the images look
+like it: position and heading are searched for, scored by the colours of the pixels that its centres project
+to, and then refined against rendered images. Finally all colours are sampled from the images, and the scene
+is optimised photometrically, like a scene from depth: shapes too wide for their images become narrower.
 """
 
 import warnings
@@ -17,17 +17,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from gsjax.geometry.cameras import project
 from gsjax.geometry.neighbors import nearest
 from gsjax.geometry.spherical_harmonics import rgb_to_sh0
-from gsjax.methods.track.align import bilinear, spot
+from gsjax.methods.track.align import bilinear, pixel_position
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.first_fit import fit_scene
 from gsjax.methods.track.layers import render_labels
-from gsjax.methods.track.motion import Motion, first_pose, move
+from gsjax.methods.track.motion import Motion, first_pose, move, place
 from gsjax.methods.track.refine import RefineBatch, refine
 from gsjax.methods.track.scene import TrackedScene, assemble
 from gsjax.optim.compiler import host_options
@@ -37,25 +37,25 @@ from gsjax.scene.gaussians import Gaussians, gaussians_from_activated
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
 
-_GRID_STEP, _HEADINGS, _SAMPLES = 0.03, 36, 96  # metres, over the full turn, centres a candidate is scored on
-_COLOR_LIMIT = 0.35  # a colour difference beyond this is of something else
-_MAX_SPREAD = 0.2  # cameras that see the same thing agree better on its brightness
+_GRID_STEP, _HEADINGS, _SAMPLES = 0.03, 36, 96  # metres; per full turn; centres on which a pose is scored
+_COLOR_LIMIT = 0.35  # a larger colour difference is due to something else
+_MAX_SPREAD = 0.2  # cameras whose brightness differs by more do not see the same surface
 _MARGIN = 4  # pixels around an object that may show it rather than the background
-_REFINEMENTS, _ITERATIONS = 3, 60
+_REFINEMENTS, _ITERATIONS = 3, 60  # rounds of refinement and recolouring; iterations of each
 
 
 @runtime_checkable
 class Shape(Protocol):
-    """What is known of an object or of the background; `gsjax.data.PointModel` is one."""
+    """A known model of an object or of the background; `gsjax.data.PointModel` is one."""
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name."""
         ...
 
     @property
     def means(self) -> np.ndarray:
-        """Centres in its own frame, metres, [N,3]."""
+        """Centres in the frame of the shape, metres, [N,3]."""
         ...
 
     @property
@@ -85,48 +85,46 @@ class Shape(Protocol):
 
     @property
     def pose(self) -> np.ndarray | None:
-        """Shape to world [4,4] in the first frame; None where it must be fitted."""
+        """Shape to world [4,4] in the first frame; None if it is to be fitted."""
         ...
 
     @property
     def plane(self) -> np.ndarray | None:
-        """(n, d) with n.x + d = 0 of the plane in the world that it rests on, or None."""
+        """(n, d) of the plane n.x + d = 0 in the world on which the shape rests, or None."""
         ...
 
 
 def scene_from_shapes(
     shapes: Sequence[Shape], frame: Frame, config: TrackConfig | None = None
 ) -> TrackedScene:
-    """A labelled scene of known shapes, posed and coloured to fit the first frame.
+    """A labelled scene of known shapes, with poses and colours fitted to the first frame.
 
     Args:
         shapes: objects (label > 0) and background (label 0).
-        frame: what the cameras see at first; depth is not used.
+        frame: the first frame; depth is not used.
         config: see `TrackConfig`.
 
     Raises:
-        ValueError: there is no object, or an object has neither a pose nor a plane to lie on.
+        ValueError: there is no object, or an object has neither a pose nor a plane to rest on.
     """
     config = TrackConfig() if config is None else config
     background = [s for s in shapes if not s.label]
     extent = np.concatenate([_placed(s, s.pose).means for s in background]) if background else None
     parts, labels, label_ids = [], [], [0]
     for shape in shapes:
-        pose = shape.pose
-        if pose is None:
-            pose = find_pose(shape, frame, extent)
+        pose = find_pose(shape, frame, extent) if shape.pose is None else shape.pose
         if shape.label:
             label_ids.append(int(shape.label))
         parts.append(_placed(shape, pose))
         labels.append(np.full(len(shape.means), len(label_ids) - 1 if shape.label else 0))
-    scene = assemble(parts, labels, tuple(label_ids))
-    scene = _recolored(scene, frame)
+    scene = _recolored(assemble(parts, labels, tuple(label_ids)), frame)
     for _ in range(_REFINEMENTS):
         scene = _recolored(_refined(scene, frame, config), frame)
     return fit_scene(scene, frame, config.start.iterations, config.headroom)[0]
 
 
 def _placed(shape: Shape, pose: np.ndarray) -> Gaussians:
+    """The Gaussians of a shape at a pose [4, 4]."""
     rotation, translation = np.asarray(pose)[:3, :3], np.asarray(pose)[:3, 3]
     quats = Rotation.from_matrix(rotation) * Rotation.from_quat(shape.quats, scalar_first=True)
     means = shape.means @ rotation.T + translation
@@ -136,26 +134,28 @@ def _placed(shape: Shape, pose: np.ndarray) -> Gaussians:
 
 
 def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np.ndarray, "4 4"]:
-    """The pose on its plane in which a shape's centres fall on pixels of their colours, in all cameras.
+    """The pose on its plane at which the centres of a shape project to pixels of their colours.
 
     Args:
-        shape: with a plane (n, d): n.x + d = 0, that it rests on, either side up.
-        frame: the first images.
-        extent: points of the background, whose box bounds the search.
+        shape: a shape with a plane, on which it rests either side up.
+        frame: the first frame.
+        extent: points of the background [N, 3], whose bounding box bounds the search.
 
     Raises:
-        ValueError: the shape has no plane, or there is no background to search on.
+        ValueError: the shape has no plane, or there is no background.
     """
     if shape.plane is None or extent is None:
         raise ValueError(
-            f"the shape {shape.name!r} has no pose; finding one takes a plane to rest on and a background"
+            f"shape {shape.name!r}: expected a pose, or a plane to rest on and a background, found neither"
         )
     normal = np.asarray(shape.plane[:3], np.float64)
     normal, offset = normal / np.linalg.norm(normal), float(shape.plane[3]) / np.linalg.norm(normal)
-    # Places are counted along two directions of the plane, whichever way it lies in the world.
+    # Positions are coordinates along two directions of the plane, however it is oriented in the world.
     across = np.linalg.svd(normal[None])[2][1:]
     low, high = (extent @ across.T).min(0), (extent @ across.T).max(0)
     best = (np.inf, np.eye(4))
+    rows = np.random.default_rng(0).permutation(len(shape.means))[:_SAMPLES]
+    sampled = [jnp.asarray(values[rows], jnp.float32) for values in (shape.means, shape.colors)]
     for up in (1.0, -1.0):
         base, _ = Rotation.align_vectors([normal], [[0.0, 0.0, up]])
         standing = shape.means @ base.as_matrix().T
@@ -165,10 +165,10 @@ def find_pose(shape: Shape, frame: Frame, extent: np.ndarray | None) -> Float[np
         places = np.stack([x.ravel(), y.ravel()], axis=-1)
         headings = np.linspace(0, 2 * np.pi, _HEADINGS, endpoint=False)
         step, turn = _GRID_STEP, headings[1]
-        for _ in range(4):  # ever finer around the best
+        for _ in range(4):  # coarse to fine, around the best
             candidates = np.array([[px, py, h] for h in headings for px, py in places])
             poses = _poses(candidates, base, normal, across, lift, center)
-            cost = _scores(shape, poses, frame)
+            cost = np.asarray(_cost(jnp.asarray(poses, jnp.float32), *sampled, frame))
             winner = int(cost.argmin())
             if cost[winner] < best[0]:
                 best = (float(cost[winner]), poses[winner])
@@ -188,7 +188,7 @@ def _poses(
     lift: float,
     center: np.ndarray,
 ) -> np.ndarray:
-    """Model-to-world transforms that turn the standing shape about its centre and move it over the plane."""
+    """Shape-to-world transforms that turn the standing shape about its centre and move it over the plane."""
     turned = Rotation.from_rotvec(candidates[:, 2:] * normal)
     poses = np.tile(np.eye(4), (len(candidates), 1, 1))
     poses[:, :3, :3] = (turned * base).as_matrix()
@@ -199,14 +199,14 @@ def _poses(
 
 @jax.jit
 def _cost(poses, means, colors, frame):
+    """Mean truncated colour difference of the points at each pose."""
+
     def one(pose):
         moved = means @ pose[:3, :3].T + pose[:3, 3]
 
         def view(viewmat, K, image):
-            pixels, z = project(moved, viewmat, K)
-            size = image.shape[1::-1]
-            inside = ((pixels > 0) & (pixels < jnp.array(size))).all(-1) & (z > 0)
-            gap = jnp.abs(bilinear(image, spot(*pixels.T, *size)).values.T - colors).mean(-1)
+            found, inside = _at_points(image, moved, viewmat, K)
+            gap = jnp.abs(found - colors).mean(-1)
             return jnp.where(inside, jnp.minimum(gap, _COLOR_LIMIT), _COLOR_LIMIT).mean()
 
         return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images).mean()
@@ -214,14 +214,16 @@ def _cost(poses, means, colors, frame):
     return jax.lax.map(one, poses, batch_size=2048)
 
 
-def _scores(shape: Shape, poses: np.ndarray, frame: Frame) -> np.ndarray:
-    rows = np.random.default_rng(0).permutation(len(shape.means))[:_SAMPLES]
-    means, colors = jnp.asarray(shape.means[rows], jnp.float32), jnp.asarray(shape.colors[rows], jnp.float32)
-    return np.asarray(_cost(jnp.asarray(poses, jnp.float32), means, colors, frame))
+def _at_points(image: Float[Array, "h w d"], points: Float[Array, "n 3"], viewmat, K):
+    """Values of an image at the projections of points [N, D], and whether these lie inside the image [N]."""
+    pixels, z = project(points, viewmat, K)
+    size = image.shape[1::-1]
+    inside = ((pixels > 0) & (pixels < jnp.array(size))).all(-1) & (z > 0)
+    return bilinear(image, pixel_position(*pixels.T, *size)).values.T, inside
 
 
 def _observed_colors(scene: TrackedScene, frame: Frame):
-    """Each Gaussian's colour in each camera, whether it has one, and whether an object is near."""
+    """Colour of each Gaussian in each camera, whether it is inside the image, and whether near an object."""
     rendered = render_labels(scene, first_pose(scene), frame, plan_render(scene.gaussians, frame.cameras))
     assert rendered.features is not None
     objects = 1 - rendered.features[..., 0] / jnp.maximum(rendered.alphas, 1e-3)
@@ -229,20 +231,18 @@ def _observed_colors(scene: TrackedScene, frame: Frame):
     near = jax.lax.reduce_window(objects, -jnp.inf, jax.lax.max, margin, (1, 1, 1), "SAME")
 
     def view(viewmat, K, image, near):
-        pixels, z = project(scene.gaussians.means, viewmat, K)
-        size = image.shape[1::-1]
-        inside = ((pixels > 0) & (pixels < jnp.array(size))).all(-1) & (z > 0)
-        at = spot(*pixels.T, *size)
-        return bilinear(image, at).values.T, inside, bilinear(near[..., None], at).values[0] > 0.1
+        place = (scene.gaussians.means, viewmat, K)
+        return *_at_points(image, *place), _at_points(near[..., None], *place)[0][:, 0] > 0.1
 
     return jax.vmap(view)(frame.cameras.viewmat, frame.cameras.K, frame.images, near)
 
 
 def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
-    """Each Gaussian takes the median over cameras of the colours it is seen in.
+    """The scene in which each Gaussian has the median of its colours in the cameras.
 
-    The background uses no pixel that an object may cover, and where none is left to its nearest
-    neighbour; an object's Gaussian to none that looks unlike its group, for something stands in front.
+    The background ignores pixels that an object may cover, and objects ignore colours unlike the rest of
+    their group, because something hides them there. A Gaussian without colours left takes that of its
+    nearest neighbour in its group.
     """
     colors, inside, covered = (np.asarray(a) for a in _observed_colors(scene, frame))
     group = np.asarray(scene.labels)
@@ -251,10 +251,10 @@ def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
         member = group == k
         typical = np.median(colors[usable & member], axis=0)
         usable &= ~(member & (np.abs(colors - typical).mean(-1) > _COLOR_LIMIT))
-    # Cameras that disagree on a piece of background do not all see it.
+    # If cameras disagree on a piece of background, not all of them see it.
     shades = np.where(usable, colors.mean(-1), np.nan)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of rows that no camera sees
+        warnings.simplefilter("ignore", RuntimeWarning)  # rows that no camera sees
         spread = np.nanmax(shades, axis=0) - np.nanmin(shades, axis=0)
     alone = (usable.sum(0) < min(2, len(usable))) | (spread > _MAX_SPREAD)
     usable &= ~(alone & (group == 0))
@@ -270,11 +270,11 @@ def _recolored(scene: TrackedScene, frame: Frame) -> TrackedScene:
 
 
 def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedScene:
-    """All objects moved rigidly to where the rendered scene fits the images best."""
+    """The scene with all objects moved rigidly to where its render fits the images best."""
     pose = first_pose(scene)
     plan = plan_render(scene.gaussians, frame.cameras, headroom=config.headroom)
     roi = tiles_to_pixels(touched_tiles([pose.means], frame), frame)
-    groups = scene.labels[: scene.num_moving]
+    groups = scene.groups
     centers = jnp.stack([pose.means[groups == k + 1].mean(0) for k in range(scene.num_objects)])
     still = Motion(jnp.zeros((len(centers), 6)), jnp.zeros_like(pose.means))
     rates = replace(config.refine, iterations=_ITERATIONS, delta_rate=0.0, background_rate=0.0)
@@ -285,20 +285,11 @@ def _refined(scene: TrackedScene, frame: Frame, config: TrackConfig) -> TrackedS
         return motion, SimpleNamespace(**info)
 
     motion, _ = with_room(refined, plan, config.headroom)
-    moved = move(pose, motion, centers, groups)
-    count = scene.num_moving
-    gaussians = eqx.tree_at(
-        lambda g: (g.means, g.quats),
-        scene.gaussians,
-        (
-            scene.gaussians.means.at[:count].set(moved.means),
-            scene.gaussians.quats.at[:count].set(moved.quats),
-        ),
-    )
-    return eqx.tree_at(lambda s: s.gaussians, scene, gaussians)
+    moved = place(scene, move(pose, motion, centers, groups))
+    return eqx.tree_at(lambda s: s.gaussians, scene, moved)
 
 
 @cache
 def _refine_rigidly() -> Callable:
-    """The jitted refinement; made late, because its options depend on the machine."""
+    """The jitted refinement, made on first use, because its compiler options depend on the machine."""
     return jax.jit(refine, static_argnums=2, compiler_options=host_options())

@@ -1,4 +1,4 @@
-"""What the tracker's step advances, what it carries from frame to frame, and what it is given."""
+"""Parameters, state and batch of the tracker's step."""
 
 from typing import NamedTuple
 
@@ -19,18 +19,18 @@ from gsjax.scene.gaussians import Gaussians
 
 
 class Tracked(NamedTuple):
-    """A scene and where its objects are: the parameters of the step, and the result of tracking.
+    """A scene and the pose of its objects: the parameters of the step, and the result of tracking.
 
     Attributes:
-        scene: the scene, with slots for what joins objects and what has joined so far.
-        pose: where the moving Gaussians are.
+        scene: the scene, with the Gaussians that have joined and the slots that are left.
+        pose: pose of the moving Gaussians.
     """
 
     scene: TrackedScene
     pose: Pose
 
     def gaussians(self) -> Gaussians:
-        """The whole scene as it stands; empty slots are transparent."""
+        """The whole scene at this pose; empty slots are transparent."""
         return place(self.scene, self.pose)
 
     @property
@@ -40,20 +40,20 @@ class Tracked(NamedTuple):
 
 
 class TrackState(NamedTuple):
-    """What the tracker carries from frame to frame.
+    """The state that the tracker carries from frame to frame.
 
     Attributes:
-        motion: of the last frame: where delta starts, and the constant-velocity hypothesis.
-        pixels: those that showed each group in the last frame.
-        keyframe: and in an earlier one.
+        motion: motion of the last frame: the start of delta, and the constant-velocity hypothesis.
+        pixels: pixels that showed each group in the last frame.
+        keyframe: pixels that showed it in an earlier frame.
         unexplained_pixels: pixels of the last frame that no group explains.
-        relocation_guesses: where each group that may be elsewhere is then, from where it is believed to be:
+        relocation_guesses: for groups that may be elsewhere, the twist from where they are believed to be:
             translation, metres, and rotation vector, radians.
-        watch: how each group has been followed.
-        count: frames so far.
-        shown: what the last frame showed; None where the whole scene is drawn again.
-        backdrop: the background that this was drawn over; None like `shown`.
-        images: of the last frame, where templates are taken from them; else None.
+        watch: record of how each group has been followed.
+        count: number of frames so far.
+        shown: what the scene showed in the last frame; None if the whole scene is redrawn.
+        backdrop: the background in `shown`; None likewise.
+        images: images of the last frame if templates are taken from them; else None.
     """
 
     motion: Motion
@@ -69,12 +69,12 @@ class TrackState(NamedTuple):
 
 
 class TrackBatch(NamedTuple):
-    """What a step is given.
+    """The input of a step.
 
     Attributes:
-        frame: what all cameras saw.
-        plan: capacities to draw with.
-        everywhere: how many groups to look for everywhere; None: as many as the config says.
+        frame: the frame of all cameras.
+        plan: capacities for rendering.
+        everywhere: number of groups to search for everywhere; None: as configured.
     """
 
     frame: Frame
@@ -83,22 +83,18 @@ class TrackBatch(NamedTuple):
 
 
 def blank_state(params: Tracked, config: TrackConfig, shape: FrameShape) -> TrackState:
-    """The state of a tracker that has seen nothing yet: no pixel shows any group, and nothing was drawn.
+    """The state of a tracker that has seen no frame yet: no pixel shows any group, and nothing was drawn.
 
-    An update from here moves no group of which only pixels would tell, and remembers what it saw.
-
-    Args:
-        params: the scene and where its objects are.
-        config: the tracker's.
-        shape: of the frames to come.
+    An update from here moves no group that only pixels of the last frame would constrain, and stores what it
+    saw. `params` is the scene and the pose of its objects, `shape` that of the frames to come.
     """
     scene, pose = params
     dtype, groups = pose.means.dtype, scene.num_objects
     cameras = len(config.cameras) or shape.cameras
     width, height = shape.width // config.shrink, shape.height // config.shrink
     nowhere = jnp.zeros((groups, 6), dtype)
-    places, seen = (cameras, 3, config.align.pixels), (cameras, config.align.pixels)
-    unexplained = Points(*(jnp.zeros(form, dtype) for form in (places, places, seen)))
+    vectors, weights = (cameras, 3, config.align.pixels), (cameras, config.align.pixels)
+    unexplained = Points(*(jnp.zeros(size, dtype) for size in (vectors, vectors, weights)))
     pixels = Points(*(jnp.zeros((groups, *of_one.shape), dtype) for of_one in unexplained))
     shown = backdrop = images = None
     if config.redraw == "moving":

@@ -15,28 +15,28 @@ from gsjax.methods.track.motion import Motion, move, select_motion
 from gsjax.methods.track.plan import Needed
 from gsjax.methods.track.points import faded, join, pixel_counts
 from gsjax.methods.track.recover import Relocation, SearchContext, depths_of_others, recover
-from gsjax.methods.track.reference import as_last_seen
+from gsjax.methods.track.reference import points_last_seen
 from gsjax.methods.track.refine import RefineBatch, refine
-from gsjax.methods.track.region import near_background, near_scene, shift_background, spread
-from gsjax.methods.track.search import judge, search
-from gsjax.methods.track.stages.moment import Hunt, Moment, Past, Refined, Starts
+from gsjax.methods.track.region import near_background, near_scene, scatter, shift_background
+from gsjax.methods.track.search import disagreements, search
+from gsjax.methods.track.stages.context import Alignment, Past, Refined, Starts, UpdateContext
 from gsjax.methods.track.stages.shown import show
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import Rendered
 
-# Pixels that must show a group for it to be moved: fewer cannot decide six numbers. This many are enough, and
-# this share of what there once were, for what is small.
+# Fewer pixels than this cannot decide six numbers, so the group is not moved. For small groups, this share of
+# the pixels that they once had is enough.
 _ENOUGH_PIXELS, _MIN_SHARE = 200, 0.2
 
 
-def look_back(now: Moment, config: TrackConfig) -> Past:
+def look_back(now: UpdateContext, config: TrackConfig) -> Past:
     """First stage: what the last scene shows of each group."""
     scene, state, frame, plan = now.scene, now.state, now.frame, now.plan
     num_objects = scene.num_objects
-    backdrop, background, drawn = state.backdrop, None, jnp.int32(0)
+    backdrop, background, needed = state.backdrop, None, jnp.int32(0)
     if backdrop is not None:
         views = reduced(frame.cameras, config.coarseness)
-        backdrop, drawn = keep_backdrop(backdrop, scene, views, plan.full)
+        backdrop, needed = keep_backdrop(backdrop, scene, views, plan.full)
         background = jnp.where(backdrop.covers, backdrop.depths, 0.0)
     template = rendered = None
     if config.redraw == "moving":
@@ -55,151 +55,132 @@ def look_back(now: Moment, config: TrackConfig) -> Past:
     enough = _ENOUGH_PIXELS / config.coarseness**2
     counts = pixel_counts(shown.labels, num_objects)
     visible = counts > jnp.minimum(_MIN_SHARE * state.watch.largest, enough)
-    return Past(shown, cameras, template, rendered, backdrop, background, drawn, counts, visible)
+    return Past(shown, cameras, template, rendered, backdrop, background, needed, counts, visible)
 
 
-def starting_points(now: Moment, past: Past, config: TrackConfig, reduction: int) -> Starts:
-    """Second stage: standing still, going on as before, and where template matching finds it.
-
-    Args:
-        now: see `Moment`.
-        past: what the last scene shows.
-        config: the tracker's.
-        reduction: factor by which images shrink for template matching.
-    """
-    jump, found, score = _match(past.template, now, config, reduction)
-    before = now.state.motion.twists
-    still = jnp.zeros_like(before)
-    jumped = still.at[:, :3].set(jnp.where(found[:, None], jump, 0.0))
-    starts, delta = [still], jnp.zeros_like(now.state.motion.delta)
+def starting_points(now: UpdateContext, past: Past, config: TrackConfig, reduction: int) -> Starts:
+    """Second stage: hypotheses of the motion up to now: none, the same as in the last frame, and that of
+    template matching, for which `reduction` is the factor by which images shrink."""
+    before, num_objects = now.state.motion, now.scene.num_objects
+    still, delta = jnp.zeros_like(before.twists), jnp.zeros_like(before.delta)
+    starts = [still]
+    found, score = jnp.zeros(num_objects, bool), jnp.zeros((len(now.frame.images), num_objects))
     if config.matching:
-        starts += [jumped]
+        assert past.template is not None
+        match = match_templates(past.template, now.frame, config.match, reduction)
+        shifts, found = lift(match, now.frame, config.match)
+        shifts, score = jnp.where(found[:, None], shifts, 0.0), match.score
+        starts += [still.at[:, :3].set(shifts)]
     if config.warm_start:
-        starts += [before]
-        delta = now.state.motion.delta
-    if config.matching and config.warm_start:
-        starts += [before.at[:, :3].set(jumped[:, :3])]
+        starts += [before.twists]
+        delta = before.delta
+        if config.matching:
+            starts += [before.twists.at[:, :3].set(shifts)]
     return Starts(jnp.stack(starts), delta, found, score)
 
 
 def align_and_search(
-    now: Moment,
+    now: UpdateContext,
     past: Past,
     starts: Starts,
     everywhere: Int[Array, ""],
     key: Key[Array, ""],
     config: TrackConfig,
-) -> Hunt:
-    """Third stage: each group is aligned with the images; those that agree worst are looked for everywhere
-    around, and what may be lost is looked for elsewhere.
+) -> Alignment:
+    """Third stage: each group is aligned with the images. Those that agree worst are searched for everywhere
+    around, and those that may be lost are searched for elsewhere.
 
     Args:
-        now: see `Moment`.
-        past: what the last scene shows.
-        starts: where each group may have gone.
-        everywhere: how many groups are looked for everywhere.
-        key: of the random places where what may be lost is looked for.
-        config: the tracker's.
+        now, past, starts: from the earlier stages.
+        everywhere: number of groups that are searched for everywhere.
+        key: random key of the relocation.
     """
     state, gap = now.state, config.start.depth_gap
-    remembered = faded(state.keyframe, config.align.keyframe_turn)
-    named = as_last_seen(now.reference, past.shown, past.cameras, gap)
-    weighted = named._replace(seen=config.align.center_weight * named.seen)
-    points = join(weighted, state.pixels, remembered)
+    keyframe = faded(state.keyframe, config.align.keyframe_turn)
+    reference = points_last_seen(now.reference, past.shown, past.cameras, gap)
+    weighted = reference._replace(seen=config.align.center_weight * reference.seen)
+    points = join(weighted, state.pixels, keyframe)
     doubtful = state.watch.doubtful
     in_turn = in_search_round(state.count, now.scene.num_objects) | state.watch.glimpsed
-    astray = state.watch.lost | (doubtful & in_turn)
-    before_now, near = _look_again(now, past, astray.any(), config)
-    others = depths_of_others(before_now, doubtful)
-    around = SearchContext(now.sight, past.background, others, state.unexplained_pixels)
+    suspects = state.watch.lost | (doubtful & in_turn)
+    shown, needed = _show_again(now, past, suspects.any(), config)
+    other_depths = depths_of_others(shown, doubtful)
+    context = SearchContext(now.images, past.background, other_depths, state.unexplained_pixels)
 
-    def recovered(group) -> Relocation:
+    def relocate(group) -> Relocation:
         own = jax.tree.map(lambda a: a[group], (now.reference, now.centers, state.relocation_guesses))
-        return recover(jax.random.fold_in(key, group), *own, around, config.align, gap)
+        return recover(jax.random.fold_in(key, group), *own, context, config.align, gap)
 
     how = (config.align, state.watch, past.visible, everywhere)
     # Without depth, an occluder cannot be distinguished from anything else that is not the group.
-    beyond = () if now.sight.depths is None else (astray, recovered)
-    sought = search(starts.twists, points, now.centers, now.sight, *how, *beyond)
-    return Hunt(sought, points, named, astray, others, near)
+    elsewhere = () if now.images.depths is None else (suspects, relocate)
+    result = search(starts.twists, points, now.centers, now.images, *how, *elsewhere)
+    return Alignment(result, points, reference, suspects, other_depths, needed)
 
 
 def in_search_round(count: Int[Array, ""], num_objects: int) -> Bool[Array, "k"]:
-    """Which groups are looked for elsewhere in this frame, if in doubt: each in two of four, which finding
-    takes, and followed in two. Odd and even ones take turns, so that no update looks for all."""
+    """Groups that are searched for elsewhere in this frame if in doubt: each in two frames of four, because
+    relocation takes two, and followed in the other two. Odd and even ones alternate, so that no update
+    searches for all."""
     return (count + 2 * jnp.arange(num_objects)) % 4 < 2
 
 
 def refine_motion(
-    now: Moment, past: Past, starts: Starts, hunt: Hunt, config: TrackConfig, extra_losses: ExtraLosses
+    now: UpdateContext,
+    past: Past,
+    starts: Starts,
+    alignment: Alignment,
+    config: TrackConfig,
+    extra_losses: ExtraLosses,
 ) -> Refined:
-    """Fourth stage, where `config.refine.iterations` is above 0: D_k and delta_i against rendered images,
-    kept for the groups that agree better with it. What too few pixels show stands still.
-
-    Args:
-        now: see `Moment`.
-        past: what the last scene shows.
-        starts: with the displacements that Gaussians go on with.
-        hunt: where groups were aligned.
-        config: the tracker's.
-        extra_losses: custom losses; see `track_step`.
-    """
-    found, scene, groups = hunt.sought.found, now.scene, now.groups
-    residual = found.residuals
-    kept = begun = Motion(found.twists, starts.delta)
-    needed, info, shifted = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
+    """Fourth stage, if `config.refine.iterations` is above 0: D_k and delta_i are refined against rendered
+    images, and kept for the groups that agree better then. Groups with too few visible pixels stand still.
+    Arguments as for `track_step`, and from the earlier stages."""
+    estimate, scene = alignment.search.estimate, now.scene
+    residuals = estimate.residuals
+    kept = start = Motion(estimate.twists, starts.delta)
+    needed, info, shifts = Needed(jnp.int32(0), jnp.int32(0), jnp.int32(0)), {}, None
     if config.refine.iterations:
         assert past.rendered is not None
-        refined, shifted, needed, info = _refine(now, begun, past.rendered, config, extra_losses)
-        if shifted is not None:
-            scene = shift_background(scene, shifted)
-        # Points know nothing of outlines, which rendered images do, so these are overruled only where
-        # they went clearly astray; without depth the points hardly know better at all.
+        refined, shifts, needed, info = _refine(now, start, past.rendered, config, extra_losses)
+        if shifts is not None:
+            scene = shift_background(scene, shifts)
+        # Points do not capture outlines, which rendered images do, so they veto the refinement only if it
+        # went clearly wrong; without depth they are hardly more reliable at all.
         lead = 0.1 if now.frame.depths is None else 0.01
-        of_refined = judge(refined.twists, hunt.points, now.centers, now.sight, config.align)
-        better = of_refined - lead <= residual
-        if extra_losses:  # of which points know nothing either
+        of_refined = disagreements(refined.twists, alignment.points, now.centers, now.images, config.align)
+        better = of_refined - lead <= residuals
+        if extra_losses:  # which points do not capture either
             better = jnp.ones_like(better)
-        kept = select_motion(better, refined, begun, groups)
-        residual = jnp.where(better, of_refined, residual)
-    kept = select_motion(past.visible, kept, jax.tree.map(jnp.zeros_like, begun), groups)
-    return Refined(kept, residual, scene, shifted, needed, info)
+        kept = select_motion(better, refined, start, scene.groups)
+        residuals = jnp.where(better, of_refined, residuals)
+    kept = select_motion(past.visible, kept, jax.tree.map(jnp.zeros_like, start), scene.groups)
+    return Refined(kept, residuals, scene, shifts, needed, info)
 
 
-def _look_again(
-    now: Moment, past: Past, asked: Bool[Array, ""], config: TrackConfig
+def _show_again(
+    now: UpdateContext, past: Past, wanted: Bool[Array, ""], config: TrackConfig
 ) -> tuple[Shown, Int[Array, ""]]:
-    """What the last scene shows to the cameras of this frame, if that is asked, and what capacity it took."""
+    """What the last scene shows in the new cameras, if that is wanted, and the capacity needed."""
     backdrop, before = past.backdrop, (past.shown, jnp.int32(0))
     if backdrop is None or now.frame.depths is None:
         return before
-    moved = asked & ~are_same(past.cameras, backdrop.cameras)
+    moved = wanted & ~are_same(past.cameras, backdrop.cameras)
     again = partial(show, now.scene, now.pose, now.frame, backdrop, now.plan, config)
     return jax.lax.cond(moved, again, lambda: before)
 
 
-def _match(template: Template | None, now: Moment, config: TrackConfig, reduction: int):
-    """Each group's shift by template matching, whether it was found, and scores [C, K]."""
-    num_objects, num_cameras = now.scene.num_objects, len(now.frame.images)
-    if not config.matching:
-        nowhere, unfound = jnp.zeros((num_objects, 3)), jnp.zeros(num_objects, bool)
-        return nowhere, unfound, jnp.zeros((num_cameras, num_objects))
-    assert template is not None
-    match = match_templates(template, now.frame, config.match, reduction)
-    return *lift(match, now.frame, config.match), match.score
-
-
 def _refine(
-    now: Moment, begun: Motion, last: Rendered, config: TrackConfig, extra_losses: ExtraLosses
+    now: UpdateContext, start: Motion, last: Rendered, config: TrackConfig, extra_losses: ExtraLosses
 ) -> tuple[Motion, Float[Array, "b 3"] | None, Needed, dict[str, Any]]:
     """Refined motion, shifts of the background (None if that is frozen), capacities needed, and info."""
-    moved = move(now.pose, begun, now.centers, now.groups)
+    moved = move(now.pose, start, now.centers, now.scene.groups)
     tiles = touched_tiles([now.pose.means, moved.means], now.frame)
     near = near_background(now.scene, last, tiles)
     around = near_scene(now.scene, near, now.plan.num_near)
     roi = tiles_to_pixels(tiles, now.frame)
     batch = RefineBatch(around, now.frame, now.plan.near, now.pose, now.centers, roi)
-    refined, shifts, info = refine(begun, batch, config.refine, extra_losses)
+    refined, shifts, info = refine(start, batch, config.refine, extra_losses)
     needed = Needed(jnp.int32(0), info.pop("needed"), near.sum())
     info["refine_loss"] = info.pop("loss")
-    return refined, None if shifts is None else spread(near, shifts), needed, info
+    return refined, None if shifts is None else scatter(near, shifts), needed, info

@@ -1,4 +1,4 @@
-"""The last two stages: what is lost is detected and found again, and what the next frame needs is kept."""
+"""The last two stages: lost groups are detected and relocated, and the next frame's input is stored."""
 
 from functools import partial
 
@@ -7,92 +7,85 @@ import jax.numpy as jnp
 
 from gsjax.methods.track.config import TrackConfig
 from gsjax.methods.track.layers import Shown
-from gsjax.methods.track.lost import Confidence, confidence, is_found
+from gsjax.methods.track.lost import Confidence, group_confidence, is_found
 from gsjax.methods.track.motion import Motion, Pose, move, select_motion
 from gsjax.methods.track.plan import Needed
-from gsjax.methods.track.points import carry, carry_keyframe, of_groups, renewed
+from gsjax.methods.track.points import carry, carry_keyframe, renewed, where_groups
 from gsjax.methods.track.recover import evidence, relative_twists
-from gsjax.methods.track.reference import all_facing, radii
-from gsjax.methods.track.stages.moment import Hunt, Moment, Past, Refined, Settled
+from gsjax.methods.track.reference import all_points_facing, radii
+from gsjax.methods.track.stages.context import Alignment, Past, Refined, Settled, UpdateContext
 from gsjax.methods.track.stages.shown import memory_of, pixels_shown, show
 from gsjax.methods.track.state import TrackState
 
-_BETTER = 1.3  # factor in evidence by which a group has to be seen better elsewhere to be moved there
+_BETTER = 1.3  # a group is moved elsewhere only if the evidence for it is stronger by this factor
 
 
-def detect_lost(now: Moment, past: Past, hunt: Hunt, refined: Refined, config: TrackConfig) -> Settled:
+def detect_lost(
+    now: UpdateContext, past: Past, alignment: Alignment, refined: Refined, config: TrackConfig
+) -> Settled:
     """Fifth stage: whether each group is where it is believed to be, and whether it moves to where it was
-    found instead.
-
-    Args:
-        now: see `Moment`.
-        past: what the last scene shows.
-        hunt: where groups may be instead.
-        refined: where they were followed to.
-        config: the tracker's.
-    """
-    state, gap, kept, again = now.state, config.start.depth_gap, refined.motion, hunt.sought.again
+    found instead. Arguments `now`, `past` and others from the earlier stages."""
+    state, gap, kept = now.state, config.start.depth_gap, refined.motion
     lost, showed = state.watch.lost, state.watch.showed
-    carried = jax.vmap(carry)(hunt.named, kept.twists, now.centers)
-    sure = confidence(carried, now.sight, gap, past.background)
+    tried, relocation = alignment.search.relocation_tried, alignment.search.relocation
+    carried = jax.vmap(carry)(alignment.reference, kept.twists, now.centers)
+    confidence = group_confidence(carried, now.images, gap, past.background)
 
-    def where_it_is() -> Confidence:
-        """By all that faces the cameras: what is lost is not where it was seen last."""
-        points = all_facing(now.reference, kept.twists, now.centers, now.sight)
-        return confidence(points, now.sight, gap, past.background, hunt.others)
+    def by_all_facing() -> Confidence:
+        """From all points that face the cameras: a lost group is not where it was last seen."""
+        points = all_points_facing(now.reference, kept.twists, now.centers, now.images)
+        return group_confidence(points, now.images, gap, past.background, alignment.other_depths)
 
-    faced = jax.lax.cond(hunt.astray.any(), where_it_is, lambda: sure)
-    sure = jax.tree.map(partial(of_groups, lost), faced, sure)
-    better = evidence(again.sure) > _BETTER * evidence(faced)
-    twice = is_found(again.sure, showed) & is_found(again.before, showed)
-    # What is not lost is seen where it is. Turned otherwise there, it is in no other place.
-    away = jnp.linalg.norm(again.twists[:, :3], axis=-1) > radii(now.reference, now.centers)
-    elsewhere = hunt.sought.recovered & better & (lost | away)
-    retaken = elsewhere & twice
-    guesses = of_groups(hunt.sought.recovered, again.twists, state.relocation_guesses)
-    found_again = Motion(again.twists, jnp.zeros_like(kept.delta))
-    kept = select_motion(retaken, found_again, kept, now.groups)
-    sure = jax.tree.map(partial(of_groups, retaken), again.sure, sure)
-    return Settled(kept, sure, elsewhere, retaken, guesses)
+    of_facing = jax.lax.cond(alignment.suspects.any(), by_all_facing, lambda: confidence)
+    confidence = jax.tree.map(partial(where_groups, lost), of_facing, confidence)
+    better = evidence(relocation.confidence) > _BETTER * evidence(of_facing)
+    twice = is_found(relocation.confidence, showed) & is_found(relocation.guess_confidence, showed)
+    # A group that is not lost is seen where it is. If it is only turned there, it is in no other place.
+    away = jnp.linalg.norm(relocation.twists[:, :3], axis=-1) > radii(now.reference, now.centers)
+    elsewhere = tried & better & (lost | away)
+    relocated = elsewhere & twice
+    guesses = where_groups(tried, relocation.twists, state.relocation_guesses)
+    there = Motion(relocation.twists, jnp.zeros_like(kept.delta))
+    kept = select_motion(relocated, there, kept, now.scene.groups)
+    confidence = jax.tree.map(partial(where_groups, relocated), relocation.confidence, confidence)
+    return Settled(kept, confidence, elsewhere, relocated, guesses)
 
 
 def remember(
-    now: Moment, past: Past, hunt: Hunt, refined: Refined, settled: Settled, config: TrackConfig
+    now: UpdateContext,
+    past: Past,
+    alignment: Alignment,
+    refined: Refined,
+    settled: Settled,
+    config: TrackConfig,
 ) -> tuple[Pose, TrackState, Shown, Needed]:
-    """Sixth stage: draw what the scene shows now, from which the next frame goes on.
-
-    Args:
-        now: see `Moment`.
-        past: with the background.
-        hunt: what was looked for.
-        refined: the scene, and how well groups agree.
-        settled: where groups are.
-        config: the tracker's.
+    """Sixth stage: draw what the scene shows now, from which the next frame continues. Arguments `now`,
+    `past` and others from the earlier stages.
 
     Returns:
-        the new pose and state, what they show, and the capacities that the whole update needed.
+        The new pose and state, what they show, and the capacities that the whole update needed.
     """
-    state, motion, groups, retaken = now.state, settled.motion, now.groups, settled.retaken
+    state, motion, groups, relocated = now.state, settled.motion, now.scene.groups, settled.relocated
     pose = move(now.pose, motion, now.centers, groups)
     shown, shown_needed = show(refined.scene, pose, now.frame, past.backdrop, now.plan, config)
     needed = refined.needed
     if past.rendered is not None:
-        drawn = jnp.maximum(past.rendered.meta.needed.max(), shown_needed)
-        needed = needed._replace(full=drawn)
+        needed = needed._replace(full=jnp.maximum(past.rendered.meta.needed.max(), shown_needed))
     else:
-        near = jnp.maximum(hunt.near, shown_needed)
-        needed = needed._replace(full=past.drawn, near=jnp.maximum(needed.near, near))
-    pixels, unexplained_pixels = pixels_shown(shown, now.sight, now.scene.num_objects, config)
+        near = jnp.maximum(alignment.needed, shown_needed)
+        needed = needed._replace(full=past.needed, near=jnp.maximum(needed.near, near))
+    pixels, unexplained_pixels = pixels_shown(shown, now.images, now.scene.num_objects, config)
     keyframe = carry_keyframe(state.keyframe, motion.twists, now.centers)
-    keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, retaken)
+    keyframe = renewed(keyframe, pixels, config.align.keyframe_turn, relocated)
     watch = state.watch.after(
-        refined.residual, hunt.sought, past.counts, settled.sure, settled.elsewhere, retaken
+        refined.residuals, alignment.search, past.counts, settled.confidence, settled.elsewhere, relocated
     )
     still = jnp.zeros_like(motion.twists)
-    guesses = of_groups(watch.doubtful & ~retaken, relative_twists(settled.guesses, motion.twists), still)
-    going = select_motion(
-        retaken, jax.tree.map(jnp.zeros_like, motion), motion, groups
-    )  # a find is no velocity
+    guesses = where_groups(
+        watch.doubtful & ~relocated, relative_twists(settled.guesses, motion.twists), still
+    )
+    # A relocation is no velocity.
+    velocity = select_motion(relocated, jax.tree.map(jnp.zeros_like, motion), motion, groups)
     memory = memory_of(shown, past.backdrop, now.frame, config)
-    new = TrackState(going, pixels, keyframe, unexplained_pixels, guesses, watch, state.count + 1, *memory)
+    new = TrackState(velocity, pixels, keyframe, unexplained_pixels, guesses, watch, state.count + 1, *memory)
     return pose, new, shown, needed
