@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gsjax.engine.drive import drive
-from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.parts import (
     BACKGROUND,
     DiscoverConfig,
@@ -121,25 +120,6 @@ def test_two_halves_become_one_and_are_followed(boxes, halves):
     assert halves.parts.done.all()
     assert len(halves.steps) == 30 * (FRAMES - 1)
     assert not any(info["skipped"] for info in halves.steps)
-
-
-def test_a_discovery_that_was_stopped_in_a_frame_goes_on_to_the_same_bits(boxes, halves, tmp_path):
-    method, problem, run = begun(boxes, of_halves(boxes))
-    ticks = drive(method, problem, run)
-    while (now := next(ticks)).step < 30 + 7:
-        pass
-    partial = now.result
-    assert partial.done.tolist() == [True, True, False, False, False]  # the second frame is half found
-    assert len(partial.layer.trajectory.times) == 2
-    save_checkpoint(tmp_path / "run.npz", now.run)
-    run, _ = load_checkpoint(tmp_path / "run.npz")
-    _, problem, _ = begun(boxes, of_halves(boxes))
-    *_, now = drive(method, problem, run)
-    for a, b in zip(jax.tree.leaves(now.result), jax.tree.leaves(halves.result), strict=True):
-        np.testing.assert_array_equal(a, b)
-    again = close_frame(now.run, CONFIG)
-    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(halves.run), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_the_result_moves_as_the_parts_did_and_can_be_edited(boxes, halves):

@@ -115,19 +115,6 @@ def test_the_result_is_what_was_refined(boxes, astray):
     assert now.result.done.all()
 
 
-def test_a_frame_of_nan_changes_nothing(boxes, astray):
-    class Broken(MovingBoxes):
-        def frame(self, t):
-            frame = super().frame(t)
-            return frame if t != 1 else eqx.tree_at(lambda f: f.images, frame, frame.images * jnp.nan)
-
-    config = replace(CONFIG, refine=RefineConfig(iterations=12))
-    infos, after = refined(Broken(boxes.boxes), astray, config)
-    assert 0 < sum(bool(info["skipped"]) for info in infos) < 12
-    np.testing.assert_array_equal(after[-1].poses.translations[1], astray.kept.translations[1])
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after[-1]))
-
-
 def test_settings_without_meaning_are_refused():
     with pytest.raises(ValueError, match=r"refine\.iterations: expected at least 0, found -1"):
         RefineConfig(iterations=-1)

@@ -83,8 +83,8 @@ class Parts:
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
         """Stores the pose of a finished frame, joins and divides parts, and opens the next frame; after the
-        last frame, removes parts that no picture needs and begins the refinement. Arguments as for
-        `Method.between`; progress is not used."""
+        last frame, removes parts that no picture needs and begins the refinement.
+        Arguments as for `Method.between`; progress is not used."""
         run = self.brought_up_to_date(problem, run)
         if not isinstance(run.params, RefineParams):
             discovery: Discovery = run.kept
@@ -108,8 +108,8 @@ class Parts:
     def batch(
         self, problem: Problem, run: Run, progress: float
     ) -> tuple[StreamBatch | RefineBatch, tuple[str, ...]]:
-        """One camera of the current frame and pictures of the past; in the refinement, any picture. Arguments
-        as for `Method.batch`; progress is not used."""
+        """One camera of the current frame and pictures of the past; in the refinement, any picture.
+        Arguments as for `Method.batch`; progress is not used."""
         if isinstance(run.params, RefineParams):
             return self._batch_of_all(problem, run)
         config, discovery = self.config.stream, run.kept
