@@ -284,9 +284,9 @@ def example_line(operation: str, parts: str) -> str:
     `echo:parts=drawer,copies=3,every=0.2,fade=0.5`, with the operation's own keys that have a simple
     value."""
     keys = {}
-    for f in fields(OPERATIONS[operation]):
+    for f in (f for f in fields(OPERATIONS[operation]) if f.name not in _COMMON):
         value = f.metadata["example"] if f.default is MISSING else f.default
-        if f.name not in _COMMON and value not in (None, ()) and not isinstance(value, Entry):
+        if value not in (None, ()) and not isinstance(value, Entry):
             keys[key_of(f)] = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
     return ",".join([f"{operation}:parts={parts}", *(f"{key}={value}" for key, value in keys.items())])
 
