@@ -99,9 +99,10 @@ def films(saved: PartsRun, name: str) -> tuple[Film, Film, list[int], list[int]]
     parts = [saved.names[part] if isinstance(part, str) else part for part in edit.parts]
     shown = [replace(film[0].trajectory, times=None) for film in (before, after)]
     pairs = list(zip(*map(jax.tree.leaves, shown), strict=True))
+    ends = [float(trajectory.times[-1] - trajectory.times[0])] * trajectory.num_parts
     concerned = [
         part
-        for part in edit.concerned(trajectory, parts)
+        for part in edit.affected(trajectory, parts, ends)
         if any((a[:, part] != b[:, part]).any() for a, b in pairs)
     ]
     return before, after, concerned, parts

@@ -28,7 +28,7 @@ from gsjax.methods.parts import (
     StreamParams,
     stream_step,
 )
-from gsjax.methods.parts.pictures import where_parts_are
+from gsjax.methods.parts.pictures import with_part_masks
 from gsjax.methods.parts.residual import pose_residual
 from gsjax.methods.parts.screws import motions_of, pose_of
 from gsjax.methods.parts.stream import posed, skinning_weights
@@ -84,7 +84,7 @@ class Update(NamedTuple):
         """For one iteration that looks through some of the cameras."""
         frame = self.frames[size]
         at = self.canonical, self.weights, self.start
-        seen = where_parts_are(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
+        seen = with_part_masks(frame, *at, TILE // size, blend=PartsConfig().stream.blend)
         plan = plan_render(posed(self.canonical, self.weights, self.start), frame.cameras, headroom=1.6)
         seen = of_cameras(seen, np.array(cameras))
         return StreamBatch(self.canonical, seen, 1.0, replace(plan, derivative=derivative), self.weights)

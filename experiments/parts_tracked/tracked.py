@@ -23,7 +23,7 @@ from gsjax.geometry.cameras import project
 from gsjax.geometry.flow import seen_in_both
 from gsjax.io.ply import read_ply
 from gsjax.methods.parts import Parts, PartsConfig, Start
-from gsjax.methods.parts.discovery import closed, weights_of_run
+from gsjax.methods.parts.discovery import close_frame, weights_of_run
 from gsjax.methods.parts.stream import posed, skinning_weights
 from gsjax.optim.compiler import host_options
 from gsjax.perception.optical_flow import DisFlow
@@ -106,7 +106,7 @@ def followed(given: Problem) -> Tracked:
     method = Parts(config)
     problem, run = method.start(given.sequence, given.start)
     *_, now = drive(method, problem, run, headroom=config.headroom)
-    run = closed(now.run, config)
+    run = close_frame(now.run, config)
     parts = run.kept
     rotations, offsets = jax.vmap(partial(rigid_motions, parts.canonical.centers))(
         HandlePose(jnp.asarray(parts.quats), jnp.asarray(parts.translations))

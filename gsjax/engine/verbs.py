@@ -20,9 +20,9 @@ from gsjax.engine.track.tracking import track as track
 from gsjax.losses.extra import ExtraLosses
 from gsjax.methods.deform import Deform, DeformConfig
 from gsjax.methods.distill import Distill, DistillConfig, Teacher
-from gsjax.methods.fit import Fit, FitConfig, without_needless
+from gsjax.methods.fit import Fit, FitConfig, prune
 from gsjax.methods.parts import Parts, PartsConfig, begin
-from gsjax.methods.parts.pictures import problem_of
+from gsjax.methods.parts.pictures import Problem as PartsProblem
 from gsjax.methods.protocols import Segmenter
 from gsjax.scene.gaussians import Gaussians
 
@@ -189,7 +189,7 @@ def parts(
     config, eval_cameras = method.config, tuple(eval_cameras)
     tracked = sequence.select(cameras=[c for c in sequence.camera_ids if c not in eval_cameras])
     if after is not None:
-        return drive(method, problem_of(tracked), after.run, headroom=config.headroom)
+        return drive(method, PartsProblem(tracked), after.run, headroom=config.headroom)
     if gaussians is not None and anchor is None:
         raise ValueError("anchor: expected the frame that the given Gaussians show, found none; name it")
     chosen, moved = detect_motion(tracked, config, anchor)
@@ -198,7 +198,7 @@ def parts(
         fitting = fit(photographs, FIT)
         for _ in fitting:
             pass
-        gaussians, _ = without_needless(fitting.result, fitting.problem.frames, FIT)
+        gaussians, _ = prune(fitting.result, fitting.problem.frames, FIT)
     segmenter, key = segmenter or PieceSegmenter(), jax.random.key(config.seed)
     start = begin(tracked, gaussians, chosen, moved, config, segmenter, key)
     problem, run = method.start(tracked, start)

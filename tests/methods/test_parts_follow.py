@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gsjax.engine.drive import drive
-from gsjax.io.checkpoints import load_checkpoint, save_checkpoint
 from gsjax.methods.parts import (
     BACKGROUND,
     DiscoverConfig,
@@ -23,10 +22,10 @@ from gsjax.methods.parts import (
     moment,
     moved_pixels,
     order_of_frames,
-    without_needless,
+    prune_parts,
 )
-from gsjax.methods.parts.discovery import closed, joined, weights_of_run
-from gsjax.methods.parts.finish import given, settled, touching
+from gsjax.methods.parts.discovery import close_frame, join_parts, weights_of_run
+from gsjax.methods.parts.finish import cut_weights, moved_weights, touched_parts
 from gsjax.methods.parts.timeline import apply, parse_script
 from gsjax.scene.feature_grid import FeatureGridConfig
 from gsjax.scene.handles import skin
@@ -78,7 +77,7 @@ class Followed:
         for now in drive(self.method, self.problem, run):
             self.steps.append(now.info)
             self.order.append(now.run.kept.frame)
-        self.run = closed(now.run, config)
+        self.run = close_frame(now.run, config)
         self.parts, self.weights = self.run.kept, np.asarray(weights_of_run(self.run))
         self.result = now.result
 
@@ -123,25 +122,6 @@ def test_two_halves_become_one_and_are_followed(boxes, halves):
     assert not any(info["skipped"] for info in halves.steps)
 
 
-def test_a_discovery_that_was_stopped_in_a_frame_goes_on_to_the_same_bits(boxes, halves, tmp_path):
-    method, problem, run = begun(boxes, of_halves(boxes))
-    ticks = drive(method, problem, run)
-    while (now := next(ticks)).step < 30 + 7:
-        pass
-    partial = now.result
-    assert partial.done.tolist() == [True, True, False, False, False]  # the second frame is half found
-    assert len(partial.layer.trajectory.times) == 2
-    save_checkpoint(tmp_path / "run.npz", now.run)
-    run, _ = load_checkpoint(tmp_path / "run.npz")
-    _, problem, _ = begun(boxes, of_halves(boxes))
-    *_, now = drive(method, problem, run)
-    for a, b in zip(jax.tree.leaves(now.result), jax.tree.leaves(halves.result), strict=True):
-        np.testing.assert_array_equal(a, b)
-    again = closed(now.run, CONFIG)
-    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(halves.run), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_the_result_moves_as_the_parts_did_and_can_be_edited(boxes, halves):
     result, parts = halves.result, halves.parts
     scene, trajectory = result.scene, result.trajectory
@@ -152,7 +132,7 @@ def test_the_result_moves_as_the_parts_did_and_can_be_edited(boxes, halves):
     np.testing.assert_array_equal(result.at(3).means, gaussians_at(scene, moment(trajectory, 3)).means)
     moved = result.at(3).means[parts.order[: parts.canonical.movable.num]]
     labels = np.asarray(scene.labels)[parts.order[: parts.canonical.movable.num]]
-    weights = jnp.asarray(settled(halves.weights, np.asarray(parts.canonical.alive)))
+    weights = jnp.asarray(cut_weights(halves.weights, np.asarray(parts.canonical.alive)))
     expected = skin(parts.canonical.movable, weights, parts.canonical.centers, parts.pose(3)).means
     np.testing.assert_allclose(moved[labels > 0], np.asarray(expected)[labels > 0], atol=2e-5)
     assert result.poses(3).quats.shape == (3, 4)
@@ -204,7 +184,7 @@ def test_what_no_picture_needs_is_given_up(boxes, halves):
     alive = np.asarray(parts.canonical.alive).copy()
     alive[free] = True
     canonical = parts.canonical._replace(alive=jnp.asarray(alive))
-    after = without_needless(boxes, parts._replace(canonical=canonical), weights, CONFIG)
+    after = prune_parts(boxes, parts._replace(canonical=canonical), weights, CONFIG)
     assert (free, BACKGROUND) in after.joined
     kept = set(np.unique(np.asarray(after.weights).argmax(-1)).tolist())
     assert kept == set(np.unique(halves.weights.argmax(-1)).tolist())
@@ -212,23 +192,23 @@ def test_what_no_picture_needs_is_given_up(boxes, halves):
 
 def test_in_the_end_weights_that_only_tie_parts_together_are_cut(halves):
     weights, alive = halves.weights, np.asarray(halves.parts.canonical.alive)
-    cut = settled(weights, alive)
+    cut = cut_weights(weights, alive)
     assert ((weights > 0) & (weights < 0.02)).mean() > 0.2
     assert not ((cut > 0) & (cut < 0.02)).any()
     np.testing.assert_allclose(cut.sum(-1), 1, atol=1e-6)
     np.testing.assert_array_equal(cut.argmax(-1), weights.argmax(-1))
     assert np.abs(cut - weights).max() < 0.02 * weights.shape[1]
-    np.testing.assert_allclose(settled(cut, alive), cut, atol=1e-6)
+    np.testing.assert_allclose(cut_weights(cut, alive), cut, atol=1e-6)
 
 
 def test_parts_that_are_touched(halves):
     parts, weights = halves.parts, halves.weights
     labels = weights.argmax(-1)
     one, other = sorted(set(np.unique(labels).tolist()) - {BACKGROUND})
-    assert touching(parts, labels, one) == [BACKGROUND]  # the boxes do not touch each other
-    assert other not in touching(parts, labels, one)
-    np.testing.assert_allclose(given(weights, one, other).sum(-1), 1, rtol=1e-5)
-    assert (given(weights, one, other)[:, one] == 0).all()
+    assert touched_parts(parts, weights, one) == [BACKGROUND]  # the boxes do not touch each other
+    assert other not in touched_parts(parts, weights, one)
+    np.testing.assert_allclose(moved_weights(weights, one, other).sum(-1), 1, rtol=1e-5)
+    assert (moved_weights(weights, one, other)[:, one] == 0).all()
 
 
 def test_frames_go_onwards_and_then_back():
@@ -237,7 +217,7 @@ def test_frames_go_onwards_and_then_back():
 
 
 def test_nothing_joins_nothing(halves):
-    same, weights = joined(halves.parts, halves.weights, np.arange(5))
+    same, weights = join_parts(halves.parts, halves.weights, np.arange(5))
     assert same is halves.parts
     assert weights is halves.weights
 

@@ -23,8 +23,9 @@ from gsjax.methods.parts.operations import (
     Rotate,
     Scale,
     Speed,
+    describe_operation,
+    example_line,
 )
-from gsjax.methods.parts.signatures import explained, first_line
 from gsjax.methods.parts.timeline import Script, parse_op, parse_script, to_yaml
 
 EXAMPLE = """
@@ -197,19 +198,19 @@ class TestScripts:
 
     @pytest.mark.parametrize("operation", OPERATIONS)
     def test_a_line_to_begin_with_is_an_edit(self, operation):
-        edit = parse_op(first_line(operation, "[lid, part 2]"))
+        edit = parse_op(example_line(operation, "[lid, part 2]"))
         assert type(edit) is OPERATIONS[operation]
         assert edit.parts == ("lid", "part 2")
-        keys = {key for line in explained(operation)[1:] for key in line.split(":")[0].split(", ")}
+        keys = {key for line in describe_operation(operation)[1:] for key in line.split(":")[0].split(", ")}
         assert keys == {key_of(f) for f in fields(edit)}
 
     def test_a_line_has_what_an_operation_is_about(self):
-        assert first_line("echo", "lid") == "echo:parts=lid,copies=3,every=0.2,fade=0.5"
-        assert first_line("move", "all") == "move:parts=all,by=[0,0,0.1]"
-        assert explained("speed")[1] == (
+        assert example_line("echo", "lid") == "echo:parts=lid,copies=3,every=0.2,fade=0.5"
+        assert example_line("move", "all") == "move:parts=all,by=[0,0,0.1]"
+        assert describe_operation("speed")[1] == (
             "factor: a factor from 0.01 to 100, or from -0.01 to -100 for backwards"
         )
-        assert explained("speed")[3] == "from, to: seconds from the film's start, 0 or more"
+        assert describe_operation("speed")[3] == "from, to: seconds from the film's start, 0 or more"
 
 
 numbers = st.floats(0.01, 50.0)

@@ -10,10 +10,10 @@ from gsjax.methods.parts.config import DiscoverConfig, PartsConfig
 from gsjax.methods.parts.discover import begin, pixel_width
 from gsjax.methods.parts.lift import label_votes, lift_masks
 from gsjax.methods.parts.masks import (
-    masks_of_labels,
+    masks_from_labels,
     moving_segments,
-    order_of_views,
-    propagated_masks,
+    propagate_masks,
+    view_order,
 )
 from gsjax.methods.parts.stream import skinning_weights
 from gsjax.methods.parts.weights import fit_field_to_weights, new_field, weights_of
@@ -114,10 +114,10 @@ def test_labels_of_all_views_count_by_what_changed_in_all():
     moved = labels == 7
     moved[0, 1, :2] = True  # two of three pixels of 3, none of 5
     np.testing.assert_array_equal(
-        masks_of_labels(labels, moved, 9), [[[1, 1, 1, 1], [2, 2, 0, 0]], [[1, 1, 0, 0], [0, 0, 0, 2]]]
+        masks_from_labels(labels, moved, 9), [[[1, 1, 1, 1], [2, 2, 0, 0]], [[1, 1, 0, 0], [0, 0, 0, 2]]]
     )
-    np.testing.assert_array_equal(masks_of_labels(labels, moved, 1), labels == 7)
-    assert not masks_of_labels(labels, np.zeros_like(moved), 9).any()
+    np.testing.assert_array_equal(masks_from_labels(labels, moved, 1), labels == 7)
+    assert not masks_from_labels(labels, np.zeros_like(moved), 9).any()
 
 
 def test_views_are_taken_around():
@@ -125,7 +125,7 @@ def test_views_are_taken_around():
     centers = np.stack([np.cos(angles), np.sin(angles), np.ones(6)], -1)
     viewmats = np.tile(np.eye(4), (6, 1, 1))
     viewmats[:, :3, 3] = -centers
-    order = order_of_views(viewmats, 0, np.zeros(3))
+    order = view_order(viewmats, 0, np.zeros(3))
     assert order[:2] == [0, 2]
     assert sorted(order) == list(range(6))
     assert order[order.index(1) - 1] == 5  # from 130 to 180 degrees, not from 300
@@ -146,11 +146,11 @@ def test_numbers_pass_from_view_to_view():
     def segmenter(picture, depth, K):
         return segments[picture[0, 0, 0]]
 
-    masks = propagated_masks(pictures, *geometry, moved, [0, 1], segmenter, known, 4, 9)
+    masks = propagate_masks(pictures, *geometry, moved, [0, 1], segmenter, known, 4, 9)
     assert masks[1, 0, 0] == masks[0, 0, 4] > 0
     assert len(set(masks[1, 0].tolist()) - {0}) == 3
     assert masks.max() == 4
-    few = propagated_masks(pictures, *geometry, moved, [0, 1], segmenter, known, 2, 9)
+    few = propagate_masks(pictures, *geometry, moved, [0, 1], segmenter, known, 2, 9)
     assert few.max() == 2  # the largest, which both views see
     assert few[1, 0, 0] == few[0, 0, 4] == 1
     assert (masks[1, 0, 3:6] == 0).all()

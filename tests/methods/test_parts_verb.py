@@ -65,7 +65,8 @@ def test_a_discovery_is_stored_and_goes_on_to_the_same_bits(boxes, sequence, seg
     assert len(steps) == 3 * (FRAMES - 1) + 2
     assert np.isfinite(steps).all()
     loaded = load(tmp_path / "run.npz")
-    assert loaded.result.done.tolist() == [True, True, False]
+    assert loaded.result.done.tolist() == [True, True, False]  # the second frame is half found
+    assert len(loaded.result.layer.trajectory.times) == 2
     *_, again = parts(sequence, loaded.method.config, eval_cameras=[HELD_OUT], after=loaded)
     for a, b in zip(jax.tree.leaves(again.result), jax.tree.leaves(now.result), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -29,7 +29,7 @@ from gsjax.engine.progress import Progress, load_run, watch
 from gsjax.engine.recording import located
 from gsjax.io.atomic import write_npz
 from gsjax.io.ply import write_ply
-from gsjax.methods.fit import Fit, FitConfig, Model, Problem, as_found, without_needless
+from gsjax.methods.fit import Fit, FitConfig, Model, Problem, prune, refined_frames
 from gsjax.optim.method import Run
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
@@ -104,14 +104,14 @@ def run(options: Options) -> int:
         seconds = {"fit": progress.seconds, "compile": progress.compile_seconds}
         gaussians, finished, ablation = ticks.result, stopped is None, []
         _note_oddities(options, progress, gaussians, finished, notes)
-        found_frames = as_found(problem, run.params)
+        found_frames = refined_frames(problem, run.params)
         write_cameras(folder, [photographs.names[i] for i in chosen], found_frames, run.params)
         optional = partial(_optional, seconds, console, notes)
         light, scores = None, Scores([])
         if finished:  # after Ctrl-C, nobody waits for this
             with optional("pruning", "removing Gaussians that no photograph needs"):
                 before = gaussians.num
-                gaussians, light = without_needless(gaussians, found_frames, config)
+                gaussians, light = prune(gaussians, found_frames, config)
                 if gaussians.num < before:
                     notes.add(
                         f"{before - gaussians.num:,} of {before:,} Gaussians were removed at the end: "

@@ -33,7 +33,7 @@ from gsjax.methods.parts import (
     PartsConfig,
     Start,
     begin,
-    masks_of_labels,
+    masks_from_labels,
 )
 from gsjax.methods.protocols import Segmenter
 from gsjax.perception.sam import load_sam
@@ -162,7 +162,7 @@ def _masks(
             f"found none for {', '.join(map(str, missing))}; name other --cameras, or use --masks segment"
         )
     known = [label for label in labels if label is not None]
-    masks = masks_of_labels(np.stack(known), moved, options.parts.discover.most_parts)
+    masks = masks_from_labels(np.stack(known), moved, options.parts.discover.most_parts)
     if not masks.any():
         raise ValueError(
             "--masks files: expected a label of which a third of the pixels changes in other frames, found "

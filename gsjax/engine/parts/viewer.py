@@ -16,8 +16,7 @@ from gsjax.engine.parts.saved import PartsRun
 from gsjax.engine.recording import Recording
 from gsjax.methods.parts.entries import ALL
 from gsjax.methods.parts.film import Film, Layer
-from gsjax.methods.parts.operations import OPERATIONS
-from gsjax.methods.parts.signatures import explained, first_line
+from gsjax.methods.parts.operations import OPERATIONS, describe_operation, example_line
 from gsjax.methods.parts.timeline import Names, Script, parse_op
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.scene.gaussians import concatenate, take
@@ -91,10 +90,10 @@ def editing_of(saved: PartsRun, filmed: Filmed) -> Editing:
         return folder
 
     return Editing(
-        operations={operation: explained(operation) for operation in OPERATIONS},
+        operations={operation: describe_operation(operation) for operation in OPERATIONS},
         parts=parts | {ALL: ALL},
         cameras=tuple(sorted(cameras, key=lambda name: cameras[name] != first)),
-        begin=first_line,
+        begin=example_line,
         preview=preview,
         save=save,
     )

@@ -5,9 +5,9 @@ slots (3DGS-MCMC, Kheradmand et al. 2024).
     problem, run = method.start(frames, cloud)
     for now in drive(method, problem, run): ...
 
-    config.py  what can be set            start.py    the first Gaussians
-    model.py   what a fit may change      update.py   the loss, and one step
-    method.py  what the loop has to know  pruning.py  what no photograph needs
+    config.py  settings                  start.py    the initial Gaussians
+    model.py   the parameters of a fit   update.py   the loss, one step, and densification
+    method.py  the method, for the loop  pruning.py  removal of unneeded Gaussians
 """
 
 from gsjax.methods.fit.config import (
@@ -18,9 +18,9 @@ from gsjax.methods.fit.config import (
     SplitConfig,
     StartConfig,
 )
-from gsjax.methods.fit.method import Fit, Problem, as_found
+from gsjax.methods.fit.method import Fit, Problem, refined_frames
 from gsjax.methods.fit.model import Model
-from gsjax.methods.fit.pruning import light_of, needed, without_needless
+from gsjax.methods.fit.pruning import light_of, needed, prune
 from gsjax.methods.fit.start import Extent, extent_of
 from gsjax.methods.fit.update import Batch, fit_loss, grow
 from gsjax.methods.fit.update import fit_step as step
@@ -37,12 +37,12 @@ __all__ = [
     "RatesConfig",
     "SplitConfig",
     "StartConfig",
-    "as_found",
     "extent_of",
     "fit_loss",
     "grow",
     "light_of",
     "needed",
+    "prune",
+    "refined_frames",
     "step",
-    "without_needless",
 ]

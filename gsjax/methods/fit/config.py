@@ -1,4 +1,4 @@
-"""How a scene is fitted to photographs. Comments become the command line's help."""
+"""Settings of a fit. The fields' docstrings become the command line's help."""
 
 from dataclasses import dataclass, field, fields
 from typing import Literal
@@ -10,17 +10,17 @@ from gsjax.methods.settings import expect
 
 @dataclass(frozen=True)
 class StartConfig:
-    """Where the first Gaussians are."""
+    """Settings of the initial Gaussians."""
 
     source: Literal["auto", "cloud", "depth", "matches", "random"] = "auto"
-    """The data's points, its depth, what photographs are found to share, or random places before cameras;
-    auto takes the first that there is."""
+    """Source of the initial positions: the data's point cloud, its depth, points matched between photographs,
+    or random points in front of the cameras. auto: the first of these that is available."""
     count: int = 20_000
-    """How many, where they are not the data's own points."""
+    """Number of Gaussians, unless they are the data's own points."""
     opacity: float = 0.1
-    """Of all of them; more where depth says that something is there."""
+    """Initial opacity."""
     scale: float = 1.0
-    """Of all of them, in distances to their neighbours."""
+    """Initial scale, relative to the distance to the neighbours."""
 
     def __post_init__(self):
         expect(self, "start.", count=(1, np.inf), opacity=(1e-3, 0.999), scale=(1e-6, np.inf))
@@ -31,21 +31,22 @@ class RatesConfig:
     """Learning rates of Adam, as in 3DGS."""
 
     means: float = 1.6e-4
-    """Of places, in radii of the scene; it falls to a hundredth by the end."""
+    """Learning rate of the means, in scene radii; it falls to a hundredth by the end."""
     quats: float = 1e-3
-    """Of orientations."""
+    """Learning rate of the orientations."""
     log_scales: float = 5e-3
-    """Of logarithms of sizes."""
+    """Learning rate of the logarithms of the scales."""
     logit_opacities: float = 5e-2
-    """Of logits of opacities."""
+    """Learning rate of the logits of the opacities."""
     sh0: float = 2.5e-3
-    """Of colours, as far as they are the same from all sides."""
+    """Learning rate of the view-independent part of the colours."""
     shN: float = 1.25e-4
-    """Of the rest of colours."""
+    """Learning rate of the higher spherical harmonics."""
     exposures: float = 1e-3
-    """Of each photograph's map of colours, where exposure is learned."""
+    """Learning rate of each photograph's colour transform, if exposure is learned."""
     twists: float = 2e-4
-    """Of the cameras' turns, radians, and shifts, radii of the scene; it falls to a hundredth by the end."""
+    """Learning rate of the cameras' rotations, radians, and translations, scene radii; it falls to a
+    hundredth by the end."""
 
     def __post_init__(self):
         expect(self, "rates.", **{field.name: (0, np.inf) for field in fields(self)})
@@ -56,19 +57,19 @@ class GrowthConfig:
     """Relocation and growth (3DGS-MCMC)."""
 
     every: int = 100
-    """Steps between relocations."""
+    """Number of steps between relocations."""
     begin: int = 300
-    """The first of them."""
+    """First step at which Gaussians are relocated."""
     end: float = 0.85
     """Share of all steps after which nothing is relocated."""
     factor: float = 1.05
-    """How many times as many Gaussians there may be after each, up to the cap."""
+    """Growth of the number of Gaussians at each relocation, up to the cap."""
     noise: float = 5e5
-    """Of the walk of what is almost transparent, in rates of the means."""
+    """Noise on the positions of nearly transparent Gaussians, relative to the learning rate of the means."""
     opacity_cost: float = 0.01
-    """Weight of the mean opacity in the loss, which frees what is not needed."""
+    """Weight of the mean opacity in the loss, which frees Gaussians that are not needed."""
     scale_cost: float = 0.01
-    """Weight of the mean scale, in radii of the scene."""
+    """Weight of the mean scale in the loss, in scene radii."""
 
     def __post_init__(self):
         expect(self, "growth.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), factor=(1, np.inf))
@@ -80,19 +81,20 @@ class SplitConfig:
     """Cloning, splitting and pruning (adaptive density control of 3DGS)."""
 
     every: int = 100
-    """Steps between them."""
+    """Number of steps between rounds of densification."""
     begin: int = 500
-    """The first of them."""
+    """First step at which Gaussians are cloned or split."""
     end: float = 0.5
     """Share of all steps after which nothing is cloned or split."""
     pull: float = 2e-4
-    """Mean gradient of a projected mean, by half a picture, above which there are too few Gaussians."""
+    """Mean gradient of a projected mean, per half image, above which a Gaussian is cloned or split."""
     large: float = 0.01
-    """Scale above which one is split and not cloned, in radii of the scene."""
+    """Scale above which a Gaussian is split instead of cloned, in scene radii."""
     too_large: float = 0.1
-    """Scale above which one is pruned, once opacities were lowered: the background begins few and large."""
+    """Scale above which a Gaussian is pruned, in scene radii; only after the first reset of opacities,
+    because the background starts with a few large Gaussians."""
     reset_every: int = 3_000
-    """Steps after which all opacities are lowered to 0.01: what is not needed stays there."""
+    """Number of steps between resets of all opacities to 0.01; Gaussians that are not needed stay there."""
 
     def __post_init__(self):
         expect(self, "split.", every=(1, np.inf), begin=(0, np.inf), end=(0, 1), reset_every=(1, np.inf))
@@ -101,39 +103,39 @@ class SplitConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a scene is fitted."""
+    """Settings of a fit."""
 
     steps: int = 7_000
-    """How many photographs are looked at, one a step."""
+    """Number of steps, each with one photograph."""
     cap: int = 60_000
-    """How many Gaussians there may be."""
+    """Largest number of Gaussians."""
     strategy: Literal["relocate", "split"] = "relocate"
-    """Where more Gaussians come from: those that became transparent move to where opacity is (3DGS-MCMC), or
-    those whose projections are pulled hard are cloned and split (3DGS)."""
+    """How Gaussians are added: transparent ones are relocated to opaque ones (3DGS-MCMC), or those whose
+    projections have large gradients are cloned and split (3DGS)."""
     sh_degree: int = 1
-    """The highest degree of the spherical harmonics, 0 to 3: how colour depends on the direction."""
+    """Highest degree of the spherical harmonics, 0 to 3, by which colour depends on the viewing direction."""
     sh_every: int = 1_500
-    """Steps after which the next degree is unlocked."""
+    """Number of steps after which the next degree is unlocked."""
     dssim_weight: float = 0.2
-    """Share of D-SSIM in the loss; the rest is L1."""
+    """Share of D-SSIM in the loss; the remainder is L1."""
     depth_weight: float = 0.0
-    """Weight of the difference in depth, in radii of the scene, where photographs have depth."""
+    """Weight of the depth loss, in scene radii, for photographs with depth."""
     coarse_until: float = 0.5
-    """Share of the fit that looks at smaller photographs, which take less time: of a quarter of the size, and
-    from a third of it on of half the size."""
+    """Share of the fit that uses smaller photographs, which are faster: a third of it at a quarter of the
+    resolution, the rest at half."""
     antialiased: bool = False
-    """Draw with Mip-Splatting's compensation, for views from other distances."""
+    """Render with the opacity compensation of Mip-Splatting, for views from other distances."""
     background: Literal["data", "black", "white", "random"] = "data"
-    """Colour behind the scene; data: what the photographs were composited on, else black."""
+    """Colour behind the scene; data: the colour that the photographs were composited on, else black."""
     prune: float = 0.002
-    """In the end, Gaussians that are needed least are left out, as many as together send at most this share
-    of the light into any photograph."""
+    """At the end, remove the least needed Gaussians, which together contribute at most this share of the
+    light of any photograph."""
     exposure: bool = False
-    """Learn an affine map of colours for each photograph, where exposure or white balance differ."""
+    """Learn an affine colour transform for each photograph, where exposure or white balance differ."""
     refine_poses: bool = False
-    """Learn how far each camera stands from where the data says."""
+    """Learn corrections of the cameras' poses."""
     seed: int = 0
-    """Of all that is random."""
+    """Random seed."""
     start: StartConfig = field(default_factory=StartConfig)
     rates: RatesConfig = field(default_factory=RatesConfig)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -160,5 +162,5 @@ PRESETS = {
         growth=GrowthConfig(begin=500, end=25 / 30),
     ),
 }
-"""Settings by name: for a first look, with 3DGS's cloning and splitting, for RGB-D, and about those of
-3DGS-MCMC, which ask for a GPU or a night."""
+"""Settings by name: for a first look, with the cloning and splitting of 3DGS, for RGB-D, and close to those
+of 3DGS-MCMC, which need a GPU or a night."""

@@ -1,4 +1,4 @@
-"""The fit as one value: which photograph is next, at what size, with which capacity, and when it grows."""
+"""The method of a fit: the order and the size of photographs, plans, and the schedule of densification."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,7 +16,7 @@ from gsjax.geometry.cameras import Camera, on_device
 from gsjax.losses.extra import ExtraLosses, named_losses
 from gsjax.methods.fit.config import FitConfig
 from gsjax.methods.fit.model import Model, carried_over, model_of, refined, with_degree, with_slots
-from gsjax.methods.fit.start import Extent, extent_of, in_slots, start_points
+from gsjax.methods.fit.start import Extent, extent_of, initial_gaussians, start_points
 from gsjax.methods.fit.update import Batch, fit_step, grow, slots_wanted, split
 from gsjax.methods.sampling import shuffled_index
 from gsjax.optim.compiler import host_options
@@ -28,18 +28,18 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians, cull_invalid, take
 from gsjax.scene.render import plan_render
 
-_BACKGROUND, _GROWTH = 0, 2  # what keys are for, beside that of the step
+_BACKGROUND, _GROWTH = 0, 2  # folded into the seed for the keys of these purposes
 
 
 class Problem(NamedTuple):
-    """What does not change during a fit.
+    """The constants of a fit, with a cache.
 
     Attributes:
-        frames: the photographs to fit, of one camera each, on the host.
-        extent: where the scene is.
-        background: RGB behind the scene; None: another in each step.
-        start: where the first Gaussians come from: cloud, depth, matches or random.
-        held: photographs of the size that is looked at now, on the device; filled as they are needed.
+        frames: the photographs to fit, with one camera each, on the host.
+        extent: the extent of the scene.
+        background: RGB behind the scene; None: random in each step.
+        start: source of the initial Gaussians: cloud, depth, matches or random.
+        held: photographs at the current size, on the device; filled on demand.
     """
 
     frames: list[Frame]
@@ -54,7 +54,7 @@ class Fit:
     """A static scene from posed photographs (`gsjax.optim.method.Method`).
 
     Attributes:
-        config: how it is fitted.
+        config: settings.
         extra_losses: custom losses `loss(scene, rendered, frame)`, whose scene is a `Model`; see
             `gsjax.losses.extra`. `info["extra"]` has their values.
     """
@@ -71,33 +71,31 @@ class Fit:
         cloud: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> tuple[Problem, Run]:
-        """A fit before its first step.
+        """The problem and the run before the first step.
 
         Args:
             frames: the photographs, each a frame of one camera on the host.
             cloud: points of the scene and their colours, 0 to 1.
-            background: what is behind the scene, where the data has it.
+            background: RGB behind the scene, if known from the data.
 
         Raises:
-            ValueError: there is no photograph, or none in which a pixel counts, or nothing of the kind from
-                which the fit is to start, or another background is asked for than the data has.
+            ValueError: there is no photograph, no pixel counts, the source of the initial Gaussians is not
+                available, or the requested background differs from the data's.
         """
         config = self.config
         if not frames:
             raise ValueError("views: expected at least one photograph to fit, found none")
         if background is not None and config.background != "data":
             raise ValueError(
-                f"background: the photographs stand on {background} where nothing is, which before "
-                f"{config.background!r} would be learned as a thing; leave it at data"
+                f"background: expected data, as the photographs were composited on {background}, which would "
+                f"otherwise be learned as an object; found {config.background!r}; leave it at data"
             )
         if not any(frame.masks is None or frame.masks.any() for frame in frames):
-            raise ValueError(
-                "masks: in none of the photographs to fit does any pixel count; are they inverted?"
-            )
+            raise ValueError("masks: no pixel counts in any of the photographs to fit; are they inverted?")
         extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
         points, colors, source = start_points(frames, cloud, config.start, config.seed)
         slots = config.cap if config.strategy == "relocate" else min(config.cap, rung(1.5 * len(points)))
-        gaussians = in_slots(points, colors, slots, config.start, config.seed)
+        gaussians = initial_gaussians(points, colors, slots, config.start, config.seed)
         behind = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": None}
         behind["data"] = background or behind["black"]
         model = model_of(gaussians, config, len(frames))
@@ -110,12 +108,12 @@ class Fit:
         return fit_step(self.config, self.extra_losses)
 
     def total(self, problem: Problem) -> int:
-        """The steps of the configuration."""
+        """Number of steps."""
         return self.config.steps
 
     def between(self, problem: Problem, run: Run, progress: float) -> Run:
-        """Relocates or divides, unlocks the next degree of the spherical harmonics, plans a new size.
-        Arguments as for `Method.between`."""
+        """Relocates or splits Gaussians, unlocks the next degree of the spherical harmonics, and plans new
+        sizes. Arguments as for `Method.between`."""
         run = self._densified(problem, run, run.step - 1, progress)
         run = self._enlarged(run, degree=min(self.config.sh_degree, run.step // self.config.sh_every))
         name, frame = self._turn(problem, run.step, progress)
@@ -126,7 +124,7 @@ class Fit:
         return run.having(plans=run.plans | {name: replace(plan, sh_degree=gaussians.sh_degree)})
 
     def batch(self, problem: Problem, run: Run, progress: float) -> tuple[Batch, tuple[str, ...]]:
-        """The photograph whose turn it is, and the plan for its size. Arguments as for `Method.batch`."""
+        """The photograph of the step, and the plan for its size. Arguments as for `Method.batch`."""
         name, frame = self._turn(problem, run.step, progress)
         if problem.background is None:
             key = jax.random.fold_in(jax.random.key(self.config.seed), _BACKGROUND)
@@ -138,7 +136,7 @@ class Fit:
         return batch, (name,)
 
     def result(self, problem: Problem | None, run: Run) -> Gaussians:
-        """The Gaussians that hold something; empty slots are left out."""
+        """The Gaussians without empty slots."""
         gaussians = run.params.gaussians
         return cull_invalid(take(gaussians, np.asarray(is_alive(gaussians))))[0]
 
@@ -150,20 +148,21 @@ class Fit:
         view, shrink = self._view(problem, step), shrink_at(self.config, progress)
         if (view, shrink) not in problem.held:
             if any(held != shrink for _, held in problem.held):
-                problem.held.clear()  # photographs of a size that is over
+                problem.held.clear()  # of an earlier size
             problem.held[view, shrink] = on_device_at(problem.frames, view, shrink)
         frame = problem.held[view, shrink]
         return f"{shrink}:{frame.cameras.width}x{frame.cameras.height}", frame
 
     def _enlarged(self, run: Run, *, degree: int = 0, slots: int = 0) -> Run:
-        """With the coefficients of a degree, and this many slots; what the optimizer knew is kept."""
+        """The run with spherical harmonics up to a degree and a number of slots; keeps the optimizer's
+        state."""
         larger = with_slots(with_degree(run.params, degree), slots)
         if larger is run.params:
             return run
         return run.having(params=larger, state=carried_over(run.state, self.step.init(larger)))
 
     def _densified(self, problem: Problem, run: Run, step: int, progress: float) -> Run:
-        """After `step`, where it is time: with Gaussians where they are needed."""
+        """The run after densification, if it is due after `step`."""
         config = self.config
         when = config.growth if config.strategy == "relocate" else config.split
         if step < when.begin or step % when.every or progress >= when.end:
@@ -172,7 +171,7 @@ class Fit:
             room = min(config.cap, rung(int(slots_wanted(run.params, run.state, config))))
             run = self._enlarged(run, slots=room)
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), _GROWTH), step)
-        seen = all_seen_since(config, step, len(problem.frames))
+        seen = _all_seen_since(config, step, len(problem.frames))
         params, state = _compiled_growth(config)(
             run.params, run.state, key, step, seen, problem.extent.radius
         )
@@ -181,7 +180,7 @@ class Fit:
 
 @lru_cache(maxsize=2)
 def _compiled_growth(config: FitConfig) -> Callable:
-    """The jitted relocation or division; buffers that it replaces are given away."""
+    """The jitted relocation or splitting, which donates its buffers."""
 
     @partial(jax.jit, compiler_options=host_options(), donate_argnums=(0, 1))
     def densify(model, optimizer, key, step, all_seen, radius):
@@ -195,36 +194,32 @@ def _compiled_growth(config: FitConfig) -> Callable:
 
 
 def shrink_at(config: FitConfig, progress: float) -> int:
-    """By how many times smaller photographs are looked at: first 4, then 2, then 1."""
+    """The factor by which photographs are downscaled: first 4, then 2, then 1."""
     if progress >= config.coarse_until:
         return 1
     return 4 if progress < config.coarse_until / 3 else 2
 
 
-def all_seen_since(config: FitConfig, step: int, views: int) -> bool:
-    """Whether each photograph had a turn since this was last so; two rounds of turns hold a whole one.
-
-    Args:
-        config: how often the fit grows.
-        step: index of the step just made.
-        views: how many photographs there are.
+def _all_seen_since(config: FitConfig, step: int, views: int) -> bool:
+    """Whether each photograph was used since this was last true, after `step`; any two rounds contain a whole
+    shuffled one. Arguments: the config, and the number of views.
     """
-    if config.strategy == "split":  # which forgets each time what was seen
+    if config.strategy == "split":  # which resets visibility each time
         return config.split.every >= 2 * views
     period = -(-2 * views // config.growth.every) * config.growth.every
     return step >= period and step % period == 0
 
 
 def on_device_at(frames: list[Frame], view: int, shrink: int) -> Frame:
-    """A photograph on the device, a number of times smaller.
+    """A downscaled photograph on the device.
 
-    All are of one kind, with a mask where any has one that leaves something out, and with depth where any has
-    some: each kind is a program of its own.
+    All have the same structure, with a mask if any photograph masks out pixels, and with depth if any has
+    depth, so that one program serves all.
 
     Args:
         frames: all photographs, on the host.
-        view: the index of the photograph.
-        shrink: how many times smaller it is to be, 1 or more.
+        view: index of the photograph.
+        shrink: factor by which it is downscaled, 1 or more.
     """
     frame = frames[view]
     image = frame.images[0]
@@ -255,8 +250,8 @@ def _counts_all(frame: Frame) -> bool:
     return frame.masks is None or bool(frame.masks.all())
 
 
-def as_found(problem: Problem, model: Model) -> list[Frame]:
-    """The photographs from where the fit found their cameras."""
+def refined_frames(problem: Problem, model: Model) -> list[Frame]:
+    """The photographs with the refined poses of their cameras."""
     if model.twists is None:
         return problem.frames
     found = []

@@ -1,10 +1,11 @@
-"""What a fit may change: the Gaussians, and where asked, how each photograph was exposed and where from."""
+"""The parameters of a fit: the Gaussians, and optionally exposures and camera poses of the photographs."""
 
 from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gsjax.geometry.cameras import perturbed
@@ -15,14 +16,14 @@ from gsjax.scene.gaussians import Gaussians
 
 
 class Model(eqx.Module):
-    """The parameters of a fit. What is None is not changed and costs nothing.
+    """The parameters of a fit. Fields that are None are not optimised and cost nothing.
 
     Attributes:
-        gaussians: of all slots.
-        exposures: of each photograph, what is added to the affine map [I | 0] of its colours.
-        twists: of each camera, a turn (radians) and a shift (radii of the scene), in the world's axes.
-        nudges: zeros added to the projected means. Their gradient says which Gaussians are seen at all, and
-            where there are too few.
+        gaussians: the Gaussians of all slots.
+        nudges: zeros that are added to the projected means. Their gradient tells which Gaussians are visible,
+            and where there are too few.
+        exposures: deviation of each photograph's affine colour transform from [I | 0].
+        twists: rotation (radians) and translation (scene radii) of each camera, in the world's axes.
     """
 
     gaussians: Gaussians
@@ -35,9 +36,9 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
     """The model before the first step.
 
     Args:
-        gaussians: where it starts.
-        config: what is learned.
-        views: how many photographs there are.
+        gaussians: the initial Gaussians.
+        config: selects what is optimised.
+        views: number of photographs.
     """
     dtype = gaussians.means.dtype
     return Model(
@@ -51,13 +52,13 @@ def model_of(gaussians: Gaussians, config: FitConfig, views: int) -> Model:
 def exposed(
     colors: Float[Array, "c h w 3"], exposures: Float[Array, "views 3 4"], view: Int[Array, ""]
 ) -> Float[Array, "c h w 3"]:
-    """Colours as the camera of a photograph made them: E [c; 1]. On average over photographs E is [I | 0]:
-    what all share belongs to the scene.
+    """Colours with the exposure of a photograph: E [c; 1]. The mean of E over photographs is [I | 0], because
+    a shared exposure belongs to the scene.
 
     Args:
-        colors: as the scene sends them.
-        exposures: E of each photograph.
-        view: which photograph.
+        colors: colours of the scene.
+        exposures: E - [I | 0] of each photograph.
+        view: index of the photograph.
     """
     map_ = (exposures - exposures.mean(0))[view]
     return colors + jnp.einsum("chwj,ij->chwi", colors, map_[:, :3]) + map_[:, 3]
@@ -69,20 +70,20 @@ def refined(
     view: Int[Array, ""],
     radius: Float[Array, ""] | float,
 ) -> Float[Array, "c 4 4"]:
-    """View matrices of cameras that were turned about their centres and shifted. On average over photographs
-    neither turned nor shifted, for else the scene could move along.
+    """View matrices of cameras, rotated about their centres and translated. The mean twist over photographs
+    is zero, because otherwise the scene could drift.
 
     Args:
-        viewmats: as they were given, world to camera.
-        twists: of each photograph.
-        view: which photograph.
-        radius: of the scene: what shifts are counted in.
+        viewmats: the given matrices, world to camera.
+        twists: twist of each photograph.
+        view: index of the photograph.
+        radius: radius of the scene, the unit of translations.
     """
     return perturbed(viewmats, (twists - twists.mean(0))[view], radius)
 
 
 def with_degree(model: Model, degree: int) -> Model:
-    """With the coefficients of a degree of the spherical harmonics, of zero where they are new."""
+    """The model with spherical harmonics up to a degree; new coefficients are zero."""
     gaussians = model.gaussians
     missing = num_sh_bases(degree) - num_sh_bases(gaussians.sh_degree)
     if missing <= 0:
@@ -93,30 +94,35 @@ def with_degree(model: Model, degree: int) -> Model:
 
 
 def with_slots(model: Model, count: int) -> Model:
-    """With room for so many Gaussians; the new slots hold none."""
+    """The model with at least `count` slots; new ones are empty."""
     more = count - model.gaussians.num
     if more <= 0:
         return model
-    padded = jax.tree.map(
-        lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], more, axis=0)]), model.gaussians
-    )
-    logits = padded.logit_opacities.at[-more:].set(EMPTY_LOGIT)
-    padded = eqx.tree_at(lambda g: g.logit_opacities, padded, logits)
     nudges = jnp.pad(model.nudges, [(0, 0), (0, more), (0, 0)])
-    return Model(padded, nudges, model.exposures, model.twists)
+    return Model(in_slots(model.gaussians, count), nudges, model.exposures, model.twists)
+
+
+def in_slots(gaussians: Gaussians, count: int) -> Gaussians:
+    """The Gaussians in the first of `count` slots, of which the others are empty; padded on the host, where
+    nothing is compiled for it."""
+    rows = np.minimum(np.arange(count), gaussians.num) % gaussians.num  # empty slots hold copies of the first
+    padded = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
+    logits = np.where(np.arange(count) < gaussians.num, padded.logit_opacities, EMPTY_LOGIT)
+    padded = eqx.tree_at(lambda g: g.logit_opacities, padded, logits.astype(padded.logit_opacities.dtype))
+    return jax.tree.map(jnp.asarray, padded)
 
 
 State = TypeVar("State")
 
 
 def carried_over(old: State, fresh: State) -> State:
-    """The state of an optimizer of a larger model, which knows what the old one knew."""
+    """The optimizer state of an enlarged model, with the old state's values where it has them."""
     known = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(old)}
 
-    def of(path, leaf):
+    def filled(path, leaf):
         before = known.get(jax.tree_util.keystr(path))
         if before is None or before.shape == leaf.shape:
             return leaf if before is None else before
-        return leaf.at[tuple(slice(0, size) for size in before.shape)].set(before)
+        return leaf.at[tuple(map(slice, before.shape))].set(before)
 
-    return jax.tree_util.tree_map_with_path(of, fresh)
+    return jax.tree_util.tree_map_with_path(filled, fresh)

@@ -1,4 +1,4 @@
-"""Which Gaussians the photographs need: the light that each of them sends into each view."""
+"""Removal of Gaussians that no photograph needs, by the light that each contributes to each view."""
 
 from functools import partial
 
@@ -17,28 +17,27 @@ from gsjax.scene.render import plan_render, render
 
 
 def needed(light: Float[np.ndarray, "n"], share: float) -> Bool[np.ndarray, "n"]:
-    """All but those that are needed least, which together send at most a share of the light into any view.
+    """All but the least needed Gaussians, which together contribute at most a share of the light of any view.
 
     Args:
         light: from `light_of`.
-        share: of the light, 0 to 1.
+        share: share of the light, 0 to 1.
     """
     order = np.argsort(light, kind="stable")
     kept = np.ones(len(light), bool)
-    kept[order[np.cumsum(light[order], dtype=np.float64) <= share]] = (
-        False  # sums of maxima: no view has more
-    )
+    # The sum of the Gaussians' maxima over views bounds their sum in each view.
+    kept[order[np.cumsum(light[order], dtype=np.float64) <= share]] = False
     return kept
 
 
-def without_needless(
+def prune(
     gaussians: Gaussians, frames: list[Frame], config: FitConfig
 ) -> tuple[Gaussians, Float[np.ndarray, "n"]]:
-    """The Gaussians that some photograph needs, and the light that each of them sends.
+    """The Gaussians that some photograph needs, and the light that each contributes.
 
     Args:
         gaussians: the scene.
-        frames: the photographs that were fitted, of one camera each.
+        frames: the photographs of the fit, with one camera each.
         config: settings of the fit; with `prune` 0 all Gaussians are kept.
     """
     if not gaussians.num:
@@ -51,15 +50,15 @@ def without_needless(
 def light_of(
     gaussians: Gaussians, frames: list[Frame], rasterize_mode: str = "classic"
 ) -> Float[np.ndarray, "n"]:
-    """What share of the scene's light each Gaussian sends, in the view that has the most of it: the largest
-    over views of the sum over pixels of its weight in compositing, w_i = alpha_i T_i, over that of all.
+    """The share of each Gaussian in the light of a view, in the view where it is largest: the sum over pixels
+    of its compositing weight, w_i = alpha_i T_i, divided by that of all Gaussians; the maximum over views.
 
     The sums are the gradient of the composited sum of a feature that is 1 everywhere.
 
     Args:
         gaussians: the scene.
-        frames: all photographs, of one camera each.
-        rasterize_mode: "classic" or "antialiased", as the scene is fitted.
+        frames: all photographs, with one camera each.
+        rasterize_mode: "classic" or "antialiased", as in the fit.
     """
     most, plans = np.zeros(gaussians.num, np.float32), {}
     for frame in frames:

@@ -1,31 +1,30 @@
-"""The first Gaussians: on the data's points, on its depth, or at random before the cameras. On the host."""
+"""The initial Gaussians: from a point cloud, from depth, or at random in front of the cameras. On the
+host."""
 
 import warnings
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from gsjax.methods.fit.config import StartConfig
-from gsjax.optim.densification import EMPTY_LOGIT
+from gsjax.methods.fit.model import in_slots
 from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.initialize import gaussians_from_points, points_from_rgbd
 
-_FEW = 0.1  # share of the points that photographs show, below which something is wrong
-_FLAT_PX = 1.0  # by which cameras shift what they see against each other, below which nothing has a depth
+_FEW = 0.1  # share of visible points below which something is wrong
+_FLAT_PX = 1.0  # disparity between cameras below which there is no depth
 
 
 class Extent(NamedTuple):
-    """Where a scene is.
+    """The location and size of a scene.
 
     Attributes:
         focus: the point nearest to all optical axes.
-        radius: 1.1 times how far cameras stand from their middle, at most; the unit of rates. Where all
-            stand at one place, 1, and the focus is as far ahead.
-        is_point: whether all do.
+        radius: 1.1 times the largest distance of a camera from their centroid, the unit of learning rates; 1
+            if all cameras are at one place, with the focus at that distance ahead of them.
+        is_point: whether all cameras are at one place.
     """
 
     focus: Float[np.ndarray, "3"]
@@ -41,9 +40,9 @@ def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     middle, ahead = centers.mean(0), axes.mean(0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
-    if spread <= 1e-6 * max(1.0, float(np.abs(centers).max())):  # nothing says how far away things are
+    if spread <= 1e-6 * max(1.0, float(np.abs(centers).max())):  # distances are unknown
         return Extent(middle + ahead, 1.0, is_point=True)
-    # Parallel axes meet nowhere: then the point one radius ahead of the middle is as good as any.
+    # Parallel axes do not meet: a weak prior for the point one radius ahead of the centroid.
     weak = 1e-3 * np.eye(3) * len(centers)
     total = np.einsum("nij,nj->i", across, centers) + weak @ (middle + ahead * spread)
     return Extent(np.linalg.solve(across.sum(0) + weak, total), 1.1 * spread)
@@ -52,16 +51,16 @@ def extent_of(viewmats: Float[np.ndarray, "n 4 4"]) -> Extent:
 def start_points(
     frames: list[Frame], cloud: tuple[np.ndarray, np.ndarray] | None, config: StartConfig, seed: int
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], str]:
-    """Points and their colours, and where they come from.
+    """Points, their colours, and their source.
 
     Args:
-        cloud: points and their colours: the data's own, or, where `config.source` says so, those of matches.
         frames: the photographs.
-        config: which source, and how many points.
-        seed: of what is drawn at random.
+        cloud: points and their colours: those of the data or, if `config.source` is "matches", matched ones.
+        config: the source, and the number of points.
+        seed: random seed.
 
     Raises:
-        ValueError: the source that is asked for is not there.
+        ValueError: the requested source is not available.
     """
     random = np.random.default_rng(seed)
     has_depth = any(frame.known_depths[0].any() for frame in frames)
@@ -73,7 +72,7 @@ def start_points(
         source = "cloud" if is_seen else "depth" if has_depth else "random"
     if source in ("cloud", "matches"):
         if cloud is None:
-            lacks = "the data has no points" if source == "cloud" else "photographs share nothing"
+            lacks = "the data has no points" if source == "cloud" else "no points were matched"
             raise ValueError(f"start.source: {lacks}; use depth, random or auto")
         return *cloud, source
     if source == "depth":
@@ -84,7 +83,7 @@ def start_points(
 
 
 def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
-    """Whether photographs show any of the points; a warning where they show few."""
+    """Whether any of the points is visible in a photograph; warns if few are."""
     seen, disparities = np.zeros(len(points), bool), np.zeros(len(points))
     extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
     for frame in frames:
@@ -111,7 +110,7 @@ def _is_seen(points: Float[np.ndarray, "m 3"], frames: list[Frame]) -> bool:
 
 
 def _from_depth(frames, count, random):
-    """Pixels with depth, as many from each frame."""
+    """Points of random pixels with depth, equally many from each frame."""
     each = -(-count // len(frames))
     points, colors = [], []
     for frame in frames:
@@ -126,7 +125,8 @@ def _from_depth(frames, count, random):
 
 
 def _at_random(frames, count, random):
-    """Pixels of the frames at depths about that of what they look at, each coloured as its pixel is."""
+    """Random pixels of the frames, at random depths around that of the focus, with the colours of the
+    pixels."""
     extent = extent_of(np.concatenate([frame.cameras.viewmat for frame in frames]))
     points, colors = np.zeros((count, 3)), np.zeros((count, 3))
     chosen: Int[np.ndarray, "count"] = random.integers(len(frames), size=count)
@@ -136,33 +136,29 @@ def _at_random(frames, count, random):
         row, column = random.integers(height, size=len(rows)), random.integers(width, size=len(rows))
         rotation, shift = frame.cameras.viewmat[0][:3, :3], frame.cameras.viewmat[0][:3, 3]
         middle = max(float((rotation @ extent.focus + shift)[2]), 0.3 * extent.radius)
-        depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))  # even in disparity, 0.4 to 4 times as far
-        rays = (
-            np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1)
-            @ np.linalg.inv(frame.cameras.K[0]).T
-        )
+        # Uniform in disparity, from 0.4 to 4 times the depth of the focus.
+        depth = middle / random.uniform(1 / 4, 1 / 0.4, len(rows))
+        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(rows))], axis=-1)
+        rays = pixels @ np.linalg.inv(frame.cameras.K[0]).T
         points[rows] = (rays * depth[:, None] - shift) @ rotation
         colors[rows] = frame.images[0][row, column] / 255
     return points, colors
 
 
-def in_slots(points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int) -> Gaussians:
-    """Spheres on the points (some of them, where there are more than slots), and empty slots behind them.
+def initial_gaussians(
+    points: np.ndarray, colors: np.ndarray, slots: int, config: StartConfig, seed: int
+) -> Gaussians:
+    """Spheres at the points, or at a random subset if these are more than slots, followed by empty slots.
 
     Args:
-        points: [M, 3].
+        points: [M, 3], metres.
         colors: [M, 3], 0 to 1.
-        slots: how many Gaussians there may ever be.
-        config: their opacity and scale.
-        seed: of which points are taken.
+        slots: number of slots.
+        config: opacity and scale.
+        seed: random seed.
     """
     if len(points) > slots:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:slots])
         points, colors = points[chosen], colors[chosen]
     started = gaussians_from_points(points, colors, opacity=config.opacity, scale_factor=config.scale)
-    rest = slots - started.num
-    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[:1], rest, axis=0)]), started)
-    logits = np.asarray(padded.logit_opacities).copy()
-    logits[started.num :] = EMPTY_LOGIT
-    fields = {name: jnp.asarray(getattr(padded, name)) for name in ("means", "quats", "log_scales", "sh0")}
-    return Gaussians(**fields, logit_opacities=jnp.asarray(logits))
+    return in_slots(started, slots)

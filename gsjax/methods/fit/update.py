@@ -1,6 +1,5 @@
-"""One step of the fit: draw a view, compare, descend. From time to time Gaussians go where they are needed,
-as in 3DGS-MCMC (relocation and noise) or as in 3DGS (cloning, splitting, pruning).
-"""
+"""One step of the fit, and densification: relocation and noise as in 3DGS-MCMC, or cloning, splitting and
+pruning as in 3DGS."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,19 +22,19 @@ from gsjax.scene.frame import Frame
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.render import render
 
-_FINAL_RATE = 0.01  # of means and twists, over the first
+_FINAL_RATE = 0.01  # learning rates of means and twists in the last step, relative to the first
 
 
 class Batch(NamedTuple):
-    """What a step is given.
+    """The input of a step.
 
     Attributes:
         frame: the photograph, of one camera, RGB in bytes.
-        view: which of the photographs it is.
+        view: index of the photograph.
         background: RGB behind the scene, 0 to 1.
-        progress: how far the fit is, 0 to 1, by which rates fall.
-        radius: of the scene, the unit in which means and cameras move and depth counts.
-        plan: to draw with.
+        progress: share of the fit that is done, 0 to 1, over which learning rates fall.
+        radius: radius of the scene, the unit of learning rates and of the depth loss.
+        plan: the render plan.
     """
 
     frame: Frame
@@ -47,13 +46,13 @@ class Batch(NamedTuple):
 
 
 def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
-    """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the difference in depth, and under relocation what
-    opacity and size cost (3DGS-MCMC, eq. 10), of one photograph.
+    """`loss(model, batch, *, step, key)`: L1 and D-SSIM, the depth error, and with relocation the costs of
+    opacity and scale (3DGS-MCMC, eq. 10), for one photograph.
 
     Args:
-        config: its weights.
-        extra_losses: given the `Model`, how it was drawn, and the photograph; what does not count is drawn as
-            photographed.
+        config: the weights.
+        extra_losses: custom losses of the `Model`, its rendering, and the photograph; masked pixels are
+            rendered as photographed.
     """
 
     def loss(model: Model, batch: Batch, *, step: Any, key: Any):
@@ -62,14 +61,14 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
         if model.twists is not None:
             viewmat = refined(camera.viewmat, model.twists, batch.view, radius)
             camera = eqx.tree_at(lambda c: c.viewmat, camera, viewmat)
-        # By half a picture, so that one threshold of the pull serves pictures of any size.
+        # Relative to half the image, so that one threshold suits images of any size.
         nudges = model.nudges * jnp.array([camera.width / 2, camera.height / 2], model.nudges.dtype)
         drawn = render(gaussians, camera, batch.plan, backgrounds=batch.background, means2d_offset=nudges)
         image = drawn.colors
         if model.exposures is not None:
             image = exposed(image, model.exposures, batch.view)
         target = frame.colors
-        if frame.masks is not None:  # what does not count is as it was photographed: no slope, no edge
+        if frame.masks is not None:  # masked pixels are as photographed: no gradient, no edge
             image = jnp.where(frame.masks[..., None], image, target)
         value = photometric_loss(image, target, config.dssim_weight)
         counted = 1.0 if frame.masks is None else frame.masks.mean()
@@ -101,28 +100,28 @@ def fit_loss(config: FitConfig, extra_losses: ExtraLosses = ()) -> Callable:
 
 
 def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
-    """Adam on a `Model`, and under relocation the walk of 3DGS-MCMC.
+    """Adam on a `Model`, and with relocation the noise of 3DGS-MCMC.
 
-    `batch` is a `Batch`; `key` is used by the walk; `step` is not, for rates fall with `batch.progress`.
-    `info` has `psnr` and `alive` beside what every step reports.
+    `batch` is a `Batch`; `key` is used by the noise; `step` is not used, as rates depend on `batch.progress`.
+    `info` has `psnr` and `alive` in addition to what every step reports.
 
     Args:
-        config: of the fit.
-        extra_losses: custom losses (`gsjax.losses.extra`) beside that of photographs.
+        config: settings.
+        extra_losses: custom losses (`gsjax.losses.extra`), added to that of the photographs.
     """
     named_losses(extra_losses)
     rates = vars(config.rates)
     loss = fit_loss(config, extra_losses)
 
-    def of(model: Model) -> Step:
-        there = [name for name in rates if getattr(model.gaussians, name, None) is not None]
-        there += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
-        # Means and twists go as far as Adam's rate of 1 says, and then only a share of it, which falls.
-        ours = {name: 1.0 if name in ("means", "twists") else rates[name] for name in there}
-        return gradient_step(loss, per_field_adam(ours, others={"nudges": watch_pull()}))
+    def adam_step(model: Model) -> Step:
+        present = [name for name in rates if getattr(model.gaussians, name, None) is not None]
+        present += [name for name in ("exposures", "twists") if getattr(model, name) is not None]
+        # Means and twists move at a rate of 1 here, of which `update` takes a share that falls over the fit.
+        used = {name: 1.0 if name in ("means", "twists") else rates[name] for name in present}
+        return gradient_step(loss, per_field_adam(used, others={"nudges": watch_pull()}))
 
     def update(params: Model, state, batch: Batch, *, step, key: PRNGKeyArray):
-        moved, new_state, info = of(params).update(params, state, batch, step=step, key=key)
+        moved, new_state, info = adam_step(params).update(params, state, batch, step=step, key=key)
         radius, fall = batch.radius, _FINAL_RATE**batch.progress
         rate = rates["means"] * radius * fall
         before, after = params.gaussians, moved.gaussians
@@ -139,7 +138,7 @@ def fit_step(config: FitConfig, extra_losses: ExtraLosses = ()) -> Step:
         alive = is_alive(params.gaussians).sum()
         return params, state, info | {"alive": alive, "skipped": info["skipped"] | ~sound}
 
-    return Step(lambda params: of(params).init(params), update)
+    return Step(lambda params: adam_step(params).init(params), update)
 
 
 def grow(
@@ -148,39 +147,39 @@ def grow(
     key: PRNGKeyArray,
     cap: Int[Array, ""] | int,
     factor: float,
-    all_looked: Bool[Array, ""] | bool,
+    all_seen: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
-    """Dead Gaussians move to where more are needed, and there may be `factor` times as many, up to `cap`.
-    Where all photographs looked since the last time, those that none has seen count as dead.
+    """Relocates dead Gaussians, and grows their number by `factor`, up to `cap`.
 
     Args:
-        model: what is learned.
-        state: of the optimizer, with what it knows of pulls.
-        key: says who is copied.
-        cap: of Gaussians.
-        factor: 1 or more.
-        all_looked: whether all photographs did.
+        model: the parameters.
+        state: state of the optimizer, with the pulls.
+        key: random key of the relocation.
+        cap: largest number of Gaussians.
+        factor: growth, 1 or more.
+        all_seen: whether all photographs were used since the last time, so that Gaussians that none of them
+            sees count as dead.
     """
-    gaussians, pull = _without_unseen(model.gaussians, state, all_looked), _pull_of(state)
+    gaussians, pull = _without_unseen(model.gaussians, state, all_seen), _pull_of(state)
     used = jnp.max(jnp.where(is_alive(gaussians), jnp.arange(gaussians.num) + 1, 0))
     slots = jnp.clip(jnp.ceil(used * factor).astype(jnp.int32), used, cap)
     moved, touched = relocate(gaussians, key, slots)
     state = _map_nodes(Gaussians, lambda known: reset_rows(known, touched), state)
-    seen = jnp.where(all_looked, 0.0, jnp.where(touched, 1.0, pull.seen))  # who is new cannot have been seen
+    seen = jnp.where(all_seen, 0.0, jnp.where(touched, 1.0, pull.seen))  # new ones cannot have been seen
     state = _map_nodes(Pull, lambda pull: Pull(pull.total, seen), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
 
 
 def slots_wanted(model: Model, state: Any, config: FitConfig) -> Int[Array, ""]:
-    """How many slots `split` would fill if there were enough.
+    """The number of slots that `split` would fill if there were enough.
 
     Args:
-        model: what is learned.
-        state: of the optimizer, with what it knows of pulls.
-        config: with the threshold of pulls.
+        model: the parameters.
+        state: state of the optimizer, with the pulls.
+        config: the threshold of pulls.
     """
-    asks = strongly_pulled(model.gaussians, _pull_of(state), config.split.pull)
-    return is_alive(model.gaussians).sum() + asks.sum()
+    pulled = strongly_pulled(model.gaussians, _pull_of(state), config.split.pull)
+    return is_alive(model.gaussians).sum() + pulled.sum()
 
 
 def split(
@@ -191,24 +190,24 @@ def split(
     radius: float,
     reset: Bool[Array, ""] | bool,
     pruning: Bool[Array, ""] | bool,
-    all_looked: Bool[Array, ""] | bool,
+    all_seen: Bool[Array, ""] | bool,
 ) -> tuple[Model, Any]:
-    """Gaussians that are pulled hard are cloned or split, others pruned, and what was known of pulls is
-    forgotten.
+    """Clones or splits Gaussians with large pulls, prunes others, and resets the pulls.
 
     Args:
-        model: what is learned.
-        state: of the optimizer, with what it knows of pulls.
-        key: says where halves go.
+        model: the parameters.
+        state: state of the optimizer, with the pulls.
+        key: random key for the positions of the halves.
         config: thresholds.
-        radius: of the scene: what sizes are counted in.
-        reset: lower opacities.
-        pruning: prune what is too large.
-        all_looked: all photographs looked since the last time, so those that none has seen are pruned too.
+        radius: radius of the scene, the unit of scales.
+        reset: whether to lower all opacities.
+        pruning: whether to prune Gaussians that are too large.
+        all_seen: whether all photographs were used since the last time, so that Gaussians that none of them
+            sees are pruned too.
     """
     options, pull = config.split, _pull_of(state)
     moved, touched = divide(
-        _without_unseen(model.gaussians, state, all_looked),
+        _without_unseen(model.gaussians, state, all_seen),
         pull,
         key,
         config.cap,
@@ -218,36 +217,35 @@ def split(
     )
     moved = keep_if(jnp.asarray(reset), reset_opacities(moved), moved)
     every = jnp.full_like(touched, True)
-    state = _map_nodes(Gaussians, lambda known: reset_rows(known, touched), state)
-    state = _map_nodes(Gaussians, lambda known: _forget_opacities(known, every & reset), state)
-    state = _map_nodes(Pull, lambda known: reset_rows(known, every), state)
+
+    def reset_moments(moments: Gaussians) -> Gaussians:
+        moments = reset_rows(moments, touched)
+        logits = reset_rows(moments.logit_opacities, every & reset)
+        return eqx.tree_at(lambda g: g.logit_opacities, moments, logits, is_leaf=_is_masked)
+
+    state = _map_nodes(Gaussians, reset_moments, state)
+    state = _map_nodes(Pull, lambda pull: reset_rows(pull, every), state)
     return eqx.tree_at(lambda m: m.gaussians, model, moved), state
 
 
-def _without_unseen(gaussians: Gaussians, state: Any, all_looked: Any) -> Gaussians:
-    """What no photograph sees, because it is hidden or outside of all, becomes an empty slot."""
-    unseen = all_looked & (_pull_of(state).seen == 0)
+def _without_unseen(gaussians: Gaussians, state: Any, all_seen: Any) -> Gaussians:
+    """The Gaussians, with those that no photograph sees turned into empty slots."""
+    unseen = all_seen & (_pull_of(state).seen == 0)
     logits = jnp.where(unseen, EMPTY_LOGIT, gaussians.logit_opacities)
     return eqx.tree_at(lambda g: g.logit_opacities, gaussians, logits)
 
 
 def _map_nodes(kind: type, function: Callable, tree: Any) -> Any:
-    """`function` of all nodes of a kind; everything else as it was."""
+    """The tree with `function` applied to all nodes of a kind."""
 
-    def is_it(node):
+    def is_kind(node):
         return isinstance(node, kind)
 
-    return jax.tree.map(lambda node: function(node) if is_it(node) else node, tree, is_leaf=is_it)
-
-
-def _forget_opacities(known: Gaussians, rows: Bool[Array, "n"]) -> Gaussians:
-    return eqx.tree_at(
-        lambda g: g.logit_opacities, known, reset_rows(known.logit_opacities, rows), is_leaf=_is_masked
-    )
+    return jax.tree.map(lambda node: function(node) if is_kind(node) else node, tree, is_leaf=is_kind)
 
 
 def _is_masked(node: Any) -> bool:
-    """Whether it stands for a field that another part of the optimizer looks after."""
+    """Whether a node stands for a field that another part of the optimizer handles."""
     return isinstance(node, optax.MaskedNode)
 
 

@@ -2,20 +2,24 @@
 
 anchor = choose_anchor(sequence.image, sequence.num_frames, sequence.num_cameras)
 moved = moved_pixels(sequence.image, anchor, sequence.num_cameras)
-start = begin(sequence, gaussians, anchor, moved, config, segmenter, key)  # gaussians: as at the anchor
+start = begin(sequence, gaussians, anchor, moved, config, segmenter, key)  # the anchor's Gaussians
 method = Parts(config)
 problem, run = method.start(sequence, start)
 for now in drive(method, problem, run): ...
 now.result.weights, now.result.poses(t), now.result.joints()
 
-config.py    what can be set              method.py     what the loop has to know
-anchor.py    which frame is canonical     pictures.py   what steps see
-masks.py     what moves in every view     stream.py     one step of a frame
-lift.py      from masks to Gaussians      refine.py     one step of all frames together
-weights.py   the field of weights         update.py     the two as one step
-discover.py  all that, before any motion  discovery.py  from frame to frame; parts become one or two
-unify.py     which parts are one          finish.py     what no picture needs is given up
-joints.py    what explains a motion       result.py     the outcome, which edits work on
+config.py     settings                            method.py      the method, for the loop
+anchor.py     the canonical frame                 pictures.py    the pictures that steps use
+masks.py      masks in every view                 stream.py      the step of a frame
+lift.py       from masks to Gaussians             refine.py      the step over all frames, and both as one
+weights.py    the field of skinning weights       discovery.py   from frame to frame; parts join and divide
+discover.py   the start, from all of these        finish.py      removal of unneeded parts
+unify.py      which parts join or divide          result.py      scene, trajectory and joints
+trajectory.py parts over time                     screws.py      poses as rigid motions
+edits.py      edits of trajectories               film.py        layers rendered together
+entries.py    checked entries of scripts          operation.py   base classes of operations
+operations.py the operations of scripts           timeline.py    scripts, and the films that they make
+limits.py     how far edits leave the observed    residual.py    the loss as residuals
 """
 
 from gsjax.methods.parts.anchor import Anchor, choose_anchor, moved_pixels
@@ -28,13 +32,13 @@ from gsjax.methods.parts.config import (
 )
 from gsjax.methods.parts.discover import Start, begin
 from gsjax.methods.parts.discovery import Discovery, order_of_frames
-from gsjax.methods.parts.finish import outcome, without_needless
-from gsjax.methods.parts.joints import joints_of, motions_in_world
-from gsjax.methods.parts.masks import masks_of_labels
+from gsjax.methods.parts.finish import prune_parts, scene_and_trajectory
+from gsjax.methods.parts.masks import masks_from_labels
 from gsjax.methods.parts.method import Parts
 from gsjax.methods.parts.pictures import Problem
 from gsjax.methods.parts.refine import RefineBatch, RefineParams, refine_step
-from gsjax.methods.parts.result import PartsResult
+from gsjax.methods.parts.refine import parts_step as step
+from gsjax.methods.parts.result import PartsResult, motions_in_world
 from gsjax.methods.parts.stream import (
     Canonical,
     PosedScene,
@@ -53,7 +57,6 @@ from gsjax.methods.parts.trajectory import (
     still,
     trajectory_of,
 )
-from gsjax.methods.parts.update import parts_step as step
 
 __all__ = [
     "BACKGROUND",
@@ -80,18 +83,17 @@ __all__ = [
     "begin",
     "choose_anchor",
     "gaussians_at",
-    "joints_of",
-    "masks_of_labels",
+    "masks_from_labels",
     "moment",
     "motions_in_world",
     "moved_pixels",
     "order_of_frames",
-    "outcome",
+    "prune_parts",
     "refine_step",
+    "scene_and_trajectory",
     "step",
     "still",
     "stream_loss",
     "stream_step",
     "trajectory_of",
-    "without_needless",
 ]

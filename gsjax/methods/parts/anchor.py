@@ -11,12 +11,11 @@ from jaxtyping import Bool, Float
 Load = Callable[[int, int], np.ndarray]
 """(frame, camera) -> RGB picture, uint8."""
 
-_WIDTH = 96  # width of the pictures by which frames are compared, pixels
-_BLUR = 1.0  # pixels; what a camera's noise and a hard edge's aliasing make is no motion
-_NOISE_FACTOR = 4.0  # times the noise; a larger difference is not noise
-_MOST_FRAMES = 16  # that are compared with the anchor at full size
-LEAST_MOVED = 1e-3
-"""Share of the pixels that must change for anything to have moved."""
+_WIDTH = 96  # pixels of the thumbnails by which frames are compared
+_BLUR = 1.0  # pixels; suppresses camera noise and the aliasing of hard edges
+_NOISE_FACTOR = 4.0  # differences above this many times the noise level are motion
+_MOST_FRAMES = 16  # compared with the anchor at full size
+_LEAST_MOVED = 1e-3  # share of the pixels that must change for anything to have moved
 
 
 class Anchor(NamedTuple):
@@ -34,18 +33,18 @@ class Anchor(NamedTuple):
 
 
 def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = None) -> Anchor:
-    """The frame with the largest mean I_d to all others, unless one is given.
+    """Choose the frame with the largest mean I_d to all others.
 
-    Warns with UserWarning where the given one differs from the others by less than half of what the best
-    does: its parts are then hard to tell from what stands still.
+    Warns with UserWarning if the given frame differs from the others by less than half as much as the best
+    one does: its parts are then hard to distinguish from the static background.
 
     Args:
-        load: pictures.
-        frames, cameras: how many there are.
-        anchor: the frame to take.
+        load: loads a picture.
+        frames, cameras: their numbers.
+        anchor: the frame to use; default: the one that differs most.
 
     Raises:
-        ValueError: there is one frame only, or no such frame as the one given.
+        ValueError: there is only one frame, or `anchor` is not a frame.
     """
     if frames < 2:
         raise ValueError(f"frames: expected at least 2, between which something moves, found {frames}")
@@ -59,7 +58,7 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
     if apart[chosen].mean() < 0.5 * apart[best].mean():
         warnings.warn(
             f"anchor: frame {chosen} differs from the others by {apart[chosen].mean():.3f} on average, frame "
-            f"{best} by {apart[best].mean():.3f}; parts that hardly move from the anchor are found badly",
+            f"{best} by {apart[best].mean():.3f}; parts that hardly move from the anchor are found poorly",
             stacklevel=2,
         )
     return Anchor(chosen, int(apart[chosen].argmax()), apart[chosen])
@@ -68,16 +67,17 @@ def choose_anchor(load: Load, frames: int, cameras: int, anchor: int | None = No
 def moved_pixels(
     load: Load, anchor: Anchor, cameras: int, *, frames: int | None = None, threshold: float = 0.06
 ) -> Bool[np.ndarray, "C H W"]:
-    """Which pixels of the anchor's pictures show something else in another frame: I_d above a threshold, or
-    above four times the noise where there is more of that.
+    """The pixels of the anchor's pictures that change in other frames: I_d exceeds a threshold, or four times
+    the noise level if that is higher.
 
     Args:
-        load: pictures.
+        load: loads a picture.
         anchor: from `choose_anchor`.
-        cameras: how many there are.
-        frames: how many other frames are compared, spread over all; 1 is the one that differs most, as in
-            the paper, in which what comes back to where it was is not seen to move. Default: 16.
-        threshold: of colours from 0 to 1.
+        cameras: number of cameras.
+        frames: number of other frames to compare, spread over the recording; default: 16. With 1, as in the
+            paper, only the frame that differs most is compared, so objects that return to their places are
+            missed.
+        threshold: least difference of colours, which range from 0 to 1.
 
     Raises:
         ValueError: nothing moves.
@@ -87,7 +87,7 @@ def moved_pixels(
     others = {anchor.farthest} if frames == 1 else {*spread.tolist(), anchor.farthest} - {anchor.frame}
     beside = [t for t in (anchor.frame - 1, anchor.frame + 1) if 0 <= t < count]
     heres = [_blurred(load(anchor.frame, c)) for c in range(cameras)]
-    # Half of a picture stands still from frame to frame: what it differs by is noise.
+    # At least half of a picture is static between adjacent frames, so the median difference is noise.
     steps = [
         np.median(difference_image(_blurred(load(t, c)), heres[c])) for c in range(cameras) for t in beside
     ]
@@ -96,10 +96,10 @@ def moved_pixels(
         largest = np.max([difference_image(_blurred(load(t, c)), here) for t in sorted(others)], axis=0)
         moved.append(largest > limit)
     share = np.mean(moved)
-    if share < LEAST_MOVED:
+    if share < _LEAST_MOVED:
         raise ValueError(
             f"frames: expected something that moves, found {share:.3%} of the pixels of frame {anchor.frame} "
-            f"to change by {limit:.2g} of the range or more; choose other frames, or a lower threshold"
+            f"changing by {limit:.2g} of the range or more; choose other frames or a lower threshold"
         )
     return np.stack(moved)
 

@@ -1,4 +1,4 @@
-"""From a canonical scene and synchronised views to pieces that may move: how a discovery begins."""
+"""The start of a discovery: from a canonical scene and synchronised views to candidate parts."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from gsjax.geometry.cameras import Camera
 from gsjax.methods.parts.anchor import Anchor
 from gsjax.methods.parts.config import PartsConfig
 from gsjax.methods.parts.lift import label_votes, lift_masks
-from gsjax.methods.parts.masks import order_of_views, propagated_masks
+from gsjax.methods.parts.masks import propagate_masks, view_order
 from gsjax.methods.parts.stream import Canonical
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.parts.weights import Field, fit_field_to_weights, new_field
@@ -22,22 +22,22 @@ from gsjax.scene.frame import Frame, one_camera
 from gsjax.scene.gaussians import Gaussians, take
 from gsjax.scene.render import plan_render, render
 
-_SURELY_FIXED = 0.9  # share of the background above which a Gaussian stays fixed ...
-_NEAR = 3.0  # ... unless something that moves is this near, in typical distances between Gaussians
+_SURELY_FIXED = 0.9  # background weight above which a Gaussian is fixed ...
+_NEAR = 3.0  # ... unless a moving one is this near, in typical distances between Gaussians
 _NEIGHBORS = 8
-_LEAST_SHOWN = 0.3  # share of a pixel that shows one label of earlier views, for it to take that label
+_LEAST_SHOWN = 0.3  # share of a pixel that must show a label of earlier views for it to take that label
 
 
 class Start(NamedTuple):
-    """What is known before anything is followed.
+    """The start of a discovery, before any frame is tracked.
 
     Attributes:
         anchor: the canonical frame.
-        order: rows of the given Gaussians, those that may move first.
+        order: rows of the given Gaussians, movable ones first.
         canonical: the scene in that order.
-        field: of skinning weights, fitted to what was lifted.
-        masks: pieces that changed, in every view of the anchor frame, [C,H,W].
-        losses: of lifting the masks (`lifting`) and of fitting the field (`warming`).
+        field: the skinning weights, fitted to the lifted masks.
+        masks: candidate parts in every view of the anchor frame, [C,H,W].
+        losses: losses of lifting the masks (`lifting`) and of fitting the field (`warming`).
     """
 
     anchor: Anchor
@@ -58,27 +58,26 @@ def begin(
     key: PRNGKeyArray,
     masks: Int[np.ndarray, "C H W"] | None = None,
 ) -> Start:
-    """Pieces that may move: what changed against the anchor's pictures, lifted to the scene's Gaussians.
+    """Candidate parts: image regions that differ from the anchor's pictures, lifted to the scene's Gaussians.
 
     Args:
-        sequence: what synchronised cameras saw.
+        sequence: the recording of synchronised cameras.
         gaussians: the scene at the anchor frame, as `gsjax.methods.fit` fits it.
         anchor: from `choose_anchor`.
         moved: from `moved_pixels`.
         config: settings.
-        segmenter: finds what belongs together in a picture; not used where masks are given.
-        key: random key of the field's first values.
-        masks: labels of the pieces in every view, where they are known.
+        segmenter: finds the segments of a picture; not used if masks are given.
+        key: random key for the initial values of the field.
+        masks: labels of the candidate parts in every view, if known.
 
     Raises:
-        ValueError: there is one camera only, next to no Gaussian, or nothing that may move.
+        ValueError: there is only one camera, there are too few Gaussians, or nothing may move.
     """
     if sequence.num_cameras < 2:
-        raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in space")
+        raise ValueError("cameras: expected at least 2, synchronised, found 1; parts are found in 3D")
     if gaussians.num <= _NEIGHBORS:
         raise ValueError(
-            f"gaussians: expected a scene of more than {_NEIGHBORS}, found {gaussians.num}; fit one to the "
-            "anchor frame"
+            f"gaussians: expected more than {_NEIGHBORS}, found {gaussians.num}; fit the anchor frame first"
         )
     frame = sequence.frame(anchor.frame)
     plan = plan_render(gaussians, frame.cameras, headroom=config.headroom)
@@ -87,10 +86,10 @@ def begin(
             moved = np.ones_like(moved)
         if segmenter is None:
             raise ValueError("segmenter, masks: expected one of them, found none")
-        masks = find_masks(sequence, gaussians, frame, plan, anchor, moved, config, segmenter)
+        masks = _find_masks(sequence, gaussians, frame, plan, anchor, moved, config, segmenter)
     if not (masks > 0).any():
         raise ValueError(
-            "masks: expected a piece of which a third changed in other frames, found none; choose another "
+            "masks: expected a segment of which a third changes in other frames, found none; choose another "
             "anchor, a lower discover.threshold, or discover.difference off"
         )
     slots = config.discover.most_parts + 1
@@ -103,7 +102,7 @@ def begin(
     labels = weights.argmax(-1)
     if not (labels != BACKGROUND).any():
         raise ValueError(
-            f"gaussians: expected some that show the {masks.max()} pieces that changed, found none among "
+            f"gaussians: expected some that show the {masks.max()} segments that changed, found none among "
             f"{gaussians.num}; is this the scene at frame {anchor.frame}?"
         )
     movable, fixed = take(gaussians, order[:count]), take(gaussians, order[count:])
@@ -128,7 +127,7 @@ def begin(
     return Start(anchor, order, canonical, field, masks, losses)
 
 
-def find_masks(
+def _find_masks(
     sequence: SequenceLike,
     gaussians: Gaussians,
     frame: Frame,
@@ -138,29 +137,17 @@ def find_masks(
     config: PartsConfig,
     segmenter: Segmenter,
 ) -> Int[np.ndarray, "C H W"]:
-    """Labels of what changed, the same ones in all views; see `gsjax.methods.parts.masks`.
-
-    Args:
-        sequence: the recording.
-        gaussians, plan: the canonical scene, and the plan that it is drawn with.
-        frame: the anchor's pictures.
-        anchor: which frame that is.
-        moved: pixels that changed.
-        config: settings.
-        segmenter: finds masks in one picture.
-    """
+    """Labels of the segments that changed, which agree between views; see `gsjax.methods.parts.masks`."""
     drawn = [render(gaussians, one_camera(frame.cameras, c), plan) for c in range(sequence.num_cameras)]
     depths = np.stack([np.where(np.asarray(d.alphas[0]) > 0.5, np.asarray(d.depths[0]), 0.0) for d in drawn])
     pictures = [sequence.image(anchor.frame, c) for c in range(sequence.num_cameras)]
     first = int(moved.mean((1, 2)).argmax())
-    order = order_of_views(
-        np.asarray(frame.cameras.viewmat), first, np.median(np.asarray(gaussians.means), 0)
-    )
-    room = 4 * config.discover.most_parts  # labels that views use before the smallest are dropped
+    order = view_order(np.asarray(frame.cameras.viewmat), first, np.median(np.asarray(gaussians.means), 0))
+    room = 4 * config.discover.most_parts  # labels before the smallest are dropped
     total = np.zeros((gaussians.num, room), np.float32)
 
     def known(c: int, last: int, mask: Int[np.ndarray, "H W"]) -> Int[np.ndarray, "H W"]:
-        """Labels of view c by what earlier views have named, of which the last is new."""
+        """Labels of view c implied by earlier views, of which `last` is the newest."""
         nonlocal total
         total += label_votes(gaussians, one_camera(frame.cameras, last), plan, mask[None], room)
         sums = total.sum(-1, keepdims=True)
@@ -170,7 +157,7 @@ def find_masks(
         shown = np.asarray(drawn[0])
         return np.where(shown.max(-1) > _LEAST_SHOWN, shown.argmax(-1), -1)
 
-    return propagated_masks(
+    return propagate_masks(
         pictures,
         depths,
         np.asarray(frame.cameras.K),
@@ -186,12 +173,12 @@ def find_masks(
 def centers_of(
     means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], slots: int
 ) -> Float[np.ndarray, "P 3"]:
-    """The centroid of each part's Gaussians, metres; that of all for a part that has none.
+    """The centroid of each part's Gaussians, metres; that of all Gaussians for a part without any.
 
     Args:
-        means: of the Gaussians, metres.
-        labels: the part of each.
-        slots: how many parts there may be.
+        means: means of the Gaussians, metres.
+        labels: the part of each Gaussian.
+        slots: number of slots for parts.
     """
     centers = np.tile(means.mean(0), (slots, 1))
     for part in np.unique(labels):
@@ -202,12 +189,12 @@ def centers_of(
 def radii_of(
     means: Float[np.ndarray, "M 3"], labels: Int[np.ndarray, "M"], centers: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, "P"]:
-    """How far each part reaches from its handle, root mean square, metres; 1 for a part without Gaussians.
+    """The radius of each part around its handle, root mean square, metres; 1 for a part without Gaussians.
 
     Args:
-        means: of the Gaussians, metres.
-        labels: the part of each.
-        centers: of all parts, metres.
+        means: means of the Gaussians, metres.
+        labels: the part of each Gaussian.
+        centers: centres of all parts, metres.
     """
     squared = np.sum((means - centers[labels]) ** 2, axis=1)
     sums, counts = (np.bincount(labels, w, len(centers)) for w in (squared, np.ones_like(squared)))
@@ -216,7 +203,7 @@ def radii_of(
 
 
 def pixel_width(points: Float[np.ndarray, "n 3"], cameras: Camera) -> float:
-    """What a pixel is wide at points, metres, in the median over cameras."""
+    """The width of a pixel at the depth of the points, metres; the median over cameras."""
     viewmats, Ks = np.asarray(cameras.viewmat), np.asarray(cameras.K)
     depths = np.median(points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3], axis=0)
     return float(np.median(np.maximum(depths, 1e-6) / Ks[:, 0, 0]))
@@ -225,8 +212,8 @@ def pixel_width(points: Float[np.ndarray, "n 3"], cameras: Camera) -> float:
 def _movable_first(
     means: Float[np.ndarray, "N 3"], weights: Float[np.ndarray, "N P"]
 ) -> tuple[Int[np.ndarray, "N"], int]:
-    """Rows in order, those that may move first, and how many these are: what is not surely background, and
-    what lies so near to a piece that its border may run there."""
+    """Row indices, movable Gaussians first, and the number of these: all that are not surely background, or
+    so near to a moving one that the part's border may run there."""
     moves = weights[:, BACKGROUND] < 0.5
     tree = cKDTree(means[moves])
     spacing = np.median(tree.query(means[moves], k=2)[0][:, 1]) if moves.sum() > 1 else 0.0

@@ -1,5 +1,5 @@
-"""How far a discovery is: the scene, which parts there are, and where they were in all frames found so far.
-Now and then parts become one or two (MotionSplicer, section 3.2)."""
+"""The state of a discovery: the scene, its parts, and their poses in all frames found so far. From time to
+time parts are joined or divided (MotionSplicer, section 3.2)."""
 
 from typing import NamedTuple
 
@@ -19,27 +19,28 @@ from gsjax.optim.method import Run
 from gsjax.scene.handles import HandlePose, at_rest
 
 Pairs = tuple[tuple[int, int], ...]
-"""Parts that became one, (part, into which), or two, (new part, of which)."""
-_REWARM = 100  # steps that fit a grid after parts became one, or two
-_REST = 4  # times that divisions are looked for and a part that was divided is left alone
+"""Joined parts, (part, into which), or divided ones, (new part, from which)."""
+_REWARM = 100  # steps that fit a grid after parts were joined or divided
+_REST = 4  # rounds of divisions for which a newly divided part is left alone
 
 
 class Discovery(NamedTuple):
-    """What steps are given, and what changes between frames; `Run.kept` of `gsjax.methods.parts.Parts`.
+    """The state that is constant within a frame and changes between frames; `Run.kept` of
+    `gsjax.methods.parts.Parts`.
 
     Attributes:
-        canonical: the scene and which handles there are.
-        order: rows of the given Gaussians, those that may move first.
+        canonical: the scene and its handles.
+        order: rows of the given Gaussians, movable ones first.
         anchor: the canonical frame.
         quats, translations: poses at all frames, [T,P,4] and [T,P,3]; at rest where not yet found.
-        found: position of each frame in the order in which frames were found; 0 is the anchor, -1 is not yet.
-        born: number of frames that were found when each part's own motion began.
-        rests: number of found frames up to which each part is not divided again.
+        found: rank of each frame in the order of discovery; 0 is the anchor, -1 is not yet found.
+        born: number of found frames when each part's own motion began.
+        rests: number of found frames until which each part is not divided again.
         frame: the frame whose pose is being found, or was found last; -1 before the first.
-        weights: of the movable Gaussians: before `frame`, or, once all frames are found, for good.
-        predicted: where handles were before the first step of `frame`.
-        joined: parts that became one: (part, into which).
-        divided: parts that became two: (new part, of which).
+        weights: weights of the movable Gaussians before `frame`, or the final ones once all frames are found.
+        predicted: poses of the handles before the first step of `frame`.
+        joined: joined parts: (part, into which).
+        divided: divided parts: (new part, from which).
     """
 
     canonical: Canonical
@@ -58,21 +59,21 @@ class Discovery(NamedTuple):
 
     @property
     def done(self) -> Bool[np.ndarray, "T"]:
-        """Which frames were found."""
+        """The frames that were found."""
         return self.found >= 0
 
     @property
     def count(self) -> int:
-        """How many frames were found, the anchor left out."""
+        """Number of frames that were found, without the anchor."""
         return int(self.found.max())
 
     @property
     def is_between_frames(self) -> bool:
-        """Whether the pose of the newest frame is found, or there is none yet."""
+        """Whether no frame is in progress."""
         return self.frame < 0 or bool(self.done[self.frame])
 
     def pose(self, t: int) -> HandlePose:
-        """The pose at frame t; at rest where it is not yet found."""
+        """The pose at frame t; at rest if it is not yet found."""
         return HandlePose(jnp.asarray(self.quats[t]), jnp.asarray(self.translations[t]))
 
     @property
@@ -84,23 +85,23 @@ class Discovery(NamedTuple):
 
 
 def order_of_frames(frames: int, anchor: int) -> list[int]:
-    """Onwards from the anchor to the end, then back from it to the beginning."""
+    """Frames from the anchor to the end, then from the anchor back to the beginning."""
     return [*range(anchor + 1, frames), *reversed(range(anchor))]
 
 
-def first_run(start: Start, frames: int, config: PartsConfig) -> Run:
-    """The run before anything is followed: all parts are at rest.
+def initial_run(start: Start, frames: int, config: PartsConfig) -> Run:
+    """The run before the first frame: all parts are at rest.
 
     Args:
         start: from `begin`.
-        frames: T.
-        config: how parts are followed.
+        frames: T, the number of frames.
+        config: settings.
     """
     slots, count = len(start.canonical.alive), start.canonical.movable.num
     quats = np.zeros((frames, slots, 4), np.float32)
     quats[..., 0] = 1
     nothing, rest = np.zeros(slots, int), at_rest(slots)
-    # Steps give away what they replace, and the start stays whole.
+    # Steps donate the buffers of their inputs, and `start` must survive.
     field = jax.tree.map(jnp.copy, start.field)
     params = StreamParams(rest, field, jnp.zeros((count, 3), start.canonical.movable.means.dtype))
     discovery = Discovery(
@@ -119,26 +120,25 @@ def first_run(start: Start, frames: int, config: PartsConfig) -> Run:
     return Run(params, stream_step(config.stream).init(params), kept=discovery)
 
 
-def opened(run: Run, t: int) -> Run:
-    """The run before the first step of frame t, whose handles go on as from the frame before the last to the
-    last."""
+def open_frame(run: Run, t: int) -> Run:
+    """The run before the first step of frame t, with poses extrapolated from the two frames before it."""
     discovery: Discovery = run.kept
-    way = 1 if t > discovery.anchor else -1
-    before, earlier = discovery.pose(t - way), t - 2 * way
+    direction = 1 if t > discovery.anchor else -1
+    before, earlier = discovery.pose(t - direction), t - 2 * direction
     pose = before
     if 0 <= earlier < len(discovery.done) and discovery.done[earlier]:
         first = discovery.pose(earlier)
         quats = normalize_quats(2 * before.quats - first.quats)
         pose = HandlePose(quats, 2 * before.translations - first.translations)
-    # Steps give away what they replace; what is kept stays whole.
+    # Steps donate the buffers of their inputs, and `kept` must survive.
     weights, predicted = jax.tree.map(jnp.copy, (weights_of_run(run), pose))
     kept = discovery._replace(frame=t, weights=weights, predicted=predicted)
-    return run.having(params=run.params._replace(pose=pose), state=run.state.in_new_frame(), kept=kept)
+    return run.having(params=run.params._replace(pose=pose), state=run.state.for_new_frame(), kept=kept)
 
 
-def closed(run: Run, config: PartsConfig) -> Run:
-    """The run after the last step of its frame: the pose is kept, and where it is time parts become one or
-    two."""
+def close_frame(run: Run, config: PartsConfig) -> Run:
+    """The run after the last step of its frame: the pose is stored, and if it is time, parts are joined and
+    divided."""
     discovery: Discovery = run.kept
     t, quats, translations = discovery.frame, discovery.quats.copy(), discovery.translations.copy()
     found, count = discovery.found.copy(), discovery.count + 1
@@ -146,20 +146,20 @@ def closed(run: Run, config: PartsConfig) -> Run:
     run = run.having(kept=discovery._replace(quats=quats, translations=translations, found=found))
     last = count == len(found) - 1
     if config.unify.every and (count % config.unify.every == 0 or last):
-        run = unify(run, config)
+        run = _unify(run, config)
         if not last:
-            run = split(run, config)
+            run = _split(run, config)
         run = run.having(state=run.state._replace(pulls=jnp.zeros_like(run.state.pulls)))
     return run
 
 
 def weights_of_run(run: Run) -> Float[Array, "M P"]:
-    """The weights of the movable Gaussians by the field of a run that follows parts."""
+    """The weights of the movable Gaussians, from the field of a run that tracks parts."""
     return skinning_weights(run.params.field, run.kept.canonical)
 
 
-def unify(run: Run, config: PartsConfig) -> Run:
-    """The run in which parts that moved alike so far are one from here on, by the larger one's motion."""
+def _unify(run: Run, config: PartsConfig) -> Run:
+    """The run with parts that have moved alike joined, which take the motion of the larger one."""
     discovery: Discovery = run.kept
     weights = np.asarray(weights_of_run(run))
     into = unified(
@@ -171,20 +171,19 @@ def unify(run: Run, config: PartsConfig) -> Run:
         noise_m=config.unify.noise * float(discovery.canonical.pixel),
         tolerance=config.unify.tolerance,
     )
-    after, weights = joined(discovery, weights, into)
+    after, weights = join_parts(discovery, weights, into)
     return run if after is discovery else _refitted(run, after, weights)
 
 
-def joined(
+def join_parts(
     discovery: Discovery, weights: Float[np.ndarray, "M P"], into: Int[np.ndarray, "P"]
 ) -> tuple[Discovery, Float[np.ndarray, "M P"]]:
-    """The discovery and the weights after each part has joined the one that `into` names, itself for those
-    that stay. Slots whose part has no Gaussian left are free again.
+    """The discovery and the weights after joining parts. Slots whose part has no Gaussian left are freed.
 
     Args:
-        discovery: before.
-        weights: of the movable Gaussians.
-        into: a part for each part.
+        discovery: the discovery before.
+        weights: weights of the movable Gaussians.
+        into: the part that each part joins; itself if it stays.
     """
     pairs = tuple((int(p), int(q)) for p, q in enumerate(into) if p != q)
     alive, members = np.asarray(discovery.canonical.alive), np.unique(weights.argmax(-1))
@@ -196,16 +195,16 @@ def joined(
     return _with_parts(discovery, weights, left)._replace(joined=(*discovery.joined, *pairs)), weights
 
 
-def split(run: Run, config: PartsConfig) -> Run:
-    """The run in which the part whose sides are pulled apart most is two from here on, if there is a slot and
-    it is no chance. Both move as the one did, and become one again where they go on to."""
+def _split(run: Run, config: PartsConfig) -> Run:
+    """The run with the part divided whose sides are pulled apart most, if a slot is free and the score is
+    significant. Both sides inherit its motion, and are joined again if they keep moving alike."""
     discovery: Discovery = run.kept
     canonical = discovery.canonical
     weights, alive = np.asarray(weights_of_run(run)), np.asarray(canonical.alive)
     points, pulls = np.asarray(canonical.movable.means), np.asarray(run.state.pulls)
     labels, free, count = weights.argmax(-1), np.flatnonzero(~alive), discovery.count
-    waking = [p for p in np.unique(labels).tolist() if p != BACKGROUND and discovery.rests[p] <= count]
-    cuts = {p: best_cut(points[labels == p], pulls[labels == p]) for p in waking}
+    candidates = [p for p in np.unique(labels).tolist() if p != BACKGROUND and discovery.rests[p] <= count]
+    cuts = {p: best_cut(points[labels == p], pulls[labels == p]) for p in candidates}
     best = max(cuts, key=lambda p: cuts[p].score, default=BACKGROUND)
     if best == BACKGROUND or not len(free) or cuts[best].score < config.unify.least_cut:
         return run
@@ -232,7 +231,7 @@ def split(run: Run, config: PartsConfig) -> Run:
 def _with_parts(
     discovery: Discovery, weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]
 ) -> Discovery:
-    """With these parts, as far as these weights reach."""
+    """The discovery with other living slots, and the radii of parts with these weights."""
     canonical = discovery.canonical
     means, centers = np.asarray(canonical.movable.means), np.asarray(canonical.centers)
     radii = jnp.asarray(radii_of(means, weights.argmax(-1), centers))
@@ -240,7 +239,7 @@ def _with_parts(
 
 
 def _refitted(run: Run, discovery: Discovery, weights: Float[np.ndarray, "M P"]) -> Run:
-    """The run with a field fitted to these weights."""
+    """The run with this discovery and a field fitted to the weights."""
     canonical = discovery.canonical
     field, _ = fit_field_to_weights(
         run.params.field, canonical.located, jnp.asarray(weights), canonical.alive, _REWARM

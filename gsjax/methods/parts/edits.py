@@ -1,15 +1,15 @@
-"""Edits of part motions: pure functions from trajectories to trajectories, which compose as functions do.
+"""Edits of part motions: pure functions from trajectories to trajectories, which compose.
 
-Each takes the parts that it concerns and leaves all others as they are, to the bit. There are two kinds.
+Each edits the given parts and leaves all others unchanged, to the bit. There are two kinds.
 
-- Edits of time (`speed`, `loop`, `freeze`, `isolate`) show parts as they were at other times. What comes
-  after the stretch from `begin` to `end` follows on from there, sooner or later than it did.
-- Edits of place and look (`move`, `rotate`, `redirect`, `amplify`, `scale`, `fade`, `ghost`) hold by a
-  `share`, 0 to 1: one number, or one for each moment, such as `during` gives.
+- Edits of time (`speed`, `loop`, `freeze`, `isolate`) show parts as they were at other times. The motion
+after
+  the interval from `begin` to `end` follows the edited interval, earlier or later than it did.
+- Edits of pose and appearance (`move`, `rotate`, `redirect`, `amplify`, `scale`, `fade`, `ghost`) are applied
+  by a `share`, 0 to 1: one number, or one for each moment, such as `during` returns.
 
-Times are the trajectory's own, which it keeps: what an edit puts after its last moment is not seen. So
-lengthen it first (`at_times`). After MotionSplicer, section 4.2, which names the edits but does
-not say how they are made.
+A trajectory keeps its times: motion that an edit moves past its last moment is cut off, so lengthen it first
+(`at_times`). After MotionSplicer, section 4.2, which names the edits but does not define them.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,20 @@ from gsjax.scene.handles import HandlePose
 
 Scalar = float | Float[Array, ""]
 Share = Scalar | Float[Array, "T"]
-_HIT = 1e-3  # of the time between two moments: what is as near to one of them is that moment
-_INSTANT = 1e-4  # seconds; rounding of times must not decide on which side of a seam a moment falls
+_HIT = 1e-3  # of the time between two moments, within which a time counts as one of them
+_INSTANT = 1e-4  # seconds; so that rounding does not decide on which side of a boundary a moment falls
 
 
-@jax.jit  # one program instead of the hundred that its operations would be, for a new length of a film
+@jax.jit  # one program, instead of a hundred for its operations, for each new length
 def at_times(trajectory: Trajectory, times: Float[Array, "S"]) -> Trajectory:
-    """The same motion at other times.
+    """The same motion, sampled at other times.
 
-    Between two moments a part goes along the screw that leads from one to the other, so what turns about a
-    hinge stays on it; opacities and scales go in proportion. Before the first moment and after the last, all
-    is as it is there. A moment that is hit is taken over to the bit.
+    Between two moments a part moves along the screw from one to the other, so that a part on a hinge stays on
+    it; opacities and scales are interpolated linearly. Before the first moment and after the last, everything
+    is constant. Times of the trajectory itself are reproduced to the bit.
 
     Args:
-        times: seconds, of `trajectory`'s clock, in any order.
+        times: seconds, in any order.
     """
     known = trajectory.times
     last = len(known) - 1
@@ -62,7 +62,7 @@ def at_times(trajectory: Trajectory, times: Float[Array, "S"]) -> Trajectory:
 
 
 def retime(trajectory: Trajectory, parts: Sequence[int], sources: Float[Array, "T"]) -> Trajectory:
-    """At moment i the parts are where, as large as and as visible as they were at `sources[i]`, seconds."""
+    """The trajectory in which the parts at moment i are as they were at time `sources[i]`, seconds."""
     seen = at_times(_only(trajectory, parts), sources)
     return _with(trajectory, parts, seen)
 
@@ -75,20 +75,21 @@ def speed(
     end: float | None = None,
     stay: bool = False,
 ) -> Trajectory:
-    """What parts do from `begin` to `end` goes `factor` times as fast; backwards if that is negative.
+    """Plays the motion from `begin` to `end` `factor` times as fast; backwards if negative.
 
-    The stretch then takes (end - begin) / |factor| seconds; what follows comes so much sooner or later.
+    The interval then takes (end - begin) / |factor| seconds, and the motion after it follows.
 
     Args:
-        begin, end: seconds; default: the whole.
-        stay: nothing follows, and parts stay as they then are; so it is too if no `end` is given.
+        factor: speed, relative to the original.
+        begin, end: seconds; default: the whole trajectory.
+        stay: whether parts stay still after the interval; always so without an `end`.
 
     Raises:
-        ValueError: `factor` is 0 (that is `freeze`), or the stretch is empty.
+        ValueError: `factor` is 0 (use `freeze`), or the interval is empty.
     """
     if factor == 0:
         raise ValueError("factor: expected a number other than 0, found 0; to stop a part, freeze it")
-    start, stop = _stretch(trajectory, begin, end)
+    start, stop = _interval(trajectory, begin, end)
     past, takes = trajectory.times - start, (stop - start) / abs(factor)
     sources = trajectory.times + (abs(factor) - 1) * jnp.clip(past, 0.0, takes)
     if factor < 0:
@@ -107,20 +108,20 @@ def loop(
     bounce: bool = False,
     stay: bool = False,
 ) -> Trajectory:
-    """What parts do from `begin` to `end` is done again and again.
+    """Repeats the motion from `begin` to `end`.
 
     Args:
-        begin, end: seconds; default: the whole.
-        times: number of repetitions before what follows goes on; default: without end.
-        bounce: there and back each time, so that there is no seam.
-        stay: nothing follows, and parts stay as they then are; so it is too if no `end` is given.
+        begin, end: seconds; default: the whole trajectory.
+        times: number of repetitions, after which the motion goes on; default: endless.
+        bounce: play each repetition forwards and backwards, so that there is no jump.
+        stay: whether parts stay still after the repetitions; always so without an `end`.
 
     Raises:
-        ValueError: the stretch is empty, or `times` is less than 1.
+        ValueError: the interval is empty, or `times` is less than 1.
     """
     if times is not None and times < 1:
         raise ValueError(f"times: expected 1 or more, found {times}")
-    start, stop = _stretch(trajectory, begin, end)
+    start, stop = _interval(trajectory, begin, end)
     length = jnp.maximum(stop - start, _INSTANT)
     period = 2 * length if bounce else length
     past, lasts = trajectory.times - start, period * (jnp.inf if times is None else times)
@@ -140,17 +141,17 @@ def freeze(
     begin: float | None = None,
     end: float | None = None,
 ) -> Trajectory:
-    """Parts stand still from `begin` to `end`, as they were at `at`, and then go on from there.
+    """Holds parts from `begin` to `end` as they were at `at`, from where they then continue.
 
     Args:
         at: seconds; default: `begin`.
         begin: seconds; default: `at`, or the first moment.
-        end: seconds; by default they never go on.
+        end: seconds; default: parts never continue.
 
     Raises:
         ValueError: `end` is not after `begin`.
     """
-    start, stop = _stretch(trajectory, at if begin is None else begin, end)
+    start, stop = _interval(trajectory, at if begin is None else begin, end)
     past, held = trajectory.times - start, stop - start
     sources = (start if at is None else at) + jnp.maximum(past - held, 0.0)
     return retime(trajectory, parts, jnp.where(past < 0, trajectory.times, sources))
@@ -163,12 +164,11 @@ def isolate(
     begin: float | None = None,
     end: float | None = None,
 ) -> Trajectory:
-    """Of all motions only those of `parts` go on; the other parts `freeze`. To see nothing else: `ghost`.
+    """Freezes all other parts. To hide them, use `ghost`.
 
     Args:
-        trajectory: of all parts.
-        parts: that go on.
-        at, begin, end: of the others, as for `freeze`, seconds.
+        parts: indices of the parts that keep moving.
+        at, begin, end: as for `freeze`, seconds.
     """
     return freeze(trajectory, others(trajectory, parts), at, begin, end)
 
@@ -176,25 +176,25 @@ def isolate(
 def during(
     times: Float[Array, "T"], begin: float | None = None, end: float | None = None, ease: float = 0.0
 ) -> Float[Array, "T"]:
-    """A share for edits of place and look: 1 from `begin` until `end`, 0 before and after.
+    """A share for edits of pose and appearance: 1 from `begin` until `end`, 0 before and after.
 
     Args:
         times: seconds.
-        begin, end: seconds; default: without bound.
-        ease: seconds within the bounds in which it comes and goes smoothly; at once if 0.
+        begin, end: seconds; default: unbounded.
+        ease: duration of the smooth transitions within the bounds, seconds; 0: abrupt.
     """
-    since = times - (-jnp.inf if begin is None else begin)
+    elapsed = times - (-jnp.inf if begin is None else begin)
     left = (jnp.inf if end is None else end) - times
     if ease == 0:
-        return jnp.where((since > -_INSTANT) & (left > _INSTANT), 1.0, 0.0)
-    x = jnp.clip(jnp.minimum(since, left) / ease, 0.0, 1.0)
+        return jnp.where((elapsed > -_INSTANT) & (left > _INSTANT), 1.0, 0.0)
+    x = jnp.clip(jnp.minimum(elapsed, left) / ease, 0.0, 1.0)
     return x * x * (3 - 2 * x)
 
 
 def move(
     trajectory: Trajectory, parts: Sequence[int], shift: Float[Array, "3"], share: Share = 1.0
 ) -> Trajectory:
-    """Parts are `shift` (metres, of the world) from where they were."""
+    """Moves parts by `shift`, metres, in the world's axes."""
     chosen = _checked(trajectory, parts)
     by = _over_time(trajectory, share)[..., None] * shift
     moved = trajectory.poses.translations.at[:, chosen].add(by)
@@ -208,11 +208,12 @@ def rotate(
     arm: Float[Array, "*parts 3"] | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
-    """Parts are turned, on top of what they do, each about its own handle or another point of its own.
+    """Rotates parts in addition to their motion, each about its handle or another of its points.
 
     Args:
-        turn: axis of the world times angle, radians.
-        arm: from the handle to that point in the canonical scene, metres.
+        turn: axis in the world times angle, radians.
+        arm: vector from the handle to the point in the canonical scene, metres.
+        share: how far the edit is applied, 0 to 1.
     """
     motions, share = motions_of(_only(trajectory, parts).poses), _over_time(trajectory, share)
     around = motions.apply(jnp.zeros(3) if arm is None else arm)
@@ -227,19 +228,20 @@ def redirect(
     at: float | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
-    """The captured motion goes in another direction, and the part itself is not turned.
+    """Rotates the captured motion instead of the part.
 
-    Its path is turned about the handle (G M G^-1 instead of M): a lid that opened to the back opens to the
-    side, a drawer slides where it is sent. A turn about a point of a hinge replaces the hinge's axis there.
+    The path is rotated about the handle (G M G^-1 instead of M): a lid that opened to the back opens to the
+    side, a drawer slides in another direction. A rotation about a point of a hinge replaces the hinge's axis.
 
     Args:
-        turn: axis of the world times angle, radians.
-        arm: from the handle to the point about which the path is turned, in the canonical scene, metres.
-        at: when the part stays where it is, seconds; default: the first moment.
+        turn: axis in the world times angle, radians.
+        arm: vector from the handle to the centre of rotation, in the canonical scene, metres.
+        at: the time at which the part's pose is unchanged, seconds; default: the first moment.
+        share: how far the edit is applied, 0 to 1.
     """
-    since, first, share = *_since(trajectory, parts, at), _over_time(trajectory, share)
+    motions, first, share = *_relative(trajectory, parts, at), _over_time(trajectory, share)
     around = turned_about(first.apply(jnp.zeros(3) if arm is None else arm), share, turn)
-    return _moved(trajectory, parts, around @ since @ around.inverse() @ first, share != 0)
+    return _moved(trajectory, parts, around @ motions @ around.inverse() @ first, share != 0)
 
 
 def amplify(
@@ -249,21 +251,26 @@ def amplify(
     at: float | None = None,
     share: Share = 1.0,
 ) -> Trajectory:
-    """Parts go `factor` times as far: along the screw that leads to each moment, so about their hinges.
+    """Moves parts `factor` times as far along the screw to each moment, and so about their hinges.
 
     Args:
-        factor: more than 1 makes subtle motion visible, less calms it, 0 stops it, less goes the other way.
-        at: when the parts stay where they are, seconds; default: the first moment. They must turn by less
-            than a full turn from there.
+        factor: above 1 it makes subtle motion visible, below 1 damps it, 0 stops it, negative reverses it.
+        at: the time at which poses are unchanged, seconds; default: the first moment. Parts must rotate by
+            less than a full turn from there.
+        share: how far the edit is applied, 0 to 1.
     """
     by = 1 + _over_time(trajectory, share) * (factor - 1)
-    since, first = _since(trajectory, parts, at)
-    further = jaxlie.SE3.exp(by[..., None] * unwound(since))
+    motions, first = _relative(trajectory, parts, at)
+    further = jaxlie.SE3.exp(by[..., None] * unwound(motions))
     return _moved(trajectory, parts, further @ first, by != 1)
 
 
 def scale(trajectory: Trajectory, parts: Sequence[int], factor: float, share: Share = 1.0) -> Trajectory:
-    """Parts are `factor` times as large, about their handles.
+    """Scales parts by `factor` about their handles.
+
+    Args:
+        factor: scale, more than 0.
+        share: how far the edit is applied, 0 to 1; intermediate scales are geometric means.
 
     Raises:
         ValueError: `factor` is not more than 0.
@@ -278,10 +285,11 @@ def scale(trajectory: Trajectory, parts: Sequence[int], factor: float, share: Sh
 def fade(
     trajectory: Trajectory, parts: Sequence[int], opacity: Scalar = 0.0, share: Share = 1.0
 ) -> Trajectory:
-    """Parts become translucent, or vanish.
+    """Makes parts translucent or invisible.
 
     Args:
         opacity: factor on their opacities, 0 to 1.
+        share: how far the edit is applied, 0 to 1.
     """
     by = 1 + _over_time(trajectory, share) * (opacity - 1)
     opacities = trajectory.opacities.at[:, _checked(trajectory, parts)].multiply(by)
@@ -291,17 +299,18 @@ def fade(
 def ghost(
     trajectory: Trajectory, parts: Sequence[int], opacity: Scalar = 0.0, share: Share = 1.0
 ) -> Trajectory:
-    """Only `parts` are shown; all else, the background included, is as faint as `opacity`."""
+    """Fades all other parts, including the background, by the factor `opacity`; `share` as for `fade`."""
     return fade(trajectory, others(trajectory, parts), opacity, share)
 
 
 def echo(trajectory: Trajectory, parts: Sequence[int], delay: float, opacity: Scalar = 1.0) -> Trajectory:
-    """A copy of parts that does what they do `delay` seconds later; sooner if that is negative.
+    """A copy of parts that repeats their motion `delay` seconds later; earlier if negative.
 
-    It is to be drawn beside the original (`Layer`): all else is hidden in it, and it is hidden itself until
-    what it does has begun.
+    It is rendered beside the original, as another `Layer`: all other parts are hidden in it, and it is hidden
+    itself until its motion has begun.
 
     Args:
+        delay: seconds.
         opacity: factor on the opacities of the copy, 0 to 1.
     """
     sources = trajectory.times - delay
@@ -311,21 +320,21 @@ def echo(trajectory: Trajectory, parts: Sequence[int], delay: float, opacity: Sc
 
 
 def others(trajectory: Trajectory, parts: Sequence[int]) -> list[int]:
-    """All parts but these."""
+    """All parts except these."""
     chosen = set(_checked(trajectory, parts).tolist())
     return [p for p in range(trajectory.num_parts) if p not in chosen]
 
 
 def _checked(trajectory: Trajectory, parts: Sequence[int]) -> Integer[np.ndarray, "parts"]:
-    """The parts as an index, each once; raises a ValueError for one that is not there."""
+    """The parts without duplicates; raises ValueError for one that does not exist."""
     wrong = [p for p in parts if not 0 <= p < trajectory.num_parts]
     if wrong:
         raise ValueError(f"parts: expected numbers from 0 to {trajectory.num_parts - 1}, found {wrong[0]}")
     return np.array(list(dict.fromkeys(parts)), int)
 
 
-def _stretch(trajectory: Trajectory, begin: float | None, end: float | None) -> tuple[Scalar, Scalar]:
-    """Both ends of a stretch; default: those of the trajectory."""
+def _interval(trajectory: Trajectory, begin: float | None, end: float | None) -> tuple[Scalar, Scalar]:
+    """Both ends of an interval; default: those of the trajectory."""
     if begin is not None and end is not None and not begin < end:
         raise ValueError(f"end: expected a time after begin, {begin:g} s, found {end:g}")
     begin = trajectory.times[0] if begin is None else begin
@@ -356,16 +365,16 @@ def _over_time(trajectory: Trajectory, share: Share) -> Float[Array, "T 1"]:
 def _moved(
     trajectory: Trajectory, parts: Sequence[int], motions: jaxlie.SE3, where: Bool[Array, "T 1"]
 ) -> Trajectory:
-    """The trajectory with other motions of some parts at some moments; else as it was, to the bit."""
+    """The trajectory with other motions of some parts at some moments; otherwise unchanged, to the bit."""
     old = _only(trajectory, parts)
-    poses = jax.tree.map(
-        lambda new, kept: jnp.where(where[..., None], new, kept), pose_of(motions), old.poses
-    )
+    poses = jax.tree.map(lambda new, a: jnp.where(where[..., None], new, a), pose_of(motions), old.poses)
     return _with(trajectory, parts, eqx.tree_at(lambda t: t.poses, old, poses))
 
 
-def _since(trajectory: Trajectory, parts: Sequence[int], at: float | None) -> tuple[jaxlie.SE3, jaxlie.SE3]:
-    """How parts have moved since a time, and where they were then."""
+def _relative(
+    trajectory: Trajectory, parts: Sequence[int], at: float | None
+) -> tuple[jaxlie.SE3, jaxlie.SE3]:
+    """The motions of parts relative to their pose at a time, and that pose."""
     chosen = _only(trajectory, parts)
     motions = motions_of(chosen.poses)
     then = motions if at is None else motions_of(at_times(chosen, jnp.full(1, at)).poses)

@@ -1,8 +1,8 @@
-"""Entries of a script: frozen dataclasses whose fields' metadata say how values are checked.
+"""Entries of a script: frozen dataclasses whose fields' metadata define how values are checked.
 
-`metadata["check"]` returns a value as it is kept, or raises a ValueError with what was expected and what
-was found. `metadata["wanted"]` says what that is, `metadata["key"]` is the field's name in scripts where that
-is another one, and `metadata["example"]` a value to begin with where there is no default.
+`metadata["check"]` converts a value, or raises a ValueError with what was expected and what was found.
+`metadata["wanted"]` describes valid values, `metadata["key"]` is the field's name in scripts if it differs,
+and `metadata["example"]` is an example for a field without a default.
 """
 
 import math
@@ -12,17 +12,17 @@ from difflib import get_close_matches
 from typing import Any, TypeVar
 
 ALL = "all"
-"""In place of parts: every one, the background included."""
+"""Stands for all parts, including the background."""
 Vector = tuple[float, ...]
 Checked = dict[str, Any]
 """Metadata of a field."""
-_LONG = 200  # letters of what was found, in a message
-_FAR = 1e6  # more metres, degrees or seconds than anybody means
+_LONG = 200  # most characters of a value that a message shows
+_FAR = 1e6  # more metres, degrees or seconds than are ever meant
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """What is checked field by field when it is made; a field whose default is None may be None.
+    """An entry, whose fields are checked at construction; a field whose default is None may be None.
 
     Raises:
         ValueError: a value is not as expected; the message begins with its key.
@@ -53,13 +53,13 @@ def read(kind: type[Kind], found: Any) -> Kind:
     for key in found:
         if key not in keys:
             raise ValueError(f"{key}: expected the keys {', '.join(keys)}, found {did_you_mean(key, keys)}")
-    # What is missing and has no default is None, which its check refuses in its own words.
+    # A missing field without default is None, which its check refuses with its own message.
     given = {f: found.get(key) for key, f in keys.items() if key in found or f.default is MISSING}
     return kind(**{f.name: _checked(f, value) for f, value in given.items()})
 
 
 def _checked(f: Field, value: Any) -> Any:
-    """A value as it is kept."""
+    """A field's value, checked and converted."""
     if value is None and f.default is None:
         return None
     try:
@@ -69,30 +69,30 @@ def _checked(f: Field, value: Any) -> Any:
 
 
 def shown(found: Any) -> str:
-    """What was found, in a message."""
+    """A value, as messages show it."""
     text = "nothing" if found is None else repr(found)
     return text if len(text) <= _LONG else f"{text[:_LONG]} ..."
 
 
 def did_you_mean(found: Any, known: Collection[str]) -> str:
-    """What was found, and what of all that is known is most like it."""
+    """A value, as messages show it, with the most similar known name."""
     meant = get_close_matches(str(found), known, 1)
     return f"{found!r}" + (f"; did you mean {meant[0]!r}?" if meant else "")
 
 
 def number(wanted: str, low: float = -_FAR, high: float = _FAR, of: Callable = float) -> Checked:
-    """A number, `of` which is from `low` to `high`; also one that YAML takes for text, such as 1e-3.
+    """A number in a range; also one that YAML reads as text, such as 1e-3.
 
     Args:
-        wanted: what is expected, for messages.
+        wanted: description for messages.
         low, high: the range.
-        of: what of the number has to be in it; default: the number itself.
+        of: function of the number that must be in the range, `abs` say; default: the number itself.
     """
 
     def check(value: Any) -> float:
         try:
             found = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError, OverflowError):  # that of a whole number of hundreds of digits
+        except (TypeError, ValueError, OverflowError):  # an integer of hundreds of digits
             found = math.nan
         if not low <= of(found) <= high:
             raise ValueError(f"expected {wanted}, found {shown(value)}")
@@ -114,7 +114,7 @@ def whole(low: int, high: int) -> Checked:
 
 
 def vector(wanted: str, least: float = 0.0) -> Checked:
-    """Three numbers, of length `least` at least."""
+    """A vector of three numbers whose length is at least `least`."""
     one, wanted = number("")["check"], f"{wanted} as [x, y, z]"
 
     def check(value: Any) -> Vector:
@@ -130,7 +130,7 @@ def vector(wanted: str, least: float = 0.0) -> Checked:
 
 
 def instance(kind: type, wanted: str) -> Checked:
-    """A value of one type; text must not be empty."""
+    """A value of a type; text must not be empty."""
 
     def check(value: Any) -> Any:
         if not isinstance(value, kind) or value == "":
@@ -141,10 +141,10 @@ def instance(kind: type, wanted: str) -> Checked:
 
 
 def part_list(value: Any) -> tuple[str | int, ...]:
-    """Names and numbers of parts; one alone needs no list.
+    """Names and numbers of parts; a single one needs no list.
 
     Raises:
-        ValueError: it is neither, or there is none.
+        ValueError: the value is neither, or the list is empty.
     """
     listed = [value] if isinstance(value, (str, int)) else value
     sound = isinstance(listed, (list, tuple)) and len(listed) > 0

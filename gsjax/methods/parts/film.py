@@ -1,4 +1,5 @@
-"""A film: a scene and its trajectory, or several drawn together: copies of parts, parts of elsewhere."""
+"""A film: one or several layers, each a scene with its trajectory: copies of parts, or parts of other
+scenes."""
 
 from collections.abc import Sequence
 
@@ -14,22 +15,27 @@ from gsjax.methods.parts.trajectory import PartScene, Trajectory, gaussians_at, 
 from gsjax.scene.gaussians import Gaussians, concatenate, take
 from gsjax.scene.handles import Blend, HandlePose
 
-_FAINTEST = 1 / 255  # an opacity that the rasterizer skips (its `alpha_min`)
+_FAINTEST = 1 / 255  # opacity below which the rasterizer skips a Gaussian (its `alpha_min`)
 
 
 class Layer(eqx.Module):
-    """A scene whose parts move; which of them are shown, its trajectory's opacities say."""
+    """A scene whose parts move; the opacities of the trajectory determine which of them are visible."""
 
     scene: PartScene
     trajectory: Trajectory
 
 
 Film = tuple[Layer, ...]
-"""Layers with the same times. The first is the scene that is edited."""
+"""Layers with the same times. The first is the edited scene."""
 
 
 def film_gaussians(film: Film, t: Int[Array, ""] | int, blend: Blend = "quaternion") -> Gaussians:
     """All Gaussians of a film at moment `t`. Under jit, `film` is a pytree and `t` may be traced.
+
+    Args:
+        film: the layers.
+        t: index of the moment.
+        blend: how rotations are blended.
 
     Raises:
         ValueError: layers differ in their number of moments, or in their features.
@@ -37,19 +43,18 @@ def film_gaussians(film: Film, t: Int[Array, ""] | int, blend: Blend = "quaterni
     lengths = {len(layer.trajectory.times) for layer in film}
     if len(lengths) > 1:
         raise ValueError(f"film: expected layers with the same times, found {sorted(lengths)} moments")
-    now = [gaussians_at(layer.scene, moment(layer.trajectory, t), blend) for layer in film]
-    return concatenate(now)
+    return concatenate([gaussians_at(layer.scene, moment(layer.trajectory, t), blend) for layer in film])
 
 
 def trimmed(film: Film) -> Film:
-    """The film without the Gaussians that are never seen in it, so that they cost nothing. On the host.
+    """The film without Gaussians that are never visible, to save their cost. On the host.
 
-    A layer of which nothing is left goes too, but for the first; if nothing is seen at all, that stays whole.
+    Empty layers are removed, except for the first; if nothing is visible at all, the first stays complete.
     """
     layers = []
     for layer in film:
         scene = layer.scene
-        # How visible a shown part is makes no difference: a faded one shall not change all shapes.
+        # Only whether a part is visible counts, so that another opacity does not change array shapes.
         shown = (np.asarray(layer.trajectory.opacities) > 0).any(axis=0).astype(scene.weights.dtype)
         rows = np.flatnonzero(scene.gaussians.opacities * (scene.weights @ shown) >= _FAINTEST)
         if len(rows) or not layers:
@@ -59,7 +64,7 @@ def trimmed(film: Film) -> Film:
 
 
 def composite(film: Film, layer: Layer, parts: Sequence[int]) -> Film:
-    """The film with parts of another scene in it, where they are there; `placed` puts them elsewhere."""
+    """The film with parts of another scene added, at their own places; `placed` moves them."""
     trajectory = at_times(layer.trajectory, film[0].trajectory.times)
     return (*film, Layer(layer.scene, ghost(trajectory, parts)))
 
@@ -71,15 +76,16 @@ def placed(
     factor: float = 1.0,
     about: Float[Array, "3"] | None = None,
 ) -> Layer:
-    """A layer as a whole put elsewhere, motion and all: x -> about + shift + factor R (x - about).
+    """A layer moved as a whole, with its motion: x -> about + shift + factor R (x - about).
 
-    Colours that depend on the side they are seen from keep doing so in the directions of the old place.
+    View-dependent colours are not rotated.
 
     Args:
-        turn: axis times angle, radians.
-        shift: metres.
-        factor: of the size, more than 0.
-        about: the point that the turn and the factor leave in place, metres; default: the origin.
+        layer: the layer.
+        turn: rotation, axis times angle in radians.
+        shift: translation, metres.
+        factor: scale, more than 0.
+        about: fixed point of the rotation and the scaling, metres; default: the origin.
 
     Raises:
         ValueError: `factor` is not more than 0.

@@ -1,19 +1,18 @@
-"""The end of a discovery: parts that no picture needs are given up, the scene and the poses of all frames are
-what is refined, and the outcome is what edits work on."""
+"""The end of a discovery: parts that no picture needs are removed, the refinement of the scene and of all
+poses is set up, and the scene and its trajectory are assembled for edits."""
 
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.config import PartsConfig, StreamConfig
 from gsjax.methods.parts.discover import centers_of
-from gsjax.methods.parts.discovery import Discovery, joined, weights_of_run
-from gsjax.methods.parts.pictures import where_parts_are
+from gsjax.methods.parts.discovery import Discovery, join_parts, weights_of_run
+from gsjax.methods.parts.pictures import with_part_masks
 from gsjax.methods.parts.refine import RefineParams, refine_step
 from gsjax.methods.parts.stream import Canonical, picture_loss, posed
 from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, trajectory_of
@@ -27,86 +26,85 @@ from gsjax.scene.handles import HandlePose
 from gsjax.scene.region import TILE
 from gsjax.scene.render import plan_render, render
 
-_FRAMES, _CAMERAS = 6, 2  # by which parts are judged
-_LEAST_CONTACT = 0.05  # share of a part's neighbours
+_FRAMES, _CAMERAS, _SHRINK = 6, 2, 2  # pictures by which parts are evaluated, at half size
+_LEAST_CONTACT = 0.05  # share of a part's neighbours that another part must have to touch it
 _LEAST_WEIGHT = 0.02
-_SHRINK = 2
 
 
-def finished(sequence: SequenceLike, run: Run, config: PartsConfig) -> Run:
-    """The run before the first step over all frames together, of which all frames were found: without
-    needless parts, with weights that stay.
+def begin_refinement(sequence: SequenceLike, run: Run, config: PartsConfig) -> Run:
+    """The run before the first step of the refinement, without unneeded parts and with fixed weights.
 
     Args:
-        sequence: what the cameras saw.
-        run: that followed parts to the last frame.
+        sequence: the recording.
+        run: a run that has found all frames.
         config: settings.
     """
-    discovery = without_needless(sequence, run.kept, np.asarray(weights_of_run(run)), config)
+    discovery = prune_parts(sequence, run.kept, np.asarray(weights_of_run(run)), config)
     poses = HandlePose(jnp.asarray(discovery.quats), jnp.asarray(discovery.translations))
-    # Steps give away what they replace; what is kept stays whole.
+    # Steps donate the buffers of their inputs, and `kept` must survive.
     scene = discovery.canonical.movable, discovery.canonical.fixed
     params = RefineParams(*jax.tree.map(jnp.copy, scene), jax.tree.map(jnp.copy, poses))
     return run.having(params=params, state=refine_step(config).init(params), kept=discovery)
 
 
-def without_needless(
+def prune_parts(
     sequence: SequenceLike, discovery: Discovery, weights: Float[np.ndarray, "M P"], config: PartsConfig
 ) -> Discovery:
-    """The parts that pictures need: from the smallest on, each joins the part that it touches, or the
-    background, with which pictures get worse by least, if that is less than `unify.least_gain`.
+    """Removes the parts that no picture needs: from the smallest on, each part joins a part that it touches,
+    or the background, whichever raises the loss least, if it rises by less than `unify.least_gain`.
 
-    What a scene does not require is not modelled. It is decided by what is seen, and not by how motions
-    compare: the motion of a thin piece is badly known, and matters little for the same reason.
+    The criterion is the loss rather than a comparison of motions: the motion of a thin part is poorly
+    known, and matters little for the same reason.
 
-    The weights that are left are fixed from here on, without those below 2 %: a softmax gives every part a
-    little of everything, and to move a part would move all others a little.
+    The remaining weights are fixed from here on, and those below 2 % are cut: a softmax gives every part a
+    small weight everywhere, so that moving one part would move all others slightly.
 
     Args:
-        sequence: what the cameras saw.
-        discovery: all frames that were found.
-        weights: of the movable Gaussians.
+        sequence: the recording.
+        discovery: the discovery of all frames.
+        weights: weights of the movable Gaussians.
         config: settings.
     """
-    judge = _Judge(sequence, discovery, weights, config)
+    mean_loss = _MeanLoss(sequence, discovery, weights, config)
     found, into = weights, np.arange(len(discovery.canonical.alive))
-    here, before = judge(weights), None
+    here, before = mean_loss(weights), None
     while before is None or (into != before).any():
         before = into.copy()
         for part in _smallest_first(weights.argmax(-1)):
-            ways = {q: given(weights, part, q) for q in touching(discovery, weights.argmax(-1), part)}
-            losses = {q: judge(changed) for q, changed in ways.items()}
+            options = {q: moved_weights(weights, part, q) for q in touched_parts(discovery, weights, part)}
+            losses = {q: mean_loss(changed) for q, changed in options.items()}
             best = min(losses, key=losses.__getitem__)
             if losses[best] <= (1 + config.unify.least_gain) * here:
-                weights, here = ways[best], losses[best]
+                weights, here = options[best], losses[best]
                 into[into == part] = best
-    discovery, _ = joined(discovery, found, into)
-    kept = settled(weights, np.asarray(discovery.canonical.alive))
+    discovery, _ = join_parts(discovery, found, into)
+    kept = cut_weights(weights, np.asarray(discovery.canonical.alive))
     return discovery._replace(weights=jnp.asarray(kept))
 
 
-def settled(weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
-    """The weights without those so small that they only tie parts to each other."""
+def cut_weights(weights: Float[np.ndarray, "M P"], alive: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
+    """The weights without those below 2 %, which only tie parts to each other; rows sum to 1."""
     kept = np.where((weights < _LEAST_WEIGHT) | ~alive, 0.0, weights)
     return (kept / kept.sum(-1, keepdims=True)).astype(weights.dtype)
 
 
-def given(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
-    """The weights with those of a part given to another."""
+def moved_weights(weights: Float[np.ndarray, "M P"], part: int, to: int) -> Float[np.ndarray, "M P"]:
+    """The weights, with those of `part` moved `to` another part."""
     changed = weights.copy()
     changed[:, to] += changed[:, part]
     changed[:, part] = 0
     return changed
 
 
-def touching(discovery: Discovery, labels: Int[np.ndarray, "M"], part: int) -> list[int]:
-    """The parts to which a share of a part's neighbours belongs, and the background.
+def touched_parts(discovery: Discovery, weights: Float[np.ndarray, "M P"], part: int) -> list[int]:
+    """The parts that a part touches, to which at least 5 % of its neighbours belong, and the background.
 
     Args:
-        discovery: with the neighbours of each Gaussian.
-        labels: the part of each movable Gaussian.
-        part: whose neighbours are counted.
+        discovery: the neighbours of each Gaussian.
+        weights: weights of the movable Gaussians.
+        part: index of the part.
     """
+    labels = weights.argmax(-1)
     neighbors = np.asarray(discovery.canonical.neighbors)[labels == part].ravel()
     all_ = np.concatenate([labels, np.full(discovery.canonical.fixed.num, BACKGROUND)])
     names, counts = np.unique(all_[neighbors], return_counts=True)
@@ -119,8 +117,8 @@ def _smallest_first(labels: Int[np.ndarray, "M"]) -> list[int]:
     return names[np.argsort(counts, kind="stable")].tolist()
 
 
-class _Judge:
-    """How well weights explain some pictures, spread over frames and cameras."""
+class _MeanLoss:
+    """The mean loss of some pictures, spread over frames and cameras, for given weights."""
 
     def __init__(
         self,
@@ -129,63 +127,50 @@ class _Judge:
         weights: Float[np.ndarray, "M P"],
         config: PartsConfig,
     ):
-        self._loss = _compiled(config.stream)
+        self._loss = _compiled_loss(config.stream)
         self._canonical, self._headroom = discovery.canonical, 2 * config.headroom
-        done = np.flatnonzero(discovery.done)
+        done, count = np.flatnonzero(discovery.done), sequence.num_cameras
         frames = done[np.linspace(0, len(done) - 1, min(_FRAMES, len(done))).round().astype(int)]
-        self._seen: list[tuple[HandlePose, Frame]] = []
+        self._pictures: list[tuple[HandlePose, Frame]] = []
         for i, t in enumerate(frames.tolist()):
             frame = part_of(sequence.frame(t), (), _SHRINK)
-            count = sequence.num_cameras
             cameras = {(i + k * count // _CAMERAS) % count for k in range(_CAMERAS)}
             place = self._canonical, jnp.asarray(weights), discovery.pose(t)
-            seen = where_parts_are(frame, *place, TILE // _SHRINK, blend=config.stream.blend)
-            self._seen += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]
+            seen = with_part_masks(frame, *place, TILE // _SHRINK, blend=config.stream.blend)
+            self._pictures += [(discovery.pose(t), one_camera(seen, c)) for c in sorted(cameras)]
         scene = posed(self._canonical, jnp.asarray(weights), discovery.pose(int(done[0])))
         self._plan = plan_render(scene, frame.cameras, headroom=self._headroom)
 
     def __call__(self, weights: Float[np.ndarray, "M P"]) -> float:
-        """The mean loss over the pictures."""
-        losses = [self._of(jnp.asarray(weights), pose, frame) for pose, frame in self._seen]
+        losses = []
+        for pose, frame in self._pictures:
+            draw = partial(self._loss, self._canonical, jnp.asarray(weights), pose, frame)
+            loss, self._plan = with_room(draw, self._plan, self._headroom)
+            losses.append(float(loss))
         return float(np.mean(losses))
-
-    def _of(self, weights: Float[Array, "M P"], pose: HandlePose, frame: Frame) -> float:
-        """The loss in one picture, by a plan that holds it."""
-        draw = partial(self._loss, self._canonical, weights, pose, frame)
-        loss, self._plan = with_room(draw, self._plan, self._headroom)
-        return float(loss)
-
-
-class _Room(NamedTuple):
-    """Whether a plan was too small, and what it should have held."""
-
-    overflow: Bool[Array, ""]
-    needed: Int[Array, ""]
 
 
 @lru_cache(maxsize=2)
-def _compiled(config: StreamConfig):
+def _compiled_loss(config: StreamConfig):
     @partial(jax.jit, static_argnames="plan", compiler_options=host_options())
     def loss(canonical: Canonical, weights, pose, frame, plan):
-        scene = posed(canonical, weights, pose, config.blend)
-        drawn = render(scene, frame.cameras, plan, roi=frame.masks)
-        room = _Room(drawn.meta.overflow.any(), drawn.meta.needed.max())
-        return picture_loss(drawn, frame, config), room
+        drawn = render(posed(canonical, weights, pose, config.blend), frame.cameras, plan, roi=frame.masks)
+        return picture_loss(drawn, frame, config), drawn.meta
 
     return loss
 
 
-def outcome(
+def scene_and_trajectory(
     discovery: Discovery, weights: Float[np.ndarray, "M P"], times: Float[np.ndarray, "T"]
 ) -> tuple[PartScene, Trajectory]:
-    """The scene with its parts, all Gaussians in the order in which they were given, and where parts were.
+    """The scene with its parts, with all Gaussians in their given order, and the trajectory of the parts.
 
-    Handles that nothing follows are left out, and the others stand in the middle of what follows them.
+    Handles without Gaussians are left out; the others are moved to the centroids of their parts.
 
     Args:
-        discovery: how far it is.
-        weights: of the movable Gaussians.
-        times: of the frames, seconds.
+        discovery: the discovery.
+        weights: weights of the movable Gaussians.
+        times: times of the frames, seconds.
     """
     labels = weights.argmax(-1)
     kept = [BACKGROUND, *(p for p in np.unique(labels).tolist() if p != BACKGROUND)]

@@ -1,7 +1,7 @@
-"""Learned limits: what parts were seen to do, and where an edited trajectory leaves that.
+"""Learned limits: the observed motion of parts, and where an edited trajectory leaves it.
 
-What a part was seen to do is the path of its handle: the captured poses and the screws between them. Beyond
-it, weights have never been compared with an image, and what no camera saw comes to light.
+The observed motion of a part is the path of its handle: the captured poses and the screws between them.
+Beyond it, the weights have never been compared with an image, and surfaces that no camera saw are revealed.
 """
 
 from collections.abc import Mapping
@@ -18,15 +18,15 @@ from gsjax.methods.parts.screws import motions_of
 from gsjax.methods.parts.trajectory import PartScene, Trajectory
 
 NOISE_M, NOISE_RAD = 2e-3, 0.02
-"""What is nearer than this to what was seen, is within the limits: tracked handles are not surer."""
+"""Tolerances of the limits, metres and radians: the accuracy of tracked handles."""
 
 
 class Beyond(NamedTuple):
-    """How far each part is from the pose nearest to it of all that it was seen in.
+    """The distance of each part from the nearest pose in which it was observed.
 
     Attributes:
-        metres: between the places of the handle.
-        radians: between the orientations.
+        metres: distance between the positions of the handle.
+        radians: angle between the orientations.
     """
 
     metres: Float[Array, "T P"]
@@ -34,15 +34,15 @@ class Beyond(NamedTuple):
 
 
 def beyond_captured(captured: Layer, edited: Trajectory) -> Beyond:
-    """Where parts leave what they were seen to do.
+    """How far parts leave their observed motion.
 
-    The nearest pose is the one from which the part's points would have to go least, the handle's way and the
-    turn's (by the part's radius) together. Poses between two that were captured, on the screw that leads from
-    one to the other, count as seen; so edits of time stay within the limits. Size and opacity have none.
+    The nearest pose minimises the sum of the handle's translation and its rotation times the part's radius.
+    Poses between two captured ones, on the screw from one to the other, count as observed, so edits of time
+    stay within the limits. Scales and opacities have no limits.
 
     Args:
-        captured: the scene as it was found, and its trajectory.
-        edited: the same parts, at any times.
+        captured: the discovered scene and its trajectory.
+        edited: a trajectory of the same parts, at any times.
     """
     path = motions_of(captured.trajectory.poses)
     start = path.wxyz_xyz if len(path.wxyz_xyz) == 1 else path.wxyz_xyz[:-1]
@@ -55,7 +55,7 @@ def beyond_captured(captured: Layer, edited: Trajectory) -> Beyond:
     def nearest(pose: Float[Array, "P 7"]) -> Beyond:
         away = (start.inverse() @ jaxlie.SE3(pose)).log()
         share = jnp.sum(metric * away * along, axis=-1) / jnp.where(length > 0, length, 1.0)
-        # The ends too: what is far off in place is little nearer by a turn that it does not have.
+        # The ends too, so that a distant position is not explained by a spurious rotation.
         share = jnp.stack([jnp.zeros_like(share), jnp.clip(share, 0.0, 1.0), jnp.ones_like(share)])
         seen = start @ jaxlie.SE3.exp(share[..., None] * along)
         metres = jnp.linalg.norm(pose[:, 4:] - seen.translation(), axis=-1)
@@ -75,12 +75,13 @@ def describe_beyond(
     least_m: float = NOISE_M,
     least_rad: float = NOISE_RAD,
 ) -> list[str]:
-    """A sentence for each part that leaves its limits, to warn with. On the host.
+    """A warning for each part that leaves its limits. On the host.
 
     Args:
-        times: of the edited trajectory, seconds.
-        names: of parts, with their numbers; a part without a name goes by its number.
-        least_m, least_rad: what is nearer than both is within the limits.
+        beyond: from `beyond_captured`.
+        times: times of the edited trajectory, seconds.
+        names: part numbers by name; a part without a name is called by its number.
+        least_m, least_rad: tolerances, metres and radians.
     """
     metres, radians = np.asarray(beyond.metres), np.asarray(beyond.radians)
     outside = (metres > least_m) | (radians > least_rad)
@@ -93,13 +94,14 @@ def describe_beyond(
         far += [f"{np.rad2deg(turn):.1f} degrees"] if turn > least_rad else []
         sentences.append(
             f"{called.get(int(p), f'part {p}')} goes up to {' and '.join(far)} beyond what was captured, "
-            f"at {len(when)} of {len(times)} moments from {when[0]:.2f} s to {when[-1]:.2f} s: expect flaws"
+            f"at {len(when)} of {len(times)} moments from {when[0]:.2f} s to {when[-1]:.2f} s: "
+            "expect artefacts"
         )
     return sentences
 
 
 def _radii(scene: PartScene) -> Float[Array, "P"]:
-    """How far the Gaussians of each part are from its handle, root mean square, metres."""
+    """The distance of each part's Gaussians from its handle, root mean square, metres."""
     means, weights = scene.gaussians.means, scene.weights
     total = jnp.maximum(jnp.sum(weights, axis=0), 1e-9)
     middle = weights.T @ means / total[:, None]

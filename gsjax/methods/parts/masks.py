@@ -1,9 +1,9 @@
-"""Masks of what moves in every view of the anchor frame, by the same numbers in all of them.
+"""Masks of the moving parts in every view of the anchor frame, with labels that agree between views.
 
-In each view a segmenter finds what belongs together, and of its segments those that changed count (I_d).
-Views are taken in an order in which neighbours look from near; what earlier ones found is drawn into the
-next, and a segment that shows mostly one part takes its number. So numbers pass from view to view over the
-scene's own geometry, where SAM2 passes them over its memory of pictures (MotionSplicer, section 3.2).
+In each view a segmenter finds segments, and those that changed (I_d) are kept. Views are visited in an order
+in which each is close to an earlier one; labels found so far are rendered into the next view, and a segment
+that mostly shows one part takes its label. Labels thus propagate from view to view through the scene's own
+geometry, where SAM2 uses its memory of pictures (MotionSplicer, section 3.2).
 """
 
 from collections.abc import Callable, Sequence
@@ -14,15 +14,15 @@ from jaxtyping import Bool, Float, Int
 from gsjax.methods.protocols import Segmenter
 
 _LEAST_CHANGED = 0.3  # share of a segment's pixels that must have changed
-_LEAST_KNOWN = 0.5  # share of its pixels that must show one part for it to be that part
+_LEAST_KNOWN = 0.5  # share of a segment's pixels that must show one part for it to take its label
 
 
 def moving_segments(
     segments: Int[np.ndarray, "H W"], moved: Bool[np.ndarray, "H W"], least: float = _LEAST_CHANGED
 ) -> Int[np.ndarray, "H W"]:
-    """The segments of which at least such a share of pixels changed; the others become 0.
+    """The segments of which at least the share `least` of the pixels changed; the others become 0.
 
-    By segments rather than by pixels, because the inside of a plain surface looks the same after it moved.
+    Segments rather than pixels, because the interior of a uniform surface looks the same after it has moved.
     """
     count = segments.max() + 1
     sizes = np.bincount(segments.ravel(), minlength=count)
@@ -31,27 +31,27 @@ def moving_segments(
     return np.where(kept[segments], segments, 0)
 
 
-def order_of_views(
+def view_order(
     viewmats: Float[np.ndarray, "C 4 4"], first: int, focus: Float[np.ndarray, "3"]
 ) -> list[int]:
-    """Views in an order in which each looks from nearest to those before it, by the angle at `focus`.
+    """Views in an order in which each is the nearest to those before it, by the angle at `focus`.
 
     Args:
         viewmats: world to camera.
-        first: where to begin.
-        focus: what they look at, metres.
+        first: the first view.
+        focus: the point that the cameras look at, metres.
     """
     centers = -np.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    ways = centers - focus
-    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    directions = centers - focus
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     order, left = [first], set(range(len(viewmats))) - {first}
     while left:
-        order.append(max(sorted(left), key=lambda c: (ways[c] @ ways[order].T).max()))
+        order.append(max(sorted(left), key=lambda c: (directions[c] @ directions[order].T).max()))
         left.remove(order[-1])
     return order
 
 
-def propagated_masks(
+def propagate_masks(
     pictures: Sequence[np.ndarray],
     depths: Float[np.ndarray, "C H W"],
     Ks: Float[np.ndarray, "C 3 3"],
@@ -62,19 +62,19 @@ def propagated_masks(
     most: int,
     room: int,
 ) -> Int[np.ndarray, "C H W"]:
-    """Masks of all views: 0 what stands still, then numbers from the largest part to the smallest.
+    """Masks of all views: 0 is the static background, then labels from the largest part to the smallest.
 
     Args:
-        pictures: of the anchor frame, RGB.
-        depths: as the canonical scene draws them, metres, 0 where nothing is.
+        pictures: RGB pictures of the anchor frame.
+        depths: rendered from the canonical scene, metres, 0 where it is empty.
         Ks: intrinsics.
         moved: from `moved_pixels`.
-        order: of views, from `order_of_views`.
-        segmenter: what belongs together.
-        known: (view, the view before it, its mask) -> mask of the view as far as earlier ones tell, [H, W];
-            -1 where they do not.
-        most: how many numbers there may be in the end; those of fewest pixels are dropped.
-        room: how many there may be before that.
+        order: indices of the views, from `view_order`.
+        segmenter: finds the segments of a picture.
+        known: (view, previous view, its mask) -> labels of the view that earlier views imply, [H, W]; -1
+            where unknown.
+        most: largest number of labels in the result; those with the fewest pixels are dropped.
+        room: largest number of labels before that.
     """
     masks: dict[int, np.ndarray] = {}
     count, last = 0, None
@@ -95,16 +95,16 @@ def propagated_masks(
     return _by_size(np.stack([masks[c] for c in range(len(pictures))]), most)
 
 
-def masks_of_labels(
+def masks_from_labels(
     labels: Int[np.ndarray, "C H W"], moved: Bool[np.ndarray, "C H W"], most: int
 ) -> Int[np.ndarray, "C H W"]:
-    """Masks from labels that mean the same in all views: those of which enough changed, over all views, by
-    numbers from the largest to the smallest.
+    """Masks from labels that agree between views: those of which enough pixels changed over all views,
+    numbered from the largest to the smallest.
 
     Args:
-        labels: 0 and below is nothing.
+        labels: 0 and below is background.
         moved: from `moved_pixels`.
-        most: how many numbers there may be; those of fewest pixels are dropped.
+        most: largest number of labels; those with the fewest pixels are dropped.
     """
     flat = np.maximum(labels, 0).reshape(-1, labels.shape[-1])
     return _by_size(moving_segments(flat, moved.reshape(flat.shape)).reshape(labels.shape), most)

@@ -1,6 +1,5 @@
-"""What every operation of an edit script is: of some parts, from a time until another; and what two kinds of
-them share, those that change time (`TimeEdit`) and those that change how parts look or stand (`LookEdit`).
-"""
+"""Base classes of the operations of an edit script: `Edit`, an operation on some parts during some time;
+`TimeEdit`, which changes time; and `LookEdit`, which changes the pose or appearance of parts."""
 
 from dataclasses import dataclass, field
 
@@ -16,11 +15,11 @@ SECONDS = number("seconds from the film's start, 0 or more", 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Edit(Entry):
-    """One operation on some parts of the film's first layer, from some time on until another.
+    """An operation on some parts of the film's first layer, during some time.
 
     Attributes:
-        parts: names or numbers; 0 is the background, "all" every one.
-        begin, end: `from` and `to`; None is the film's own.
+        parts: names or numbers; 0 is the background, "all" every part.
+        begin, end: `from` and `to`, seconds; None: those of the film.
     """
 
     parts: tuple[str | int, ...] = field(
@@ -36,85 +35,75 @@ class Edit(Entry):
 
     @classmethod
     def operation(cls) -> str:
-        """Its name in scripts."""
+        """The name of the operation in scripts."""
         return cls.__name__.lower()
 
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Which parts change, if these are named and the motion of each part of the scene ends at `lasts`."""
+    def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
+        """The parts that change if `parts` are named; the motion of each part of the scene `ends` at a
+        time."""
         return parts
 
-    def ends(self, last: float) -> float:
-        """When the motion of a part that concerns it ends, if it ended at `last`, seconds."""
-        return last
+    def end_after(self, end: float) -> float:
+        """The end of an affected part's motion after the edit, if it was `end` before, seconds."""
+        return end
 
-    def adds_until(self, last: float) -> float:
-        """When the motion ends of what it adds to the film, which is that of a part that ends at `last`."""
+    def added_end(self, end: float) -> float:
+        """The end of the motion that the edit adds to the film, from a part whose motion ends at `end`."""
         return 0.0
 
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
-        """The film after it.
+    def applied(self, film: Film, parts: list[int], ends: list[float]) -> Film:
+        """The film after the edit.
 
         Args:
-            parts: those that change.
-            lasts: when the motion of each part of the first layer ends, seconds.
+            film: the film before.
+            parts: the parts that change.
+            ends: the end of the motion of each part of the first layer, seconds.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimeEdit(Edit):
-    """What comes after `to` follows on, sooner or later; by default `to` is where a part's motion ends."""
+    """An edit of time. The motion after `to` follows it; default of `to`: the end of the part's motion."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
-        """Those that still move at `from`: what is over stands still, whatever is done to all."""
-        begin, last = self.begin or 0.0, max(lasts[p] for p in parts)
-        moving = parts if self.end is not None else [p for p in parts if begin < lasts[p]]
+    def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
+        """The parts that still move at `from`; the others stay still."""
+        begin, last = self.begin or 0.0, max(ends[p] for p in parts)
+        moving = parts if self.end is not None else [p for p in parts if begin < ends[p]]
         if not moving:
             parts = ", ".join(f"part {part}" if isinstance(part, int) else part for part in self.parts)
             expected = f"a time before {last:g}, where the motion of {parts} ends"
             raise ValueError(f"from: expected {expected}, found {begin:g}")
         return moving
 
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
+    def applied(self, film: Film, parts: list[int], ends: list[float]) -> Film:
         trajectory = film[0].trajectory
         for part in parts:
-            trajectory = self.retimed(trajectory, [part], *self.stretch(lasts[part]))
+            trajectory = self.retimed(trajectory, [part], *self.interval(ends[part]))
         return Layer(film[0].scene, trajectory), *film[1:]
 
-    def stretch(self, last: float) -> tuple[float, float]:
-        """From when to when, for a part whose motion ends at `last`."""
+    def interval(self, last: float) -> tuple[float, float]:
+        """Begin and end of the edit, for a part whose motion ends at `last`, seconds."""
         return self.begin or 0.0, last if self.end is None else self.end
 
     def retimed(self, trajectory: Trajectory, parts: list[int], begin: float, end: float) -> Trajectory:
-        """The trajectory after it.
-
-        Args:
-            trajectory: of all parts.
-            parts: whose time is changed.
-            begin, end: between which it is, seconds.
-        """
+        """The trajectory with `parts` edited from `begin` to `end`, seconds."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class LookEdit(Edit):
-    """Holds from `from` until `to`, coming and going within `ease` seconds inside of these bounds."""
+    """An edit of pose or appearance, from `from` until `to`, with smooth transitions of `ease` seconds."""
 
     ease: float = field(default=0.0, metadata=number("seconds, 0 or more", 0.0))
 
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
+    def applied(self, film: Film, parts: list[int], ends: list[float]) -> Film:
         return Layer(film[0].scene, self.changed(film[0], parts, self.share(film))), *film[1:]
 
     def share(self, film: Film) -> Float[Array, "T"]:
-        """How far it holds at each moment, 0 to 1."""
+        """How far the edit is applied at each moment, 0 to 1."""
         return edits.during(film[0].trajectory.times, self.begin, self.end, self.ease)
 
     def changed(self, layer: Layer, parts: list[int], share: Float[Array, "T"]) -> Trajectory:
-        """The layer's trajectory after it.
-
-        Args:
-            layer: the scene and its trajectory.
-            parts: that are changed.
-            share: of the change in each frame, 0 to 1.
-        """
+        """The layer's trajectory with `parts` edited, by a `share` of 0 to 1 at each moment."""
         raise NotImplementedError

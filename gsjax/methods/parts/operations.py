@@ -1,11 +1,12 @@
-"""What an edit script can ask for: a frozen dataclass for each operation, checked when it is made.
+"""The operations of edit scripts: a frozen dataclass for each, checked at construction.
 
-A field's name is its key in scripts; only `from` and `to` are `begin` and `end`, for Python's sake.
-Seconds are the film's, from 0, as the edits above have left it; angles are degrees, lengths metres.
+A field's name is its key in scripts; only `from` and `to` are `begin` and `end`, as `from` is reserved in
+Python. Times are seconds of the film after the preceding edits, from 0; angles are degrees, lengths metres.
 """
 
+import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from gsjax.methods.parts.entries import (
     Vector,
     did_you_mean,
     instance,
+    key_of,
     number,
     read,
     shown,
@@ -34,17 +36,18 @@ _DEGREES = number("degrees")
 _OPACITY = number("a factor on opacities, 0 to 1", 0.0, 1.0)
 _RATE = number("a factor from 0.01 to 100, or from -0.01 to -100 for backwards", 0.01, 100.0, of=abs)
 _SIZE = number("a factor from 0.001 to 1000", 1e-3, 1e3)
+_COMMON = {f.name for kind in (Edit, LookEdit) for f in fields(kind)}  # keys that operations share
 
 
 @dataclass(frozen=True, kw_only=True)
 class Speed(TimeEdit):
-    """Parts go faster, slower or backwards."""
+    """Parts move faster, slower or backwards."""
 
     factor: float = field(metadata=_RATE | {"example": 2})
 
-    def ends(self, last: float) -> float:
-        begin, end = self.stretch(last)
-        return max(last, end) + (end - begin) * (1 / abs(self.factor) - 1)
+    def end_after(self, end: float) -> float:
+        begin, stop = self.interval(end)
+        return max(end, stop) + (stop - begin) * (1 / abs(self.factor) - 1)
 
     def retimed(self, trajectory, parts, begin, end):
         return edits.speed(trajectory, parts, self.factor, begin, end, stay=self.end is None)
@@ -52,18 +55,18 @@ class Speed(TimeEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Loop(TimeEdit):
-    """Parts do the same again and again, `times` times or without end."""
+    """Parts repeat their motion, `times` times or endlessly."""
 
     times: int | None = field(default=None, metadata=whole(1, 1000))
     bounce: bool = field(default=False, metadata=instance(bool, "true or false"))
 
-    def ends(self, last: float) -> float:
-        begin, end = self.stretch(last)
+    def end_after(self, end: float) -> float:
+        begin, stop = self.interval(end)
         if self.times is None:
-            return max(last, end)
-        lasts = (end - begin) * self.times * (2 if self.bounce else 1)
-        follows = 0.0 if self.end is None else max(last - end, 0.0) + (end - begin if self.bounce else 0.0)
-        return begin + lasts + follows
+            return max(end, stop)
+        looped = (stop - begin) * self.times * (2 if self.bounce else 1)
+        follows = 0.0 if self.end is None else max(end - stop, 0.0) + (stop - begin if self.bounce else 0.0)
+        return begin + looped + follows
 
     def retimed(self, trajectory, parts, begin, end):
         return edits.loop(trajectory, parts, begin, end, self.times, self.bounce, stay=self.end is None)
@@ -71,24 +74,24 @@ class Loop(TimeEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Freeze(TimeEdit):
-    """Parts stand still as they were `at` a time, and go on from there after `to`, if that is given."""
+    """Parts stay still as they were `at` a time, and continue from there after `to`, if that is given."""
 
     at: float | None = field(default=None, metadata=SECONDS)
 
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+    def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
         return parts
 
-    def stretch(self, last: float) -> tuple[float, float]:
+    def interval(self, last: float) -> tuple[float, float]:
         begin = self.begin if self.begin is not None else self.at or 0.0
         end = math.inf if self.end is None else self.end
         if not begin < end:
             raise ValueError(f"to: expected a time after {begin:g}, when parts stop, found {end:g}")
         return begin, end
 
-    def ends(self, last: float) -> float:
-        begin, end = self.stretch(last)
-        left = last - (begin if self.at is None else self.at)
-        return last if end == math.inf else end + max(left, 0.0)
+    def end_after(self, end: float) -> float:
+        begin, stop = self.interval(end)
+        left = end - (begin if self.at is None else self.at)
+        return end if stop == math.inf else stop + max(left, 0.0)
 
     def retimed(self, trajectory, parts, begin, end):
         return edits.freeze(trajectory, parts, self.at, begin, end)
@@ -96,15 +99,15 @@ class Freeze(TimeEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Isolate(Freeze):
-    """Only these parts keep moving: all others freeze."""
+    """Only these parts keep moving; all others freeze."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+    def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fade(LookEdit):
-    """Parts become translucent; by default they vanish."""
+    """Parts become translucent, or by default invisible."""
 
     opacity: float = field(default=0.0, metadata=_OPACITY)
 
@@ -114,15 +117,15 @@ class Fade(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Ghost(Fade):
-    """Only these parts are shown: all others, the background too, vanish or become translucent."""
+    """Only these parts are shown; all others, including the background, become invisible or translucent."""
 
-    def concerned(self, trajectory: Trajectory, parts: list[int], lasts: list[float]) -> list[int]:
+    def affected(self, trajectory: Trajectory, parts: list[int], ends: list[float]) -> list[int]:
         return edits.others(trajectory, parts)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(LookEdit):
-    """Parts are larger or smaller, about their handles."""
+    """Parts are scaled about their handles."""
 
     factor: float = field(metadata=_SIZE | {"example": 0.5})
 
@@ -132,7 +135,7 @@ class Scale(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Move(LookEdit):
-    """Parts are elsewhere, `by` metres along the axes of the world."""
+    """Parts are moved `by` metres along the axes of the world."""
 
     by: Vector = field(metadata=vector("metres") | {"example": (0, 0, 0.1)})
 
@@ -142,7 +145,8 @@ class Move(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Rotate(LookEdit):
-    """Parts are turned on top of what they do, about their handles or a point of the canonical scene."""
+    """Parts are rotated in addition to their motion, about their handles or a point of the canonical
+    scene."""
 
     axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
     degrees: float = field(metadata=_DEGREES | {"example": 30})
@@ -155,7 +159,7 @@ class Rotate(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Redirect(LookEdit):
-    """What parts do is turned, not the parts: a lid opens to another side, a drawer slides another way."""
+    """The motion of parts is rotated, not the parts: a lid or a drawer opens in another direction."""
 
     axis: Vector = field(metadata=_AXIS | {"example": (0, 0, 1)})
     degrees: float = field(metadata=_DEGREES | {"example": 30})
@@ -169,7 +173,7 @@ class Redirect(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Amplify(LookEdit):
-    """Parts go `factor` times as far from where they were `at` a time, by default the film's start."""
+    """Parts move `factor` times as far from where they were `at` a time, by default the film's start."""
 
     factor: float = field(metadata=number("a factor from -100 to 100", -100.0, 100.0) | {"example": 1.5})
     at: float | None = field(default=None, metadata=SECONDS)
@@ -180,16 +184,16 @@ class Amplify(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Echo(LookEdit):
-    """Copies follow parts (run ahead if `every` is negative), each fainter than the last by `fade`."""
+    """Copies follow parts (or precede them if `every` is negative), each fainter than the last by `fade`."""
 
     copies: int = field(default=3, metadata=whole(1, 100))
     every: float = field(default=0.2, metadata=number("seconds other than 0", 1e-3, 1e4, of=abs))
     fade: float = field(default=0.5, metadata=_OPACITY)
 
-    def adds_until(self, last: float) -> float:
-        return min(last + max(self.copies * self.every, 0.0), math.inf if self.end is None else self.end)
+    def added_end(self, end: float) -> float:
+        return min(end + max(self.copies * self.every, 0.0), math.inf if self.end is None else self.end)
 
-    def edited(self, film: Film, parts: list[int], lasts: list[float]) -> Film:
+    def applied(self, film: Film, parts: list[int], ends: list[float]) -> Film:
         scene, trajectory = film[0].scene, film[0].trajectory
         copies = [
             edits.echo(trajectory, parts, k * self.every, self.fade**k) for k in range(1, self.copies + 1)
@@ -200,11 +204,11 @@ class Echo(LookEdit):
 
 @dataclass(frozen=True, kw_only=True)
 class Place(Entry):
-    """Where parts of another scene are put.
+    """The placement of parts of another scene.
 
     Attributes:
-        to: where the middle of their handles comes to be at the start; default: where it is there.
-        axis, degrees, scale: how they are turned and how much larger they are, about that middle.
+        to: position of the centre of their handles at the start; default: as in the other scene.
+        axis, degrees, scale: their rotation and scale about that centre.
     """
 
     to: Vector | None = field(default=None, metadata=_POINT)
@@ -215,7 +219,7 @@ class Place(Entry):
 
 @dataclass(frozen=True, kw_only=True)
 class Composite(LookEdit):
-    """Parts of another run are brought in, after `edits` of their own, and put in their `place`."""
+    """Parts of another run are added, after `edits` of their own, at their `place`."""
 
     from_run: str = field(metadata=instance(str, "the folder of a run") | {"example": "runs/other"})
     place: Place = field(
@@ -229,11 +233,11 @@ class Composite(LookEdit):
         default=(), metadata={"check": lambda value: read_edits(value), "wanted": "a list of edits"}
     )
 
-    def adds_until(self, last: float) -> float:
-        return last if self.end is None else min(last, self.end)
+    def added_end(self, end: float) -> float:
+        return end if self.end is None else min(end, self.end)
 
     def joined(self, film: Film, other: Film, parts: list[int]) -> Film:
-        """The film with `parts` of the other's first layer in it, and its further layers whole."""
+        """The film with `parts` of the other's first layer added, and all of its further layers."""
         first, place, hidden = other[0], self.place, 1 - self.share(film)
         handles = first.scene.centers + first.trajectory.poses.translations[0]
         middle = jnp.mean(handles[jnp.array(parts)], axis=0)
@@ -252,14 +256,15 @@ OPERATIONS: dict[str, type[Edit]] = {
         *(Scale, Move, Rotate, Redirect, Amplify),
     )
 }
-"""By their names in scripts."""
+"""The operations by name."""
 
 
 def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
-    """Edits from a list of mappings, or of edits.
+    """Edits from a list of mappings or edits.
 
     Args:
-        first: the number that messages call the first of them by.
+        found: the list.
+        first: number of the first edit in messages.
 
     Raises:
         ValueError: an entry is not as expected; the message begins with its number and operation.
@@ -270,8 +275,30 @@ def read_edits(found: Any, first: int = 1) -> tuple[Edit, ...]:
 
 
 def label(number: int, operation: str) -> str:
-    """What messages call an edit."""
+    """How messages refer to an edit."""
     return f"edit {number} ({operation})"
+
+
+def example_line(operation: str, parts: str) -> str:
+    """An example of an operation that `parse_op` reads, such as
+    `echo:parts=drawer,copies=3,every=0.2,fade=0.5`, with the operation's own keys that have a simple
+    value."""
+    keys = {}
+    for f in (f for f in fields(OPERATIONS[operation]) if f.name not in _COMMON):
+        value = f.metadata["example"] if f.default is MISSING else f.default
+        if value not in (None, ()) and not isinstance(value, Entry):
+            keys[key_of(f)] = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return ",".join([f"{operation}:parts={parts}", *(f"{key}={value}" for key, value in keys.items())])
+
+
+def describe_operation(operation: str) -> list[str]:
+    """A sentence that describes an operation, and a line for its keys, one for all that have the same
+    values."""
+    kind, keys = OPERATIONS[operation], {}
+    for f in sorted(fields(kind), key=lambda f: f.name in _COMMON):  # else as they are declared
+        keys.setdefault(f.metadata["wanted"], []).append(key_of(f))
+    sentence = " ".join((kind.__doc__ or operation).split())
+    return [sentence, *(f"{', '.join(alike)}: {wanted}" for wanted, alike in keys.items())]
 
 
 def _read_edit(found: Any, number: int) -> Edit:
@@ -290,10 +317,10 @@ def _read_edit(found: Any, number: int) -> Edit:
 
 
 def _turn(axis: Vector, degrees: float) -> Float[Array, "3"]:
-    """Axis times angle, radians."""
+    """The rotation as axis times angle, radians."""
     return jnp.array(np.deg2rad(degrees) * np.array(axis) / np.linalg.norm(axis))
 
 
 def _arm(layer: Layer, parts: list[int], about: Vector | None) -> Float[Array, "parts 3"] | None:
-    """From the handles of parts to a point of the canonical scene."""
+    """The vectors from the handles of parts to a point of the canonical scene, metres."""
     return None if about is None else jnp.array(about) - layer.scene.centers[jnp.array(parts)]

@@ -1,6 +1,7 @@
-"""The pictures that steps see: of the frame that is being found, of the past, and of all frames in the end.
-They are loaded on demand and kept on the host or on the device as long as they are needed."""
+"""The pictures that steps use: of the current frame, of the past, and in the end of all frames. They are
+loaded on demand, and cached on the host or on the device while they are needed."""
 
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -11,45 +12,41 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsjax.methods.parts.discovery import Discovery
-from gsjax.methods.parts.stream import Canonical, counted
+from gsjax.methods.parts.stream import Canonical, valid_pixels
 from gsjax.methods.parts.trajectory import BACKGROUND
 from gsjax.methods.protocols import SequenceLike
 from gsjax.scene.frame import Frame, one_camera, part_of
 from gsjax.scene.handles import Blend, HandlePose, skin
 from gsjax.scene.region import TILE, tiles_to_pixels, touched_tiles
 
-WHOLE, HALF = 1, 2
-"""Sizes of pictures, by how many times smaller they are than in the data."""
-_CAMERAS = 4  # of a frame that are used before another frame is opened
+FULL, HALF = 1, 2
+"""Sizes of pictures, as factors by which they are smaller than in the data."""
+_CAMERAS = 4  # used in a row before another frame is loaded
 
 
-class Problem(NamedTuple):
-    """What does not change during a discovery; see `problem_of`.
+@dataclass(frozen=True)
+class Problem:
+    """A recording, with caches of its pictures that are filled on demand.
 
     Attributes:
-        sequence: what synchronised cameras saw.
-        past: frames of the past at half the size, on the host, colours in bytes; filled on demand.
-        now: by size, the frame that is being found, and the weights that say which of its pixels count.
-        whole: the frame that all frames' step sees, by its index.
+        sequence: the recording of synchronised cameras.
+        past: past frames at half size, on the host, with colours in bytes.
+        now: the current frame by size, with the weights by which its pixels were selected.
+        whole: the full frame of the refinement's current step, by its index.
     """
 
     sequence: SequenceLike
-    past: dict[int, Frame]
-    now: dict[int, tuple[Array, Frame]]
-    whole: dict[int, Frame]
-
-
-def problem_of(sequence: SequenceLike) -> Problem:
-    """The problem of a recording, of which nothing is loaded yet."""
-    return Problem(sequence, {}, {}, {})
+    past: dict[int, Frame] = field(default_factory=dict)
+    now: dict[int, tuple[Array, Frame]] = field(default_factory=dict)
+    whole: dict[int, Frame] = field(default_factory=dict)
 
 
 class Draws(NamedTuple):
-    """What a frame's steps draw at random.
+    """The random choices of a frame's steps.
 
     Attributes:
-        cameras: of each step.
-        past: of each step, (frame, camera) of each picture of the past.
+        cameras: the camera of each step.
+        past: for each step, (frame, camera) of each picture of the past.
     """
 
     cameras: list[int]
@@ -58,16 +55,16 @@ class Draws(NamedTuple):
 
 @lru_cache(maxsize=8)
 def draws_of(seed: int, t: int, cameras: int, past: tuple[int, ...], count: int, steps: int) -> Draws:
-    """The cameras and pictures of the past of all steps of frame t: all cameras take turns in a random order,
-    and then in another. The same arguments give the same draws.
+    """The cameras and pictures of the past for all steps of frame t. Cameras take turns in a random order,
+    which is reshuffled after each round. The same arguments give the same draws.
 
     Args:
-        seed: of the discovery.
-        t: the frame.
-        cameras: how many there are.
+        seed: random seed of the discovery.
+        t: index of the frame.
+        cameras: number of cameras.
         past: frames to draw from.
-        count: pictures of the past in a step.
-        steps: of the frame.
+        count: number of pictures of the past in each step.
+        steps: number of steps of the frame.
     """
     rng = np.random.default_rng((seed, t))
     order = np.concatenate([rng.permutation(cameras) for _ in range(64)])
@@ -81,13 +78,13 @@ def draws_of(seed: int, t: int, cameras: int, past: tuple[int, ...], count: int,
 
 @lru_cache(maxsize=8)
 def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: int) -> list[tuple[int, int]]:
-    """(frame, camera) of each step that refines all frames, several cameras of a frame in a row.
+    """(frame, camera) for each step of the refinement, with several cameras of a frame in a row.
 
     Args:
-        seed: of the discovery.
-        frames: to draw from.
-        cameras: how many there are.
-        steps: in all.
+        seed: random seed of the discovery.
+        frames: frames to draw from.
+        cameras: number of cameras.
+        steps: number of steps.
     """
     rng, order = np.random.default_rng((seed, 1)), []
     while len(order) < steps:
@@ -96,62 +93,62 @@ def order_of_pictures(seed: int, frames: tuple[int, ...], cameras: int, steps: i
     return order[:steps]
 
 
-def frame_now(problem: Problem, discovery: Discovery, size: int, blend: Blend) -> Frame:
-    """The frame that is being found, by all cameras.
+def current_frame(problem: Problem, discovery: Discovery, size: int, blend: Blend) -> Frame:
+    """The current frame of all cameras.
 
     Args:
-        problem: keeps it until the next frame.
-        discovery: with the frame, the weights before it, and where parts are thought to be.
-        size: `WHOLE` or `HALF`.
-        blend: of rotations.
+        problem: caches it until the next frame.
+        discovery: the frame, the weights before it, and the predicted poses.
+        size: `FULL` or `HALF`.
+        blend: how rotations are blended.
     """
     weights, frame = problem.now.get(size, (None, None))
     if frame is None or weights is not discovery.weights:
         t = discovery.frame
         pictures = problem.sequence.frame(t)
-        for other in (HALF, WHOLE):
+        for other in (HALF, FULL):
             smaller = part_of(pictures, (), other)
             if other == HALF:
                 problem.past[t] = _on_host(smaller)
             place = discovery.canonical, discovery.weights, discovery.predicted
-            seen = where_parts_are(smaller, *place, TILE // other, blend=blend)
+            seen = with_part_masks(smaller, *place, TILE // other, blend=blend)
             problem.now[other] = discovery.weights, seen
         frame = problem.now[size][1]
     return frame
 
 
-def picture_then(
+def past_picture(
     problem: Problem, discovery: Discovery, t: int, camera: int, blend: Blend
 ) -> tuple[Frame, HandlePose]:
-    """What one camera saw in a frame of the past, at half the size, and where handles were.
+    """The picture of one camera in a past frame, at half size, and the poses of the handles.
 
     Args:
-        problem: keeps the pictures.
-        discovery: with poses, and the weights that say which pixels count.
-        t: the frame.
-        camera: its index.
-        blend: of rotations.
+        problem: caches the pictures.
+        discovery: the poses, and the weights by which pixels are selected.
+        t: index of the frame.
+        camera: index of the camera.
+        blend: how rotations are blended.
     """
     if t not in problem.past:
         problem.past[t] = _on_host(part_of(problem.sequence.frame(t), (), HALF))
     frame = one_camera(problem.past[t], camera)
     frame = eqx.tree_at(lambda f: f.images, frame, jnp.asarray(frame.images, jnp.float32) / 255)
     pose = discovery.pose(t)
-    seen = where_parts_are(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
+    seen = with_part_masks(frame, discovery.canonical, discovery.weights, pose, TILE // HALF, blend=blend)
     return seen, pose
 
 
-def whole_picture(problem: Problem, t: int, camera: int) -> Frame:
-    """What one camera saw in frame t, of which all pixels count that the data does not exclude."""
+def full_picture(problem: Problem, t: int, camera: int) -> Frame:
+    """The picture of one camera in frame t, with all pixels that the data does not mask out."""
     if t not in problem.whole:
         problem.whole.clear()
         problem.whole[t] = problem.sequence.frame(t)
     frame = one_camera(problem.whole[t], camera)
-    return Frame(frame.images, frame.depths, frame.cameras, counted(frame), frame.time)
+    return Frame(frame.images, frame.depths, frame.cameras, valid_pixels(frame), frame.time)
 
 
 @partial(jax.jit, static_argnames=("tile", "blend"))
-def where_parts_are(
+def with_part_masks(
     frame: Frame,
     canonical: Canonical,
     weights: Float[Array, "M P"],
@@ -160,19 +157,19 @@ def where_parts_are(
     *,
     blend: Blend,
 ) -> Frame:
-    """The frame in which pixels count where what moves is, and where it was in the canonical scene.
+    """The frame, masked to the pixels around the parts, at their poses and at their canonical places.
 
     Args:
-        frame: what cameras saw.
-        canonical: the scene.
-        weights: of its movable Gaussians.
-        pose: where handles are.
-        tile: pixels a side of what counts together.
-        blend: of rotations.
+        frame: the pictures.
+        canonical: the canonical scene.
+        weights: weights of its movable Gaussians.
+        pose: poses of the handles.
+        tile: edge of the square blocks of which masks consist, pixels.
+        blend: how rotations are blended.
     """
     moves = weights[:, BACKGROUND] < 0.5
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend).means
-    # What stands still is put behind all cameras' backs, where it touches nothing.
+    # NaN positions touch no tile.
     nowhere = jnp.full_like(moved, jnp.nan)
     places = [jnp.where(moves[:, None], means, nowhere) for means in (moved, canonical.movable.means)]
     counts = tiles_to_pixels(touched_tiles(places, frame, tile), frame, tile)

@@ -1,9 +1,9 @@
-"""All frames together: the scene, which the canonical frame alone has shaped so far, and the poses, each of
-which was found from the last, go down the gradient of what any camera saw in any frame. What came to light
-later, and the shade that parts carry along, are known only then.
+"""Refinement over all frames: the scene, so far fitted to the canonical frame alone, and the poses, each
+found from the previous one, descend the gradient of the loss in any picture of any frame. Only then can the
+scene learn surfaces that were revealed later, and the shadows that parts carry along.
 
-The paper leaves the canonical scene as it is. While parts are still being found, so do we: a scene that may
-change explains away what a piece that is not yet known does.
+The paper leaves the canonical scene fixed. So do we while parts are still being discovered: a scene that may
+change would explain away the motion of an undiscovered part. `parts_step` joins both stages in one step.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +16,15 @@ from jaxtyping import Array, Float, Int
 
 from gsjax.losses.extra import ExtraLosses, extra_terms, named_losses
 from gsjax.methods.parts.config import PartsConfig
-from gsjax.methods.parts.stream import Canonical, PosedScene, moved_on, picture_loss, posed
+from gsjax.methods.parts.stream import (
+    Canonical,
+    PosedScene,
+    StreamParams,
+    picture_loss,
+    pose_after,
+    posed,
+    stream_step,
+)
 from gsjax.optim.step import Step, all_finite, keep_if, per_field_adam
 from gsjax.rasterize.plan import Plan
 from gsjax.scene.frame import Frame
@@ -29,12 +37,12 @@ _FINAL_RATE = 0.1
 
 
 class RefineParams(NamedTuple):
-    """What changes.
+    """The parameters of the refinement.
 
     Attributes:
         movable: Gaussians of the canonical scene that handles may move.
         fixed: all others.
-        poses: where handles are in T frames.
+        poses: poses of the handles in T frames.
     """
 
     movable: Gaussians
@@ -43,16 +51,16 @@ class RefineParams(NamedTuple):
 
 
 class RefineBatch(NamedTuple):
-    """What a step is given.
+    """The input of a step.
 
     Attributes:
         canonical: the handles; its Gaussians are not read.
-        weights: of the movable Gaussians; they stay.
-        frame: what one camera saw at frame t; its masks say which pixels count.
-        t: which frame it is.
-        anchor: the canonical frame, at which all handles are at rest.
-        progress: share of these steps that were made, 0 to 1, over which rates fall.
-        plan: for its pictures.
+        weights: weights of the movable Gaussians, which are constant.
+        frame: the picture of one camera at frame t; its masks select the pixels that count.
+        t: index of the frame.
+        anchor: index of the canonical frame, at which all handles are at rest.
+        progress: share of the refinement that is done, 0 to 1, over which learning rates fall.
+        plan: the render plan.
     """
 
     canonical: Canonical
@@ -68,12 +76,12 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on `RefineParams`, with a state for each frame's pose, given a `RefineBatch`; neither `step` nor
     `key` is used.
 
-    The background's handle does not move, nor does any at the canonical frame. A step whose loss or gradient
-    is not finite, or that overflowed its plan, changes nothing, and `info["skipped"]` reports it.
+    The background's handle never moves, nor does any handle at the canonical frame. A step whose loss or
+    gradient is not finite, or that overflowed its plan, changes nothing, and `info["skipped"]` reports it.
 
     Args:
-        config: of the parts.
-        extra_losses: custom losses (`gsjax.losses.extra`) beside that of pictures.
+        config: settings of the parts.
+        extra_losses: custom losses (`gsjax.losses.extra`), added to the picture loss.
     """
     named_losses(extra_losses)
     poses = optax.adam(1.0, b2=0.99)
@@ -117,7 +125,7 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
             known.append(now)
         moves, pose_state = poses.update(slope[1], pose_state)
         far = jnp.where(batch.t == batch.anchor, 0.0, length)
-        pose = moved_on(pose, moves, batch.canonical, far, far)
+        pose = pose_after(pose, moves, batch.canonical, far, far)
         everywhere = jax.tree.map(
             lambda every, one: every.at[batch.t].set(one), (params.poses, state[1]), (pose, pose_state)
         )
@@ -127,3 +135,22 @@ def refine_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
         return params, state, {**info, "loss": value, "skipped": ~sound}
 
     return Step(init, update)
+
+
+def parts_step(config: PartsConfig, extra_losses: ExtraLosses = ()) -> Step:
+    """`stream_step` of `StreamParams`, `refine_step` of `RefineParams`; neither uses `step` or `key`.
+
+    Args:
+        config: settings of the parts.
+        extra_losses: custom losses `loss(scene, rendered, frame)` (`gsjax.losses.extra`), whose scene is a
+            `PosedScene`.
+    """
+    stream, refine = stream_step(config.stream, extra_losses), refine_step(config, extra_losses)
+
+    def stage(params: StreamParams | RefineParams) -> Step:
+        return refine if isinstance(params, RefineParams) else stream
+
+    def update(params: StreamParams | RefineParams, state: Any, batch: Any, *, step: Any, key: Any):
+        return stage(params).update(params, state, batch, step=step, key=key)
+
+    return Step(lambda params: stage(params).init(params), update)

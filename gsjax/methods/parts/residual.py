@@ -1,4 +1,4 @@
-"""The stream's loss as residuals of the handles' motions, for Gauss-Newton through `gsjax.optim`."""
+"""The loss of `stream` as residuals of the handles' motions, for Gauss-Newton by `gsjax.optim`."""
 
 from functools import partial
 from typing import Any
@@ -10,13 +10,12 @@ from jaxtyping import Array, Float
 
 from gsjax.methods.parts.config import StreamConfig
 from gsjax.methods.parts.screws import pose_of
-from gsjax.methods.parts.stream import FINAL_TEAR, StreamBatch, counted, gaps_between, posed
-from gsjax.methods.parts.trajectory import BACKGROUND
+from gsjax.methods.parts.stream import FINAL_TEAR, StreamBatch, gaps_between, posed, valid_pixels
 from gsjax.optim.residuals import block_residual
 from gsjax.scene.handles import HandlePose
 from gsjax.scene.render import render
 
-_LIMIT = 1.0  # of differences of colour: none is left out, as in the loss
+_LIMIT = 1.0  # of differences of colour: none saturates, as in the loss
 
 
 def pose_residual(
@@ -29,26 +28,26 @@ def pose_residual(
     block: int = 2,
     softness: float = 0.1,
 ) -> tuple[dict[str, Float[Array, "..."]], dict[str, Any]]:
-    """The differences of `stream_loss` by the pose alone, its SSIM left out. Half their squares sum up to the
-    loss for each pixel that counts, but for differences that `block_residual` rounds off.
+    """The residuals of `stream_loss` as a function of the pose alone, without SSIM. Half the sum of their
+    squares is the loss per pixel that counts, up to the rounding of small differences by `block_residual`.
 
     Args:
-        motions: of all P handles, `screws.motions_of` their pose; the background's stays.
-        batch: with a plan whose derivative is "forward", for the Jacobian is made by columns, 6 P of them.
-            Its weights are taken as they are, and its past is not used.
-        step, key: not used; they are part of the residual's form.
-        block, softness: of `block_residual`.
+        motions: motions of all P handles, from `screws.motions_of`; the background's stays.
+        batch: the plan must have derivative "forward", because the Jacobian is built by its 6 P columns. The
+            weights are constant, and past frames are not used.
+        step, key: not used; part of the signature of a residual.
+        config: settings.
+        block, softness: as for `block_residual`.
     """
-    free = (batch.canonical.alive & (jnp.arange(len(batch.canonical.alive)) != BACKGROUND))[:, None]
-    pose = pose_of(motions)
-    pose = jax.tree.map(lambda a: jnp.where(free, a, jax.lax.stop_gradient(a)), pose)
+    free = batch.canonical.free
+    pose = jax.tree.map(lambda a: jnp.where(free, a, jax.lax.stop_gradient(a)), pose_of(motions))
     drawn = render(
         posed(batch.canonical, batch.weights, pose, config.blend),
         batch.now.cameras,
         batch.plan,
         roi=batch.now.masks,
     )
-    frame, counts = batch.now, counted(batch.now).astype(drawn.colors.dtype)[..., None]
+    frame, counts = batch.now, valid_pixels(batch.now).astype(drawn.colors.dtype)[..., None]
     pixels = counts.sum()
     residual = partial(block_residual, block=block, softness=softness)
     residuals = {
@@ -64,7 +63,7 @@ def pose_residual(
 
 
 def _torn(batch: StreamBatch, pose: HandlePose, config: StreamConfig) -> Float[Array, "M k 3"]:
-    """Half its squares sum up to `tearing`, weighted as a frame's first step does."""
+    """Residuals, half the sum of whose squares is `tearing`, weighted as in a frame's first step."""
     gaps = gaps_between(batch.canonical, batch.weights, pose)
     scale = config.tear_scale * batch.canonical.pixel
     far = jnp.sqrt(jnp.sum(gaps**2, axis=-1, keepdims=True) + scale**2)

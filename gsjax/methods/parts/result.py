@@ -1,4 +1,4 @@
-"""What a discovery comes to: a scene with parts, and where these were."""
+"""The result of a discovery: a scene with parts, their poses, and the joints that explain their motions."""
 
 from typing import NamedTuple
 
@@ -6,25 +6,29 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gsjax.geometry.joints import FittedJoint
+from gsjax.geometry.joints import FittedJoint, fit_joint
+from gsjax.geometry.rotations import quats_to_matrices
 from gsjax.methods.parts.film import Layer
-from gsjax.methods.parts.joints import joints_of
-from gsjax.methods.parts.trajectory import PartScene, Trajectory, gaussians_at, moment
+from gsjax.methods.parts.trajectory import BACKGROUND, PartScene, Trajectory, gaussians_at, moment
+from gsjax.methods.parts.unify import motions_of
 from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose
 
+_POINTS = 500  # of a part, to which its joint is fitted ...
+_FAR = 3.0  # ... without those farther from its middle, in median distances: there, rotation noise is large
+_OFF_JOINT = 0.15  # tolerated deviation from a joint, as a share of the part's motion
+
 
 class PartsResult(NamedTuple):
-    """A scene with parts, and where these were in all frames.
+    """A scene with parts, and their poses in all frames.
 
     Attributes:
-        scene: the canonical Gaussians in the order in which they were given, and the weights of P parts, the
-            background first.
+        scene: the canonical Gaussians in their given order, and the weights of P parts, the background first.
         trajectory: poses of the parts at T frames; at rest in frames that were not found yet.
-        done: which frames were found.
+        done: the frames that were found.
         anchor: the canonical frame.
-        pixel: width of a pixel where things move, metres, which poses may be off by.
-        blend: how rotations are blended where a Gaussian follows several parts.
+        pixel: width of a pixel at the moving parts, metres; the error of the poses.
+        blend: how rotations are blended for a Gaussian that follows several parts.
     """
 
     scene: PartScene
@@ -47,7 +51,7 @@ class PartsResult(NamedTuple):
         return Layer(self.scene, poses)
 
     def poses(self, t: int) -> HandlePose:
-        """The poses of all parts at frame t, against the canonical scene; [P,4] and [P,3]."""
+        """The poses of all parts at frame t, relative to the canonical scene; [P,4] and [P,3]."""
         return moment(self.trajectory, t).pose
 
     def at(self, t: int) -> Gaussians:
@@ -56,4 +60,24 @@ class PartsResult(NamedTuple):
 
     def joints(self) -> dict[int, FittedJoint]:
         """The joint that explains the motion of each part best, by part, over the frames that were found."""
-        return joints_of(self.scene, self.trajectory, self.done, self.pixel)
+        motions = motions_in_world(self.scene, self.trajectory)[self.done]
+        labels, means = np.asarray(self.scene.labels), np.asarray(self.scene.gaussians.means, np.float64)
+        joints = {}
+        for part in range(BACKGROUND + 1, self.scene.num_parts):
+            points = means[labels == part]
+            distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+            points = points[distances <= _FAR * np.median(distances)]
+            points = points[:: max(1, len(points) // _POINTS)]
+            joints[part] = fit_joint(motions[:, part], points, noise_m=self.pixel, tolerance=_OFF_JOINT)
+        return joints
+
+
+def motions_in_world(scene: PartScene, trajectory: Trajectory) -> Float[np.ndarray, "T P 4 4"]:
+    """The rigid motions of all parts relative to the canonical scene, in the world's axes."""
+    quats, translations = trajectory.poses.quats, trajectory.poses.translations
+    rotations, shifts, centers = (
+        np.asarray(array, np.float64) for array in (quats_to_matrices(quats), translations, scene.centers)
+    )
+    motions = np.broadcast_to(np.eye(4), (*rotations.shape[:2], 4, 4)).copy()
+    motions[..., :3, :3], motions[..., :3, 3] = motions_of(rotations, shifts, centers)
+    return motions

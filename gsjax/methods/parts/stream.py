@@ -1,6 +1,6 @@
 """One step of the streaming optimisation (MotionSplicer, sections 3.3 and 3.4): the handles' pose at this
-frame and the skinning weights, which all frames share, go down the gradient of what one camera sees now, and
-another saw in a frame of the past, whose pose is frozen.
+frame, and the skinning weights, which all frames share, descend the gradient of the loss in the current
+picture of one camera and in past pictures, whose poses are frozen.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,8 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, rigid_motions, skin
 from gsjax.scene.render import Rendered, render
 
-FINAL_TEAR = 0.2  # of a frame's last step, over that of its first: less would hold back what does tear off
+FINAL_TEAR = 0.2
+"""Tear weight in a frame's last step, relative to its first; it falls so that parts can come apart."""
 
 
 class Canonical(NamedTuple):
@@ -35,13 +36,13 @@ class Canonical(NamedTuple):
 
     Attributes:
         movable: M Gaussians that handles may move.
-        fixed: all others.
-        located: where the movable ones lie in the grid; None where weights are a table.
-        centers: the handles' places, metres.
-        radii: how far from its handle each part reaches, metres.
-        pixel: width of a pixel where things move, metres.
-        alive: which of the P slots hold a handle; the background's is one.
-        neighbors: of each movable Gaussian, rows of all Gaussians, the movable ones first.
+        fixed: all other Gaussians.
+        located: locations of the movable Gaussians in the grid; None if weights are a table.
+        centers: positions of the handles, metres.
+        radii: radii of the parts around their handles, metres.
+        pixel: width of a pixel at the moving parts, metres.
+        alive: the slots, of P, that hold a handle; the background's is one of them.
+        neighbors: neighbours of each movable Gaussian, as indices into all Gaussians, movable ones first.
     """
 
     movable: Gaussians
@@ -53,15 +54,20 @@ class Canonical(NamedTuple):
     alive: Bool[Array, "P"]
     neighbors: Int[Array, "M k"]
 
+    @property
+    def free(self) -> Bool[Array, "P 1"]:
+        """The handles that may move: those of living slots, without the background's."""
+        return (self.alive & (jnp.arange(len(self.alive)) != BACKGROUND))[:, None]
+
 
 class StreamParams(NamedTuple):
-    """What a frame changes.
+    """The parameters of a frame.
 
     Attributes:
-        pose: where handles are.
-        field: what weights are made of.
-        nudges: added to the movable means, metres; always 0, their gradient says where pictures would have
-            each Gaussian go.
+        pose: poses of the handles.
+        field: the skinning weights.
+        nudges: offsets of the movable means, metres; always 0, they exist for their gradient, which points
+            away from where the pictures pull each Gaussian.
     """
 
     pose: HandlePose
@@ -70,12 +76,12 @@ class StreamParams(NamedTuple):
 
 
 class PosedScene(NamedTuple):
-    """The scene at one moment, as extra losses are given it.
+    """The scene at one moment, as passed to extra losses.
 
     Attributes:
-        gaussians: where they are, the movable ones first.
-        weights: of the movable ones.
-        pose: of the handles.
+        gaussians: the moved Gaussians, movable ones first.
+        weights: weights of the movable Gaussians.
+        pose: poses of the handles.
     """
 
     gaussians: Gaussians
@@ -84,16 +90,17 @@ class PosedScene(NamedTuple):
 
 
 class StreamBatch(NamedTuple):
-    """What a step is given.
+    """The input of a step.
 
     Attributes:
-        canonical: the scene.
-        now: this frame; its masks say which pixels count.
-        progress: share of the frame's steps that were made, 0 to 1, over which rates and `tear_weight` fall.
-        plan: for its pictures.
-        weights: before this frame, which are held unless pictures tell otherwise.
-        past: frames of the past and their poses.
-        past_plan: for their pictures.
+        canonical: the canonical scene.
+        now: the current frame; its masks select the pixels that count.
+        progress: share of the frame's steps that are done, 0 to 1, over which learning rates and
+            `tear_weight` fall.
+        plan: the render plan of the current frame.
+        weights: the weights before this frame, to which `hold_weight` ties the current ones.
+        past: past frames and their poses.
+        past_plan: the render plan of past frames.
     """
 
     canonical: Canonical
@@ -106,7 +113,7 @@ class StreamBatch(NamedTuple):
 
 
 def skinning_weights(field: Field, canonical: Canonical) -> Float[Array, "M P"]:
-    """Weights of the movable Gaussians; 0 for slots that hold no handle."""
+    """Weights of the movable Gaussians; 0 for slots without a handle."""
     return weights_of(field, canonical.located, canonical.alive)
 
 
@@ -117,14 +124,14 @@ def posed(
     blend: Blend = "quaternion",
     nudges: Float[Array, "M 3"] | None = None,
 ) -> Gaussians:
-    """The whole scene with its handles at a pose, the movable Gaussians first.
+    """The whole scene with its handles at a pose, movable Gaussians first.
 
     Args:
         canonical: the scene at rest.
-        weights: of its movable Gaussians; rows sum to 1.
-        pose: where handles are.
-        blend: of rotations.
-        nudges: added to the movable means, metres.
+        weights: weights of its movable Gaussians; rows sum to 1.
+        pose: poses of the handles.
+        blend: how rotations are blended.
+        nudges: offsets of the movable means, metres.
     """
     moved = skin(canonical.movable, weights, canonical.centers, pose, blend)
     if nudges is not None:
@@ -132,24 +139,24 @@ def posed(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), moved, canonical.fixed)
 
 
-def counted(frame: Frame) -> Bool[Array, "C H W"]:
-    """Which pixels of a frame count."""
+def valid_pixels(frame: Frame) -> Bool[Array, "C H W"]:
+    """The pixels of a frame that count."""
     return jnp.ones(frame.images.shape[:-1], bool) if frame.masks is None else jnp.asarray(frame.masks)
 
 
 def picture_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[Array, ""]:
-    """lambda L1 + (1 - lambda)(1 - SSIM) on the pixels that count; and where cameras measured depth, its
-    difference, which beyond a limit is that of another thing.
+    """lambda L1 + (1 - lambda)(1 - SSIM) over the pixels that count, and where cameras measure depth, the
+    depth error, which saturates at a limit.
 
     Args:
-        drawn: the scene.
-        frame: what was seen; its masks say which pixels count.
-        config: with lambda, the depth's weight and its limit.
+        drawn: the rendered scene.
+        frame: the observed pictures; their masks select the pixels that count.
+        config: lambda, and the weight and limit of the depth error.
     """
-    target, masks = frame.colors, counted(frame)
+    target, masks = frame.colors, valid_pixels(frame)
     counts = masks.astype(drawn.colors.dtype)
     image = jnp.where(masks[..., None], drawn.colors, target)
-    share = jnp.maximum(counts.mean(), 1e-3)  # a step is as long where little moves
+    share = jnp.maximum(counts.mean(), 1e-3)  # so that the loss does not depend on how much moves
     loss = config.l1_weight * l1_loss(image, target)
     loss += (1 - config.l1_weight) * (1 - ssim(image, target))
     loss = loss / share
@@ -163,15 +170,16 @@ def picture_loss(drawn: Rendered, frame: Frame, config: StreamConfig) -> Float[A
 def tearing(
     canonical: Canonical, weights: Float[Array, "M P"], pose: HandlePose, scale: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """How much of the scene is torn: the share of neighbours whose motions take the same place apart, each
-    counted by r^2 / (r^2 + scale^2) of the gap r. A hinge tears nothing along its axis, and what is torn for
-    good costs no more the farther it goes; but a piece that no picture holds goes with its neighbours.
+    """How much of the scene is torn: the share of pairs of neighbours whose motions pull the same point
+    apart, each counted by r^2 / (r^2 + scale^2) for a gap r. A hinge tears nothing along its axis, and parts
+    that came apart pay no more the farther they go, but a surface that no picture shows follows its
+    neighbours.
 
     Args:
         canonical: the scene at rest, with neighbours.
-        weights: of its movable Gaussians.
-        pose: where handles are.
-        scale: metres.
+        weights: weights of its movable Gaussians.
+        pose: poses of the handles.
+        scale: gap that counts by half, metres.
     """
     squared = jnp.sum(gaps_between(canonical, weights, pose) ** 2, axis=-1)
     return jnp.mean(squared / (squared + scale**2))
@@ -180,12 +188,12 @@ def tearing(
 def gaps_between(
     canonical: Canonical, weights: Float[Array, "M P"], pose: HandlePose
 ) -> Float[Array, "M k 3"]:
-    """By how much the motions of neighbours take the same place apart, metres.
+    """The gaps that open when each Gaussian's mean is moved by its own motion and by its neighbours', metres.
 
     Args:
         canonical: the scene at rest, with neighbours.
-        weights: of its movable Gaussians.
-        pose: where handles are.
+        weights: weights of its movable Gaussians.
+        pose: poses of the handles.
     """
     rotations, offsets = rigid_motions(canonical.centers, pose)
     rigid = jnp.concatenate([rotations, offsets[..., None]], axis=-1).reshape(-1, 12)
@@ -198,12 +206,12 @@ def gaps_between(
 
 
 def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callable:
-    """`loss(params, batch, *, step, key)`: of this frame by pose and field, and of past ones, in the mean, by
-    the field alone. Neither `step` nor `key` is used.
+    """`loss(params, batch, *, step, key)`: the loss of the current frame, with gradients to pose and field,
+    plus the mean loss of past frames, with gradients to the field alone. Neither `step` nor `key` is used.
 
     Args:
-        config: of the stream.
-        extra_losses: given this frame's `PosedScene`, its picture and the frame.
+        config: settings.
+        extra_losses: custom losses of the current frame's `PosedScene`, its rendering and the frame.
     """
 
     def loss(params: StreamParams, batch: StreamBatch, *, step: Any, key: Any):
@@ -211,7 +219,7 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
         gaussians = posed(batch.canonical, weights, params.pose, config.blend, params.nudges)
         drawn = render(gaussians, batch.now.cameras, batch.plan, roi=batch.now.masks)
         value = picture_loss(drawn, batch.now, config)
-        fixed = jax.lax.stop_gradient(weights)  # what stands still in all frames so far tears at no part
+        fixed = jax.lax.stop_gradient(weights)  # the tear penalty moves handles and leaves weights alone
         scale = config.tear_scale * batch.canonical.pixel
         info: dict[str, Any] = {
             "now": value,
@@ -244,38 +252,38 @@ def stream_loss(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Callabl
 
 
 class StreamState(NamedTuple):
-    """What a step carries along.
+    """The state of a step.
 
     Attributes:
-        pose: Adam's moments of the pose, begun anew each frame.
+        pose: Adam's moments of the pose, reset in each frame.
         field: the optimizer's state of the field.
-        pulls: where pictures would have each movable Gaussian go: the sum of the downward gradients by its
-            place over the later half of each frame's steps, where those of a rigid part are balanced.
+        pulls: the direction in which pictures pull each movable Gaussian: the sum of the negative gradients
+            with respect to its position over the later half of each frame's steps, when the pulls on a rigid
+            part are balanced.
     """
 
     pose: optax.OptState
     field: optax.OptState
     pulls: Float[Array, "M 3"]
 
-    def in_new_frame(self) -> "StreamState":
+    def for_new_frame(self) -> "StreamState":
         """The state before a frame's first step."""
         return self._replace(pose=jax.tree.map(jnp.zeros_like, self.pose))
 
 
-def moved_on(
+def pose_after(
     pose: HandlePose, moves: HandlePose, canonical: Canonical, shift: Array, turn: Array
 ) -> HandlePose:
-    """The pose after moves of Adam, of which one of length 1 shifts a part by `shift`, and turns it so far
-    that its border goes by `turn`, metres. The background's handle stays, and so do slots that hold none.
+    """The pose after an update of Adam: an update of length 1 shifts a part by `shift`, and rotates it such
+    that its border moves by `turn`, metres. The background's handle and empty slots stay.
 
     Args:
-        pose: before.
-        moves: of Adam, of length 1 about.
-        canonical: with the parts that there are, and how far each reaches.
+        pose: the pose before.
+        moves: updates of Adam, of length about 1.
+        canonical: the living slots, and the radii of the parts.
         shift, turn: metres, [] for all parts or [P,1].
     """
-    free = (canonical.alive & (jnp.arange(len(canonical.alive)) != BACKGROUND))[:, None]
-    shift, turn = (jnp.where(free, far, 0.0) for far in (shift, turn))
+    shift, turn = (jnp.where(canonical.free, length, 0.0) for length in (shift, turn))
     quats = pose.quats + turn / (2 * canonical.radii[:, None]) * moves.quats  # half the angle
     return HandlePose(normalize_quats(quats), pose.translations + shift * moves.translations)
 
@@ -284,13 +292,13 @@ def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
     """Adam on `StreamParams`, given a `StreamBatch`; neither `step` nor `key` is used.
 
     The background's handle does not move. A step whose loss or gradient is not finite, or that overflowed a
-    plan, changes nothing, and `info["skipped"]` reports it. `info` has the loss of this frame's picture
-    (`now`), of those of the past (`past`) and how much is torn (`torn`), beside what every step reports;
-    where there is a past, `needed` is what both plans needed.
+    plan, changes nothing, and `info["skipped"]` reports it. In addition to what every step reports, `info`
+    has the picture loss of the current frame (`now`), that of past frames (`past`), and how much is torn
+    (`torn`); if there are past frames, `needed` is a pair, one number for each plan.
 
     Args:
-        config: of the stream.
-        extra_losses: custom losses (`gsjax.losses.extra`) beside that of pictures.
+        config: settings.
+        extra_losses: custom losses (`gsjax.losses.extra`), added to the picture loss.
     """
     named_losses(extra_losses)
     loss = stream_loss(config, extra_losses)
@@ -306,11 +314,11 @@ def stream_step(config: StreamConfig, extra_losses: ExtraLosses = ()) -> Step:
         return StreamState(poses.init(params.pose), field, jnp.zeros_like(params.nudges))
 
     def update(params: StreamParams, state: StreamState, batch: StreamBatch, *, step, key):
-        at = params._replace(nudges=jnp.zeros_like(params.nudges))  # a constant costs the program nothing
+        at = params._replace(nudges=jnp.zeros_like(params.nudges))  # constants are free
         (value, info), slope = jax.value_and_grad(loss, has_aux=True)(at, batch, step=step, key=key)
         moves, pose_state = poses.update(slope.pose, state.pose)
         unit = batch.canonical.pixel * config.final_rate**batch.progress
-        pose = moved_on(params.pose, moves, batch.canonical, config.rate * unit, config.turn_rate * unit)
+        pose = pose_after(params.pose, moves, batch.canonical, config.rate * unit, config.turn_rate * unit)
         changes, field_state = fields(params.field).update(
             slope.field, state.field, params.field, allowed=batch.canonical.alive
         )

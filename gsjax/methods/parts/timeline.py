@@ -1,7 +1,7 @@
-"""Edit scripts: a list of operations on named parts, as YAML, and the film that they make of a scene.
+"""Edit scripts: a list of operations on named parts, as YAML, and the film that results.
 
     fps: 15           # frames a second; default: the recording's own
-    length: 8         # seconds; default: as long as the recording and what the edits need
+    length: 8         # seconds; default: as long as the recording and the edits require
     edits:            # one after the other
       - {op: speed, parts: [drawer], factor: 2}
       - {op: echo, parts: [3], copies: 3, every: 0.2, fade: 0.5}
@@ -32,24 +32,24 @@ from gsjax.methods.parts.trajectory import BACKGROUND, Trajectory
 Names = Mapping[str, int]
 """Parts by name."""
 LoadScene = Callable[[str], tuple[Layer, Names]]
-"""From the path of another run to its scene as it was found, and the names of its parts."""
+"""Loads another run from its path: the discovered scene, and the names of its parts."""
 MOST_MOMENTS = 100_000
-"""A film that is longer, if only while it is edited, is a slip."""
+"""Longest film, also while it is edited; a longer one is taken for a mistake."""
 LENGTHS = 0.01, 86400.0
-"""Seconds, of a film."""
+"""Shortest and longest film, seconds."""
 ROUND = 256
-"""Moments: films are edited in multiples of these, so that a new length seldom compiles anything."""
-_INSTANT = 1e-6  # seconds; rounding must not add a moment
+"""Films are edited in multiples of this number of moments, so that a new length seldom compiles anything."""
+_INSTANT = 1e-6  # seconds; so that rounding does not add a moment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Script(Entry):
-    """An edit script, checked.
+    """A checked edit script.
 
     Attributes:
-        fps: frames a second; None is the recording's own.
-        length: seconds; None is as long as the recording and what the edits need.
-        edits: in the order in which they are applied.
+        fps: frames per second; None: those of the recording.
+        length: seconds; None: as long as the recording and the edits require.
+        edits: the edits, in the order of application.
     """
 
     fps: float | None = field(default=None, metadata=number("frames a second, 0.1 to 1000", 0.1, 1000.0))
@@ -58,11 +58,11 @@ class Script(Entry):
 
 
 def parse_script(text: str) -> Script:
-    """The script that YAML describes.
+    """The script in a YAML text.
 
     Raises:
-        ValueError: it is no YAML, or an entry is not as expected; the message names the edit by its number,
-            the operation and the key.
+        ValueError: the text is not YAML, or an entry is not as expected; the message names the number of the
+            edit, the operation and the key.
     """
     with _not_too_deep():
         found = _yaml(text)
@@ -70,10 +70,11 @@ def parse_script(text: str) -> Script:
 
 
 def parse_op(text: str, number: int = 1) -> Edit:
-    """One edit from one line: `speed:parts=drawer,factor=2` or `scale:parts=[1, lid],factor=0.5,from=1`.
+    """The edit in a line such as `speed:parts=drawer,factor=2` or `scale:parts=[1, lid],factor=0.5,from=1`.
 
     Args:
-        number: that messages call it by.
+        text: the line.
+        number: number of the edit in messages.
 
     Raises:
         ValueError: as for `parse_script`.
@@ -86,28 +87,30 @@ def parse_op(text: str, number: int = 1) -> Edit:
 
 
 def to_yaml(script: Script) -> str:
-    """The script as YAML, from which `parse_script` makes an equal one."""
+    """The script as YAML, which `parse_script` reads back."""
     return yaml.safe_dump(_plain(script), sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 
 def apply(script: Script, layer: Layer, names: Names, load_scene: LoadScene | None = None) -> Film:
-    """The film that a script makes of a scene. Its times begin at 0, and what is never seen is left out.
+    """Applies a script to a scene. The film's times begin at 0, and Gaussians that are never visible are
+    removed.
 
     Args:
-        layer: the scene as it was found.
-        names: its parts by name; "background" is known without.
-        load_scene: reads other runs; needed where parts of one are brought in.
+        script: the script.
+        layer: the discovered scene.
+        names: its parts by name; "background" is predefined.
+        load_scene: loads other runs; required by `composite`.
 
     Raises:
-        ValueError: a part is not known, there is nothing for an edit to change, or the film would be too
-            long; the message names the edit by its number and operation.
+        ValueError: a part is unknown, an edit has nothing to change, or the film would be too long; the
+            message names the number of the edit and its operation.
     """
     recorded = np.asarray(layer.trajectory.times, np.float64)
     recorded = recorded - recorded[0]
-    step = 1 / script.fps if script.fps else _step(recorded)
-    plan = _planned(script.edits, layer, names, load_scene)
+    step = 1 / script.fps if script.fps else _frame_time(recorded)
+    plan = _plan_of(script.edits, layer, names, load_scene)
     length = script.length or plan.end(range(layer.scene.num_parts)) + step
-    times = _reaching(np.zeros(1) if script.fps else recorded, step, length)
+    times = _extended(np.zeros(1) if script.fps else recorded, step, length)
     return trimmed(_edited(plan, times[times < length - _INSTANT], step))
 
 
@@ -117,91 +120,91 @@ class _Step:
 
     Attributes:
         edit: the edit.
-        parts: that it changes, or brings in.
-        lasts: when the motion of each part of the scene ends before it, seconds.
-        brought: what it brings in, if that is what it does.
+        parts: the parts that it changes or adds.
+        ends: the end of the motion of each part of the scene before the edit, seconds.
+        added: the plan of the scene that a `Composite` adds.
     """
 
     edit: Edit
     parts: list[int]
-    lasts: list[float]
-    brought: "_Plan | None" = None
+    ends: list[float]
+    added: "_Plan | None" = None
 
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """What edits of a scene come to, before any of them is done.
+    """The planned edits of a scene.
 
     Attributes:
-        layer: the scene as it was found.
-        steps: one after the other.
-        lasts: when the motion of each part of the scene ends after all of them, seconds.
-        added: when that of all copies and of all that was brought in ends.
+        layer: the discovered scene.
+        steps: the edits in order.
+        ends: the end of the motion of each part of the scene after all edits, seconds.
+        added_end: the end of the motion of all copies and added parts, seconds.
     """
 
     layer: Layer
     steps: list[_Step]
-    lasts: list[float]
-    added: float
+    ends: list[float]
+    added_end: float
 
     def end(self, parts: Iterable[int]) -> float:
-        """When nothing moves any more of some parts of the scene and of what was added, seconds."""
-        return max([self.added, *(self.lasts[p] for p in parts)])
+        """The end of the motion of some parts of the scene and of everything added, seconds."""
+        return max([self.added_end, *(self.ends[p] for p in parts)])
 
 
-def _planned(edits: Sequence[Edit], layer: Layer, names: Names, load_scene: LoadScene | None) -> _Plan:
+def _plan_of(edits: Sequence[Edit], layer: Layer, names: Names, load_scene: LoadScene | None) -> _Plan:
     num, times = layer.scene.num_parts, layer.trajectory.times
-    lasts, steps, added = [float(times[-1] - times[0])] * num, [], 0.0
+    ends, steps, added_end = [float(times[-1] - times[0])] * num, [], 0.0
     for place, edit in enumerate(edits):
         with _naming(place, edit):
             if isinstance(edit, Composite):
-                parts, brought = _brought(edit, load_scene)
-                steps.append(_Step(edit, parts, lasts, brought))
-                added = max(added, edit.adds_until(brought.end(parts)))
+                parts, added = _added_by(edit, load_scene)
+                steps.append(_Step(edit, parts, ends, added))
+                added_end = max(added_end, edit.added_end(added.end(parts)))
             else:
-                parts = edit.concerned(layer.trajectory, _numbers(edit.parts, names, num), lasts)
-                steps.append(_Step(edit, parts, lasts))
-                added = max([added, *(edit.adds_until(lasts[p]) for p in parts)])
-                lasts = [edit.ends(last) if p in parts else last for p, last in enumerate(lasts)]
-    return _Plan(layer, steps, lasts, added)
+                parts = edit.affected(layer.trajectory, _numbers(edit.parts, names, num), ends)
+                steps.append(_Step(edit, parts, ends))
+                added_end = max([added_end, *(edit.added_end(ends[p]) for p in parts)])
+                ends = [edit.end_after(end) if p in parts else end for p, end in enumerate(ends)]
+    return _Plan(layer, steps, ends, added_end)
 
 
-def _brought(edit: Composite, load_scene: LoadScene | None) -> tuple[list[int], _Plan]:
-    """The parts that a composite brings in, and what its own edits of them come to."""
+def _added_by(edit: Composite, load_scene: LoadScene | None) -> tuple[list[int], _Plan]:
+    """The parts that a composite adds, and the plan of its own edits."""
     if load_scene is None:
-        raise ValueError("from_run: expected load_scene, which reads other runs, found none; pass it on")
+        raise ValueError("from_run: expected load_scene, which loads other runs, found none; pass it")
     layer, names = load_scene(edit.from_run)
     parts = _numbers(edit.parts, names, layer.scene.num_parts)
-    return parts, _planned(edit.edits, layer, names, load_scene)
+    return parts, _plan_of(edit.edits, layer, names, load_scene)
 
 
 def _edited(plan: _Plan, times: Float[np.ndarray, "T"], step: float) -> Film:
-    """The film at `times`. While it is edited it is as long as any edit needs it."""
+    """The film at `times`; in between it is as long as any edit requires."""
     layer = plan.layer
-    longest = max(last for lasts in (*(at.lasts for at in plan.steps), plan.lasts) for last in lasts)
+    longest = max(end for ends in (*(at.ends for at in plan.steps), plan.ends) for end in ends)
     dtype = layer.trajectory.times.dtype
-    longer = _reaching(times, step, longest + step)
-    longer = _reaching(longer, step, longer[-1] + step * (1 + -len(longer) % ROUND))
+    longer = _extended(times, step, longest + step)
+    longer = _extended(longer, step, longer[-1] + step * (1 + -len(longer) % ROUND))
     recorded = eqx.tree_at(
         lambda t: t.times, layer.trajectory, layer.trajectory.times - layer.trajectory.times[0]
     )
     film: Film = (Layer(layer.scene, at_times(recorded, jnp.asarray(longer, dtype))),)
     for place, at in enumerate(plan.steps):
         with _naming(place, at.edit):
-            if isinstance(at.edit, Composite) and at.brought is not None:
-                film = at.edit.joined(film, _edited(at.brought, longer, step), at.parts)
+            if isinstance(at.edit, Composite) and at.added is not None:
+                film = at.edit.joined(film, _edited(at.added, longer, step), at.parts)
             else:
-                film = at.edit.edited(film, at.parts, at.lasts)
-    return tuple(Layer(one.scene, _begun(one.trajectory, len(times))) for one in film)
+                film = at.edit.applied(film, at.parts, at.ends)
+    return tuple(Layer(one.scene, _first_moments(one.trajectory, len(times))) for one in film)
 
 
-def _begun(trajectory: Trajectory, moments: int) -> Trajectory:
-    """Its first moments. On the host, where nothing is compiled for it (`jnp.asarray` would)."""
+def _first_moments(trajectory: Trajectory, moments: int) -> Trajectory:
+    """The first moments of a trajectory; on the host, where slicing compiles nothing."""
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[:moments]), trajectory)
 
 
 def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
-    """Parts by number, each once."""
+    """Numbers of the parts, without duplicates."""
     known, numbers = {"background": BACKGROUND, **names}, []
     for part in parts:
         if part == ALL:
@@ -217,15 +220,15 @@ def _numbers(parts: Sequence[str | int], names: Names, num: int) -> list[int]:
     return list(dict.fromkeys(numbers))
 
 
-def _step(times: Float[np.ndarray, "T"]) -> float:
+def _frame_time(times: Float[np.ndarray, "T"]) -> float:
     """Seconds from one moment to the next."""
     if len(times) < 2:
         raise ValueError("fps: expected frames a second, as the recording is of one moment; found nothing")
     return float(np.median(np.diff(times)))
 
 
-def _reaching(times: Float[np.ndarray, "T"], step: float, until: float) -> Float[np.ndarray, "S"]:
-    """These times, and more, `step` seconds apart, as far as they are before `until`."""
+def _extended(times: Float[np.ndarray, "T"], step: float, until: float) -> Float[np.ndarray, "S"]:
+    """The times, extended by steps of `step` seconds up to `until`."""
     if until / step > MOST_MOMENTS:
         found = f"{until:g} s at {1 / step:g} frames a second"
         raise ValueError(
@@ -237,7 +240,7 @@ def _reaching(times: Float[np.ndarray, "T"], step: float, until: float) -> Float
 
 
 def _plain(entry: Entry) -> dict[str, Any]:
-    """As YAML has it; what is as it would be anyway is left out."""
+    """The entry as YAML writes it, without defaults."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Entry):
@@ -256,13 +259,13 @@ def _yaml(text: str) -> Any:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         fault = f"a fault in line {mark.line + 1}: {problem}" if mark else str(error)
         raise ValueError(f"expected YAML, found {fault}") from None
-    except (ValueError, OverflowError) as error:  # of a date that is none, a number too long to read
+    except (ValueError, OverflowError) as error:  # an invalid date, or a number that is too long
         raise ValueError(f"expected YAML, found a value that cannot be read: {error}") from None
 
 
 @contextmanager
 def _not_too_deep() -> Iterator[None]:
-    """A ValueError where something is nested deeper than Python can follow."""
+    """Raises ValueError where something is nested too deeply for Python."""
     try:
         yield
     except RecursionError:
@@ -271,7 +274,7 @@ def _not_too_deep() -> Iterator[None]:
 
 @contextmanager
 def _naming(place: int, edit: Edit) -> Iterator[None]:
-    """Errors name the edit in this place."""
+    """Adds the number and the operation of an edit to errors."""
     try:
         yield
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""What a discovery comes to and edits work on: Gaussians with weights, and handles over time."""
+"""The data that a discovery produces and edits transform: Gaussians with weights, and handles over time."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from gsjax.scene.gaussians import Gaussians
 from gsjax.scene.handles import Blend, HandlePose, at_rest, skin
 
 BACKGROUND = 0
-"""The handle of all that stands still; its pose is the identity."""
-_OPAQUE = 40.0  # a logit beyond which an opacity is 1 in float32; its exponential stays finite
-_FAINTEST = 1e-9  # factor on the opacity of what is hidden, so that its logit stays finite
+"""The handle of the static background; its pose is the identity."""
+_OPAQUE = 40.0  # largest logit: its opacity is 1 in float32, and its exponential is finite
+_FAINTEST = 1e-9  # factor on the opacity of hidden Gaussians, so that their logits stay finite
 
 
 class PartScene(eqx.Module):
-    """A canonical scene and which handles move what of it.
+    """A canonical scene and the handles that move it.
 
     Attributes:
-        gaussians: N of them, at the anchor frame.
-        weights: of each Gaussian, 1 in sum. Column 0 is the background's.
-        centers: the handles' places in the canonical scene, metres.
+        gaussians: N Gaussians, at the anchor frame.
+        weights: weights of each Gaussian, which sum to 1. Column 0 is the background's.
+        centers: positions of the handles in the canonical scene, metres.
     """
 
     gaussians: Gaussians
@@ -40,11 +40,11 @@ class PartScene(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """Where P handles are at T moments, and how their parts are shown.
+    """Poses of P handles at T moments, and the appearance of their parts.
 
     Attributes:
         times: seconds, increasing.
-        poses: of the handles against the canonical scene.
+        poses: poses of the handles relative to the canonical scene.
         opacities: factors on the opacities of each part's Gaussians, 0 to 1; 0 hides it.
         scales: factors on the size of each part, about its handle.
     """
@@ -61,13 +61,13 @@ class Trajectory(eqx.Module):
 
 
 def trajectory_of(times: Float[Array, "T"], poses: HandlePose) -> Trajectory:
-    """The trajectory that was seen: all parts shown, none larger or smaller."""
+    """The trajectory with these poses, with all parts visible at their own size."""
     ones = jnp.ones(poses.translations.shape[:2], poses.translations.dtype)
     return Trajectory(times, poses, ones, ones)
 
 
 def still(num_parts: int, times: Float[Array, "T"]) -> Trajectory:
-    """Nothing moves."""
+    """The trajectory in which nothing moves."""
     rest = at_rest(num_parts)
     every = (len(times), 1, 1)
     return trajectory_of(times, HandlePose(jnp.tile(rest.quats, every), jnp.tile(rest.translations, every)))
@@ -88,18 +88,18 @@ def moment(trajectory: Trajectory, t: Int[Array, ""] | int) -> Moment:
 
 
 def gaussians_at(scene: PartScene, now: Moment, blend: Blend = "quaternion") -> Gaussians:
-    """The scene at a moment: parts are scaled about their handles, moved, and shown as far as they are.
+    """The scene at a moment: parts are scaled about their handles, moved, and faded.
 
-    A Gaussian between parts goes where its weights' mean has it, as in skinning, and is as large and as
-    visible as that. What is 1 times as large and wholly shown is as it was, to the bit.
+    A Gaussian between parts takes the weighted mean of their positions, as in skinning, and of their scales
+    and opacities. With scale and opacity 1 a Gaussian is unchanged, to the bit.
 
     Args:
         scene: the parts.
-        now: the moment, where they are, how large and how visible.
-        blend: of rotations.
+        now: poses, scales and opacities of the parts.
+        blend: how rotations are blended.
     """
     gaussians, weights = scene.gaussians, scene.weights
-    # From the change on, so that weights which sum to 1 but for rounding change nothing by it.
+    # Written in terms of the change, so that the rounding of weights that sum to 1 has no effect.
     larger = now.scales - 1
     growth = (weights @ larger)[:, None]
     means = gaussians.means + growth * gaussians.means - weights @ (larger[:, None] * scene.centers)

@@ -1,9 +1,9 @@
-"""Unify and split: parts that move alike become one, and one that moves as two is divided (MotionSplicer,
+"""Unify and split: parts that move alike are joined, and a part that moves as two is divided (MotionSplicer,
 section 3.2).
 
-Two parts are compared by where they would take the points of both, over all frames in which both were there:
-a translation alone depends on the pivot. They are compared only if both have moved in these beyond what
-tracking errs by: parts that stand where they stood at first move alike, and are not one for that.
+Two parts are compared by the positions to which they would take the points of both, over all frames in which
+both existed; translations alone would depend on the pivot. They are compared only if both have moved by more
+than the tracking error in these frames: parts that have not moved yet move alike, but need not be one.
 """
 
 from itertools import combinations
@@ -29,7 +29,7 @@ class Motions(NamedTuple):
     offsets: Float[np.ndarray, "T P 3"]
 
     def since(self, frame: int) -> "Motions":
-        """Without earlier frames."""
+        """The motions without earlier frames."""
         return Motions(self.rotations[frame:], self.offsets[frame:])
 
 
@@ -38,23 +38,24 @@ def motions_of(
     translations: Float[np.ndarray, "T P 3"],
     centers: Float[np.ndarray, "P 3"],
 ) -> Motions:
-    """The motions of handles that turn about their own places.
+    """The motions of handles that rotate about their own centres.
 
     Args:
-        rotations: of P handles in T frames.
-        translations: of the same, metres.
-        centers: about which they turn, metres.
+        rotations: rotations of P handles in T frames.
+        translations: translations of the same, metres.
+        centers: centres of rotation, metres.
     """
     return Motions(rotations, centers + translations - np.einsum("tpij,pj->tpi", rotations, centers))
 
 
 def gap(motions: Motions, a: int, b: int, points: Float[np.ndarray, "n 3"]) -> float:
-    """How far two parts' motions take the same points apart, root mean square over frames, metres.
+    """The distance between the same points moved by two parts, root mean square over points and frames,
+    metres.
 
     Args:
-        motions: of all parts.
-        a, b: the two.
-        points: canonical, metres.
+        motions: motions of all parts.
+        a, b: indices of the two parts.
+        points: canonical points, metres.
     """
     turn = motions.rotations[:, a] - motions.rotations[:, b]
     shift = motions.offsets[:, a] - motions.offsets[:, b]
@@ -63,13 +64,13 @@ def gap(motions: Motions, a: int, b: int, points: Float[np.ndarray, "n 3"]) -> f
 
 
 def extent(motions: Motions, part: int, points: Float[np.ndarray, "n 3"]) -> float:
-    """How far a part has moved from where it was in the canonical scene, at most over frames, metres; 0
-    without frames.
+    """The largest displacement of a part from its canonical place over frames, root mean square over points,
+    metres; 0 without frames.
 
     Args:
-        motions: of all parts.
-        part: which.
-        points: its own, canonical, metres.
+        motions: motions of all parts.
+        part: index of the part.
+        points: canonical points of the part, metres.
     """
     turn = motions.rotations[:, part] - np.eye(3)
     moved = np.einsum("tij,nj->tni", turn, points) + motions.offsets[:, part][:, None]
@@ -86,26 +87,27 @@ def unified(
     noise_m: float,
     tolerance: float,
 ) -> Int[np.ndarray, "P"]:
-    """For each part the one that it is joined to: itself, or the largest of those that it moves like.
+    """The part that each part is joined to: itself, or the largest of those that move alike.
 
-    Pairs are joined from the most alike on; whoever joins takes the larger one's motion, so that chains of
-    small differences do not grow.
+    Pairs are joined in order of similarity; the smaller part takes the motion of the larger one, so that
+    small differences do not add up along chains.
 
     Args:
-        motions: of all parts, over the frames seen so far.
-        points: canonical, metres.
+        motions: motions of all parts, over the frames found so far.
+        points: canonical points, metres.
         labels: the part of each point.
-        alive: which parts there are; the background's never joins here.
-        since: from which of the frames on a part's motion is its own: before, it was part of another.
-        noise_m: error of tracking, metres: what moved less is not compared, a smaller gap is none.
-        tolerance: gap that is none, as a share of the lesser of the two motions.
+        alive: the slots that hold a part; the background is never joined here.
+        since: the frame from which each part's motion is its own; before, it belonged to another part.
+        noise_m: tracking error, metres: parts that moved less are not compared, and smaller gaps do not
+            count.
+        tolerance: largest gap between parts that move alike, as a share of the smaller of both motions.
     """
     into = np.arange(len(alive))
     sizes = np.bincount(labels, minlength=len(alive))
     mine = {int(p): points[labels == p] for p in np.flatnonzero(alive & (sizes > 0)) if p != BACKGROUND}
 
     def apart(p: int, q: int) -> float:
-        """The gap between two parts, in what counts as none."""
+        """The gap between two parts, relative to the largest one of parts that move alike."""
         own = motions.since(int(max(since[p], since[q])))
         moved = min(extent(own, part, mine[part]) for part in (p, q))
         if moved <= noise_m:
@@ -126,12 +128,12 @@ def unified(
 
 
 class Cut(NamedTuple):
-    """Where a part would be divided.
+    """A division of a part by a plane.
 
     Attributes:
-        beyond: which of its points lie beyond the cut.
-        score: how far the two sides' pulls differ, in what chance would make of them; above some 6 it is no
-            chance.
+        beyond: the points of the part that lie beyond the cut.
+        score: difference of the two sides' pulls, relative to what chance would make; above about 6 it is
+            significant.
     """
 
     beyond: Bool[np.ndarray, "n"]
@@ -139,14 +141,15 @@ class Cut(NamedTuple):
 
 
 def best_cut(points: Float[np.ndarray, "n 3"], pulls: Float[np.ndarray, "n 3"]) -> Cut:
-    """The plane across one of a part's principal axes on whose sides pictures pull most differently.
+    """The plane across one of a part's principal axes between whose sides the pulls of the pictures differ
+    most.
 
-    Of a part that moves as one, the pulls that are left at frames' ends are noise; of one that moves as two,
-    they are of one mind on each side. Strong pulls count little more than typical ones, for at edges chance
-    pulls strongly too. Points that feel no pull, because nothing shows of them, do not count.
+    In a part that moves as one, the pulls that remain at the end of a frame are noise; in one that moves as
+    two, they agree on each side. Strong pulls count little more than typical ones, because noise is strong at
+    edges. Points without a pull, which are not visible, do not count.
 
     Args:
-        points: of the part, canonical, metres.
+        points: canonical points of the part, metres.
         pulls: as in `StreamState`.
     """
     felt = np.linalg.norm(pulls, axis=1) > 0
@@ -155,8 +158,8 @@ def best_cut(points: Float[np.ndarray, "n 3"], pulls: Float[np.ndarray, "n 3"]) 
     middle = points[felt].mean(0)
     axes = np.linalg.svd(points[felt] - middle, full_matrices=False)[2]
     strengths = np.linalg.norm(pulls[felt], axis=1, keepdims=True)
-    minds = pulls[felt] / (strengths + np.median(strengths))
-    off = minds - minds.mean(0)
+    damped = pulls[felt] / (strengths + np.median(strengths))
+    off = damped - damped.mean(0)
     typical = np.sqrt(np.mean(np.sum(off**2, axis=1)))
     best = Cut(np.zeros(len(points), bool), 0.0)
     for axis in axes:

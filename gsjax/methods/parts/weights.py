@@ -1,4 +1,4 @@
-"""What skinning weights are made of: a feature grid over the scene, fitted at first to what was lifted
+"""Fields of skinning weights: a feature grid over the scene, initially fitted to the lifted weights
 (MotionSplicer, section 3.3), or a table."""
 
 from functools import partial
@@ -14,30 +14,31 @@ from gsjax.methods.parts.config import PartsConfig
 from gsjax.scene.feature_grid import FeatureGrid, Located, init_feature_grid, locate
 
 _RATE = 1e-2
-_MARGIN = 0.05  # of the box, beyond the outermost Gaussians, in its own size
-_LEAST = 1e-4  # weight; smaller ones count as this large where they become logits
+_MARGIN = 0.05  # of the grid's box around the outermost Gaussians, relative to its size
+_LEAST = 1e-4  # smallest weight when weights are converted to logits
 
 
 class SimplexTable(eqx.Module):
-    """Weights themselves, a row for each Gaussian; the optimizer keeps them on the simplex."""
+    """The weights of each Gaussian; the optimizer keeps them on the simplex."""
 
     weights: Float[Array, "M P"]
 
 
 Field = FeatureGrid | SimplexTable | Float[Array, "M P"]
-"""What weights are made of: a grid over the canonical scene, a table of them, or one of their logits."""
+"""A grid over the canonical scene, a table of weights, or a table of their logits."""
 
 
 def new_field(
     key: PRNGKeyArray, config: PartsConfig, means: Float[Array, "M 3"], parts: int
 ) -> tuple[Field, Located | None]:
-    """The field that `config.weights` names, and where the Gaussians lie in it; a grid is over their box.
+    """A new field of the kind that `config.weights` names, and the Gaussians' locations in it. A grid spans
+    their bounding box.
 
     Args:
-        key: random key of a grid's first values.
-        config: with the kind of weights.
-        means: of the movable Gaussians, metres.
-        parts: how many columns weights have.
+        key: random key for the initial values of a grid.
+        config: selects the kind of field.
+        means: means of the movable Gaussians, metres.
+        parts: number of weights per Gaussian.
     """
     if config.weights != "grid":
         empty = jnp.zeros((len(means), parts))
@@ -49,7 +50,7 @@ def new_field(
 
 
 def weights_of(field: Field, located: Located | None, alive: Bool[Array, "P"]) -> Float[Array, "M P"]:
-    """Weights that sum to 1, and 0 for slots that are not alive."""
+    """The weights of a field, which sum to 1 and are 0 for slots that are not alive."""
     if isinstance(field, SimplexTable):
         return field.weights
     logits = field.at(located) if isinstance(field, FeatureGrid) else field
@@ -63,42 +64,27 @@ def fit_field_to_weights(
     alive: Bool[Array, "P"],
     iterations: int = 100,
 ) -> tuple[Field, Float[np.ndarray, "iterations"]]:
-    """The field that has these weights, and the losses of its fit: a table has them at once, a grid as far as
-    it comes in the given number of steps.
+    """A field with the given weights, and the losses of its fit. A table takes the weights exactly; a grid is
+    fitted to them by cross-entropy.
 
     Args:
-        field: of the kind that is wanted; a grid begins with its values.
-        located: where Gaussians lie in a grid.
-        weights: targets; rows sum to 1.
-        alive: parts that there are.
-        iterations: steps of a grid.
+        field: a field of the desired kind; the fit of a grid starts from it.
+        located: the Gaussians' locations in a grid.
+        weights: target weights; rows sum to 1.
+        alive: the slots that hold a part.
+        iterations: steps of Adam for a grid.
     """
     if isinstance(field, SimplexTable):
         return SimplexTable(weights), np.zeros(0)
     if not isinstance(field, FeatureGrid):
         return jnp.log(jnp.maximum(weights, _LEAST)), np.zeros(0)
     assert located is not None
-    grid, losses = warmed_up(field, located, weights, alive, iterations)
+    grid, losses = _fitted_grid(field, located, weights, alive, iterations)
     return grid, np.asarray(losses)
 
 
 @partial(jax.jit, static_argnames="iterations")
-def warmed_up(
-    grid: FeatureGrid,
-    located: Located,
-    weights: Float[Array, "M P"],
-    alive: Bool[Array, "P"],
-    iterations: int = 100,
-) -> tuple[FeatureGrid, Float[Array, "iterations"]]:
-    """The grid fitted to these weights by cross-entropy, and the loss over the iterations.
-
-    Args:
-        grid: to begin with.
-        located: where the Gaussians lie in it.
-        weights: targets.
-        alive: which slots hold a handle; the others get no weight.
-        iterations: steps of Adam.
-    """
+def _fitted_grid(grid: FeatureGrid, located: Located, weights, alive, iterations: int):
     optimizer = optax.adam(_RATE, eps=1e-12)
 
     def loss(grid):
