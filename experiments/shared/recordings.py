@@ -1,4 +1,4 @@
-"""What experiments with the tracker share: recordings, their scenes, and scores as `gsjax track` has them."""
+"""What experiments with the tracker share: recordings, their scenes, and the scores of `gsjax track`."""
 
 import os
 from functools import lru_cache
@@ -24,7 +24,7 @@ QUIET = Console(stderr=True, quiet=True)
 
 
 class Start(NamedTuple):
-    """What a tracker begins with."""
+    """A recording and the scene that the tracker starts from."""
 
     recording: Recording
     mask: FirstMask
@@ -43,18 +43,22 @@ def recorded(name: str) -> Path:
 def started(
     dataset: str, frames: str, cameras: tuple[int, ...], held_out: tuple[int, ...], config: StartConfig
 ) -> Start:
-    """A recording and its scene at the first frame, made once for several settings of the tracker."""
+    """The start of a recording, made once for several settings of the tracker."""
     jax.clear_caches()  # every scene has shapes of its own, and programs fill the process's memory map
-    recording = open_recording(dataset, cameras, held_out, frames)
+    return start_of(open_recording(dataset, cameras, held_out, frames), TrackConfig(start=config))
+
+
+def start_of(recording: Recording, config: TrackConfig) -> Start:
+    """A recording and its scene at the first frame, from the mask of camera `MASK_CAMERA`."""
     draw_ahead(recording, QUIET)
     mask, frame = first_mask(recording.tracked, MASK_CAMERA, "files"), recording.tracked.frame(0)
     assert mask.labels is not None
-    scene = start_scene(frame, mask.labels, cameras.index(MASK_CAMERA), TrackConfig(start=config))
-    return Start(recording, mask, frame, scene)
+    camera = recording.tracked.camera_ids.index(MASK_CAMERA)
+    return Start(recording, mask, frame, start_scene(frame, mask.labels, camera, config))
 
 
 def tracked(start: Start, config: TrackConfig) -> Tracking:
-    """All of it followed; what stops it is raised."""
+    """The whole recording tracked; an error that ends the loop is raised."""
     tracking = follow(begin(start.scene), start.frame, start.recording.tracked, config, QUIET)
     if tracking.stopped is not None:
         raise tracking.stopped
@@ -62,7 +66,7 @@ def tracked(start: Start, config: TrackConfig) -> Tracking:
 
 
 def scored(start: Start, tracking: Tracking, every: int = 1) -> dict[str, Any]:
-    """Means over the objects that move; pictures and labels of every so-manieth frame."""
+    """Means over the objects that move; every n-th frame is compared as a picture and by its labels."""
     recording = start.recording
     values, truth = group_values(tracking, start.mask, recording), recording.tracked.truth
     scores = Scores(values, None if truth is None else truth.robot)
