@@ -25,26 +25,20 @@ from gsjax.methods.track import PRESETS, TrackedScene
 from gsjax.scene.frame import Frame
 
 FAST = PRESETS["fast"]
-# Colours come straight from the pixels, and no Gaussians join objects: fewer programs to compile for a trial.
+# Colours come straight from the pixels, and no Gaussians join objects: fewer programs to compile.
 CONFIG = replace(FAST, grow=replace(FAST.grow, slots=0))
 WIDTH, HEIGHT, MASK_CAMERA = 240, 180, 0
 OWN, BACKGROUND = 512, 8192  # Gaussians of an object and of the background
 OTHERS, NEAR = 1024, 0.25  # points around an object that may be in the way, and their distance, metres
-# Colours come straight from the pixels, and no Gaussians join objects: fewer programs to compile.
-# 4 and 2 mm are added.
+# robosuite's hand: its palm starts 31 mm behind the tool's point and its fingers end 9 mm beyond it. Margins
+# of 4 and 2 mm are added.
 GRIPPER = Gripper(finger_thickness=0.027, finger_height=0.038, tip=0.011, palm_height=0.092)
 KEY = jax.random.key(0)
 TILT = 0.35  # of the approach away from straight down, radians
 SEARCH = 4  # the held grasp is scored at every update, and new ones are drawn at every fourth
 BETTER = 0.1  # a new grasp replaces the held one if its score is this much larger
-CARROT = (
-    0.045  # lead of the commanded position along the path, metres: its speed is this over the servos' lag
-)
-AT_GRASP = (
-    0.004,
-    0.008,
-    0.08,
-)  # tolerances across and along the approach, metres, and in angle, radians, at which the fingers close
+CARROT = 0.045  # lead of the commanded position, metres: over the servos' lag this is the tool's speed
+AT_GRASP = (0.004, 0.008, 0.08)  # across and along the approach, metres, and radians: then the fingers close
 REACHING, CLOSING, LIFTING, HOLDING = 260, 14, 45, 15  # control periods at most
 LIFT, LIFTED = 0.15, 0.10  # rise of the tool, and of an object that counts as lifted, metres
 WINDOW = 8  # frames from which the object's velocity is estimated

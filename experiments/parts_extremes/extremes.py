@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from experiments.shared.discoveries import FIT, Options, canonical_of
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence, open_sequence
 from gsjax.engine.drive import drive
 from gsjax.io.ply import read_ply
@@ -24,7 +25,7 @@ from gsjax.methods.parts import (
     choose_anchor,
     moved_pixels,
 )
-from gsjax.metrics.tracking import relative_motion, true_labels
+from gsjax.metrics.tracking import relative_motion
 from gsjax.perception.segmenters import PieceSegmenter
 from gsjax.scene.gaussians import Gaussians, take
 
@@ -106,10 +107,7 @@ def as_it_is(folder: Path) -> Case:
     sequence = open_sequence(DATASET)
     fit = replace(FIT, steps=1500, cap=5_000, start=replace(FIT.start, count=3_000))
     gaussians, _ = read_ply(canonical_of(Options(DATASET, folder, anchor=0, fit=fit), folder) / "scene.ply")
-    seen = zip(
-        *((sequence.mask(0, c), sequence.depth(0, c)) for c in range(sequence.num_cameras)), strict=True
-    )
-    labels = true_labels(np.asarray(gaussians.means), *seen, list(sequence.viewmats[0]), list(sequence.Ks[0]))
+    labels = labels_at(sequence, np.asarray(gaussians.means))
     config = PartsConfig()
     return Case(sequence, gaussians, labels, replace(config, refine=replace(config.refine, iterations=60)))
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
-from experiments.shared.deforming import Dataset, Reconstructed, seen_as
+from experiments.shared.deforming import Dataset, Reconstructed, lifted, seen_as
 from gsjax.engine.deform.scores import classes_of_pixels
 from gsjax.metrics.features import feature_psnr
 from gsjax.metrics.segmentation import LabelOverlap
@@ -30,17 +30,14 @@ def region_map(data: Dataset, t: int) -> Int[np.ndarray, "h w"]:
     height, width = seen.shape
     high, wide = data.truth["seg"][t].shape
     seg = data.truth["seg"][t][np.ix_(np.arange(height) * high // height, np.arange(width) * wide // width)]
-    y, x = np.nonzero((seg == 1) & (seen > 0))
-    depth = seen[y, x].astype(np.float64)
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
-    camera_to_world = np.linalg.inv(viewmat)
-    points = (rays * depth[:, None]) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    tissue = (seg == 1) & (seen > 0)
+    points = lifted(seen, tissue, viewmat, K)
     apart, which = cKDTree(data.truth["verts"][t]).query(points, k=_NEAREST)
     weights = 1 / np.maximum(apart, 1e-9) ** 2
     uv = (data.truth["uv"][which] * weights[..., None]).sum(axis=1) / weights.sum(axis=1, keepdims=True)
     regions = np.full((height, width), -1, np.int32)
     regions[seg == 0] = BACKGROUND
-    regions[y, x] = 1 + np.linalg.norm(uv[:, None] - _SEEDS_UV, axis=-1).argmin(axis=1)
+    regions[tissue] = 1 + np.linalg.norm(uv[:, None] - _SEEDS_UV, axis=-1).argmin(axis=1)
     return regions
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 import gsjax
 from experiments.shared.deform_regions import REGIONS, region_map
-from experiments.shared.deforming import TOOL, Dataset, split
+from experiments.shared.deforming import TOOL, Dataset, lifted, pixels_in, split
 from gsjax.methods.deform import Question
 from gsjax.scene.frame import Frame
 
@@ -77,10 +77,8 @@ class Truth:
 
     def points(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
         """World points of a class that frame `t` shows."""
-        (viewmat, K), depth = self.pose(t), self.depths[t]
-        rows, columns = np.nonzero((self.pieces[t][k] > 0) & (depth > 0))
-        rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(K).T
-        return (rays * depth[rows, columns, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+        depth = self.depths[t]
+        return lifted(depth, (self.pieces[t][k] > 0) & (depth > 0), *self.pose(t))
 
     def surface(self, t: int, k: int) -> Float[np.ndarray, "n 3"]:
         """`points` without those whose label and depth belong to two surfaces, as on an edge: tissue is near
@@ -115,13 +113,9 @@ class Truth:
             turn = pose[g] @ np.linalg.inv(pose[f]) if k == THE_TOOL else np.eye(4)
             end = start @ turn[:3, :3].T + turn[:3, 3]
         else:
-            (viewmat, K), verts = self.pose(f), self.data.truth["verts"]
-            local = verts[f] @ viewmat[:3, :3].T + viewmat[:3, 3]
-            x, y = ((local @ K.T)[:, :2] / local[:, 2:]).T
-            height, width = self.depths[f].shape
-            inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            column, row = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
-            near = np.abs(self.depths[f][row, column] - local[:, 2]) < _SEEN_WITHIN_M
+            verts = self.data.truth["verts"]
+            column, row, depth, inside = pixels_in(verts[f], self.frames[f])
+            near = np.abs(self.depths[f][row, column] - depth) < _SEEN_WITHIN_M
             seen = inside & near & (self.pieces[f][k][row, column] > 0)
             start, end = verts[f][seen], verts[g][seen]
         return 1e3 * (end - start) if len(start) else None

@@ -225,7 +225,16 @@ def track_errors(found: Reconstructed, data: Dataset) -> dict[str, float]:
     }
 
 
-def _pixels(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
+def lifted(
+    depth: Float[np.ndarray, "h w"], which: Bool[np.ndarray, "h w"], viewmat: np.ndarray, K: np.ndarray
+) -> Float[np.ndarray, "n 3"]:
+    """World points of the chosen pixels of a depth image."""
+    rows, columns = np.nonzero(which)
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(K).T
+    return (rays * depth[rows, columns, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def pixels_in(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
     """The pixels onto which points project in a frame."""
     camera = frame.cameras
     return pixels_of(points, camera.viewmat[0], camera.K[0], camera.width, camera.height)
@@ -233,13 +242,13 @@ def _pixels(points: Float[np.ndarray, "n 3"], frame: Frame) -> PointPixels:
 
 def _seen(points: Float[np.ndarray, "n 3"], frame: Frame) -> Bool[np.ndarray, "n"]:
     """Which points are visible in a frame, by its depth and mask."""
-    x, y, depth, inside = _pixels(points, frame)
+    x, y, depth, inside = pixels_in(points, frame)
     return inside & frame.masks[0][y, x] & (np.abs(frame.depths[0][y, x] - depth) < _SEEN_WITHIN_M)
 
 
 def _near_tool_at(points: Float[np.ndarray, "n 3"], data: Dataset, t: int) -> Bool[np.ndarray, "n"]:
     frame = data.frame(t)
-    at = _pixels(points, frame)
+    at = pixels_in(points, frame)
     return at.inside & near_tool(frame)[at.rows, at.columns]
 
 

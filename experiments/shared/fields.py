@@ -20,7 +20,7 @@ from gsjax.engine.distill.scores import ClassScores, class_maps, classes_of
 from gsjax.engine.drive import drive
 from gsjax.engine.fit.run import Options as FitOptions
 from gsjax.engine.fit.run import run as run_fit
-from gsjax.geometry.cameras import project
+from gsjax.geometry.cameras import pixels_of
 from gsjax.methods.distill import (
     Distill,
     DistillConfig,
@@ -271,10 +271,8 @@ def _seen(
     """The mask value under each centre, and whether the centre lies where the depth is."""
     camera, depth = photographs.camera(i), photographs.depth(i)
     assert depth is not None
-    pixels, z = (np.asarray(a) for a in project(gaussians.means, camera.viewmat, camera.K))
-    x, y = (np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(int)[:, axis] for axis in (0, 1))
-    inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    pose = np.asarray(camera.viewmat), np.asarray(camera.K)
+    x, y, z, inside = pixels_of(np.asarray(gaussians.means), *pose, camera.width, camera.height)
     close = inside & (depth[y, x] > 0) & (np.abs(depth[y, x] - z) < TRUE_WITHIN)
     return labels_of(photographs, i)[y, x], close
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence
 from gsjax.methods.track import (
     PRESETS,
@@ -25,7 +26,7 @@ from gsjax.methods.track.motion import Motion, group_means, move, place
 from gsjax.methods.track.points import Points
 from gsjax.methods.track.refine import RefineBatch
 from gsjax.methods.track.region import near_background, near_scene
-from gsjax.metrics.tracking import ObjectScore, score_object, true_labels
+from gsjax.metrics.tracking import ObjectScore, score_object
 from gsjax.rasterize.plan import rung
 from gsjax.scene.region import tiles_to_pixels, touched_tiles
 from gsjax.scene.render import plan_render
@@ -105,10 +106,9 @@ def update_of(
         Tracked(scene, pose), TrackBatch(last, plan), CONFIG
     ).pixels
 
-    truth, cameras = sequence.truth, range(sequence.num_cameras)
+    truth = sequence.truth
     assert truth is not None
-    views = [(sequence.mask(t, c), sequence.depth(t, c)) for c in cameras]
-    labels = true_labels(pose.means, *zip(*views, strict=True), sequence.viewmats[t], sequence.Ks[t])
+    labels = labels_at(sequence, np.asarray(pose.means), t)
     scored, poses = {}, {}
     for group, value in enumerate(scene.label_ids):
         which = np.flatnonzero(truth.label_ids == value)

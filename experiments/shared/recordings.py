@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 from rich.console import Console
 
+from gsjax.data import Sequence
 from gsjax.engine.recording import FirstMask, Recording, draw_ahead, first_mask, open_recording
 from gsjax.engine.scores import Scores
 from gsjax.engine.track.loop import Tracking, begin, follow
@@ -16,6 +18,7 @@ from gsjax.engine.track.results import MOVED_MM
 from gsjax.engine.track.scoring import group_values, metrics, score_motion
 from gsjax.engine.track.views import views
 from gsjax.methods.track import StartConfig, TrackConfig, TrackedScene, start_scene
+from gsjax.metrics.tracking import true_labels
 from gsjax.scene.frame import Frame
 
 DATA = Path(os.environ.get("GSJAX_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
@@ -30,6 +33,12 @@ class Start(NamedTuple):
     mask: FirstMask
     frame: Frame
     scene: TrackedScene
+
+
+def labels_at(sequence: Sequence, points: Float[np.ndarray, "n 3"], t: int = 0) -> Int[np.ndarray, "n"]:
+    """True labels of points in a frame, from the masks and depths of all cameras; -1 where unknown."""
+    seen = [(sequence.mask(t, c), sequence.depth(t, c)) for c in range(sequence.num_cameras)]
+    return true_labels(points, *zip(*seen, strict=True), list(sequence.viewmats[t]), list(sequence.Ks[t]))
 
 
 def recorded(name: str) -> Path:

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from experiments.shared.recordings import labels_at
 from gsjax.data import Sequence
 from gsjax.data.simulated import tabletop
 from gsjax.engine.drive import Tick
 from gsjax.engine.track.results import MOVED_MM
 from gsjax.engine.track.tracking import track
 from gsjax.methods.track import PRESETS, TrackConfig, TrackedScene, first_pose, start_scene
-from gsjax.metrics.tracking import ObjectScore, score_tracks, true_labels
+from gsjax.metrics.tracking import ObjectScore, score_tracks
 
 FRAMES, WIDTH, HEIGHT, CAMERAS, MASK_CAMERA = 24, 240, 180, 2, 1
 WARM_UP = 2  # first updates whose times are left out
@@ -68,14 +69,7 @@ def score(recording: Sequence, scene: TrackedScene, ran: tuple[Tick, ...]) -> di
     background = np.asarray(scene.gaussians.means)[count:]
     poses = [first_pose(scene), *(now.result.pose for now in ran)]
     means = np.stack([np.concatenate([np.asarray(pose.means)[:count], background]) for pose in poses])
-    cameras = range(recording.num_cameras)
-    labels = true_labels(
-        means[0],
-        [recording.mask(0, c) for c in cameras],  # pyright: ignore[reportArgumentType]
-        [recording.depth(0, c) for c in cameras],  # pyright: ignore[reportArgumentType]
-        list(recording.viewmats[0]),
-        list(recording.Ks[0]),
-    )
+    labels = labels_at(recording, means[0])
     scores = score_tracks(means, labels, {int(k): truth.poses[:, i] for i, k in enumerate(truth.label_ids)})
     return dict(zip(truth.names, scores.values(), strict=True))
 
