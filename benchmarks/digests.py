@@ -87,7 +87,7 @@ def steady(value: Any, left_out: Iterable[str] = ()) -> Any:
 
 
 def _is_after_a_time(row: Any) -> bool:
-    """Whether it is a row of a fit's curve after a share of its minutes, whose step depends on the machine."""
+    """Whether it is a row of a fit's curve at a share of its minutes, whose step depends on the machine."""
     return isinstance(row, Mapping) and "part" in row and row.get("sh_degree", 0) is None
 
 
